@@ -1,0 +1,1 @@
+"""Datasets: the schema, a fast LeRobotDataset writer, recorded training streams, demonstrations."""

@@ -1,0 +1,248 @@
+"""Records training streams as a LeRobotDataset: an observer that the training loop calls once per step."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from lerobot.utils.constants import ACTION, DONE, REWARD
+
+from cronos_lerobot.data.schema import (
+    INTERVENTION,
+    LOG_PROB,
+    POLICY_VERSION,
+    SEGMENT_INDEX,
+    STEP,
+    STREAM_ID,
+    STREAM_INTERVENTIONS,
+    SUCCESS,
+    TOTAL_INTERVENTIONS,
+    VALUE,
+    Intervention,
+    observation_columns,
+    stream_features,
+)
+from cronos_lerobot.data.writer import SegmentWriter
+
+
+class StreamRecorder:
+    """Buffers the steps of each recorded stream and writes every finished segment as one episode.
+
+    ```python
+    recorder = StreamRecorder.open(env, "me/stream", root, segment_length=80, streams="all")
+    for ...:                                                    # the training loop, after each env.step
+        recorder.on_step(obs, instructions, actions, rewards, success, log_prob, value, policy_version,
+                         interventions=..., stream_interventions=..., total_interventions=...,
+                         steps=..., segments=..., segment_ends=...)
+    state = recorder.state_dict()                               # at a checkpoint: flushes to disk first
+    recorder.close()
+    # later: StreamRecorder.open(env, "me/stream", root, ..., state=state) drops what came after `state`
+    ```
+    """
+
+    def __init__(
+        self,
+        writer: SegmentWriter,
+        *,
+        num_envs: int,
+        segment_length: int,
+        streams: int | Literal["all"] = "all",
+    ) -> None:
+        """Record into `writer` (see `open` for the usual way to make one).
+
+        Args:
+            writer: takes the segments; its features are those of `stream_features`.
+            num_envs: streams the loop runs, n of the arrays of `on_step`.
+            segment_length: the most steps between two task switches (K), the buffers' capacity.
+            streams: how many of the streams to record, the first ones, or "all".
+
+        Raises:
+            ValueError: `streams` is neither "all" nor between 1 and `num_envs`.
+        """
+        if streams == "all":
+            streams = num_envs
+        if isinstance(streams, str) or not 1 <= streams <= num_envs:
+            raise ValueError(f"streams must be 'all' or from 1 to num_envs={num_envs}, got {streams!r}")
+        if segment_length < 1:
+            raise ValueError(f"segment_length must be at least 1 step, got {segment_length}")
+        self.writer = writer
+        self.num_envs = num_envs
+        self.num_streams = streams
+        self.segment_length = segment_length
+        self._lengths = np.zeros(streams, dtype=np.int64)
+        self._tasks = [""] * streams
+        self._buffers = [self._new_buffer() for _ in range(streams)]
+
+    @classmethod
+    def open(
+        cls,
+        env: Any,
+        repo_id: str,
+        root: str | Path,
+        *,
+        segment_length: int,
+        streams: int | Literal["all"] = "all",
+        state: Mapping[str, Any] | None = None,
+        **writer_options: Any,
+    ) -> Self:
+        """A recorder of `env`'s streams: into a new dataset, or on from a checkpoint.
+
+        Args:
+            env: a vector environment; its observation space, `num_envs` and `render_fps` are read.
+            repo_id: the dataset's name, "owner/name".
+            root: its folder; must not exist for a new dataset and must for a resumed one.
+            segment_length: the most steps between two task switches (K).
+            streams: how many of the streams to record, or "all".
+            state: of `state_dict()`. Everything that was written after it is dropped from the dataset.
+            writer_options: passed on to `SegmentWriter`.
+        """
+        if state is None:
+            features = stream_features(
+                env.single_observation_space,
+                state_names=getattr(env, "state_names", None),
+                environment_state_names=getattr(env, "environment_state_names", None),
+            )
+            fps = int(env.metadata["render_fps"])
+            writer = SegmentWriter(repo_id, root, features, fps, **writer_options)
+        else:
+            writer = SegmentWriter.resume(repo_id, root, state["writer"], **writer_options)
+        recorder = cls(writer, num_envs=env.num_envs, segment_length=segment_length, streams=streams)
+        if state is not None:
+            recorder._load_partial_segments(state["partial_segments"])
+        return recorder
+
+    def on_step(
+        self,
+        obs: Mapping[str, Any],
+        instructions: Sequence[str],
+        actions: np.ndarray,
+        rewards: np.ndarray,
+        success: np.ndarray,
+        log_prob: np.ndarray,
+        value: np.ndarray,
+        policy_version: int,
+        *,
+        interventions: np.ndarray,
+        stream_interventions: np.ndarray,
+        total_interventions: int,
+        steps: np.ndarray,
+        segments: np.ndarray,
+        segment_ends: np.ndarray,
+    ) -> None:
+        """Take one step of all n streams. Everything is copied.
+
+        Args:
+            obs: the raw observation that the actions were chosen on, leading dimension n.
+            instructions: n instructions, those the actions were chosen under.
+            actions: (n, 7), physical units, as given to `env.step`.
+            rewards: (n,) of this step.
+            success: (n,) bool, the task is complete after this step.
+            log_prob: (n,) of the actions under the policy that chose them.
+            value: (n,) that policy's value of `obs`.
+            policy_version: policy updates so far.
+            interventions: (n,) `Intervention` codes: what preceded `obs`. NONE inside a segment, anything
+                else on its first frame.
+            stream_interventions: (n,) interventions that count, so far, per stream.
+            total_interventions: the same over all streams.
+            steps: (n,) control steps of each stream before this one.
+            segments: (n,) task switches of each stream before this step.
+            segment_ends: (n,) bool, this is the segment's last step (a switch or a reset follows).
+
+        Raises:
+            ValueError: an intervention inside a segment or none at its start; a segment that outgrows
+                `segment_length` or changes its instruction.
+        """
+        columns = {
+            ACTION: actions,
+            REWARD: rewards,
+            SUCCESS: success,
+            DONE: segment_ends,
+            INTERVENTION: interventions,
+            STREAM_INTERVENTIONS: stream_interventions,
+            STEP: steps,
+            SEGMENT_INDEX: segments,
+            LOG_PROB: log_prob,
+            VALUE: value,
+            STREAM_ID: np.arange(self.num_envs),
+            TOTAL_INTERVENTIONS: np.full(self.num_envs, total_interventions),
+            POLICY_VERSION: np.full(self.num_envs, policy_version),
+        }
+        columns = {key: np.asarray(column) for key, column in columns.items()} | observation_columns(obs)
+        for key, column in columns.items():
+            if len(column) != self.num_envs:
+                raise ValueError(f"{key} has leading dimension {len(column)}, expected {self.num_envs}")
+        for stream in range(self.num_streams):
+            self._append(stream, columns, instructions[stream])
+            if segment_ends[stream]:
+                self._write_segment(stream)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Flush, and return what `open(state=...)` needs to go on from here (numbers and numpy arrays)."""
+        self.writer.flush()
+        partial = [
+            {"task": self._tasks[i], "frames": {k: v[: self._lengths[i]].copy() for k, v in buffer.items()}}
+            for i, buffer in enumerate(self._buffers)
+        ]
+        return {"writer": self.writer.state_dict(), "partial_segments": partial}
+
+    def close(self) -> None:
+        """Write the unfinished segments too (their last `next.done` is False) and finalize the dataset."""
+        for stream in range(self.num_streams):
+            if self._lengths[stream]:
+                self._write_segment(stream)
+        self.writer.finalize()
+
+    def _append(self, stream: int, columns: Mapping[str, np.ndarray], task: str) -> None:
+        length = self._lengths[stream]
+        intervention = Intervention(int(columns[INTERVENTION][stream]))
+        step = int(columns[STEP][stream])
+        if (intervention == Intervention.NONE) == (length == 0):
+            raise ValueError(
+                f"stream {stream}, step {step}: intervention {intervention.name} on frame {length} of a segment;"
+                " a segment's first frame follows an intervention (a task switch at least), no other does"
+            )
+        if length == self.segment_length:
+            raise ValueError(f"stream {stream}, step {step}: segment longer than {self.segment_length} steps")
+        if length and task != self._tasks[stream]:
+            raise ValueError(
+                f"stream {stream}, step {step}: the instruction changed inside a segment, from"
+                f" {self._tasks[stream]!r} to {task!r}"
+            )
+        self._tasks[stream] = task
+        for key, buffer in self._buffers[stream].items():
+            buffer[length] = columns[key][stream]
+        self._lengths[stream] += 1
+
+    def _write_segment(self, stream: int) -> None:
+        # The writer keeps the arrays until they are encoded, so the stream goes on in a fresh buffer.
+        length = self._lengths[stream]
+        frames = {key: buffer[:length] for key, buffer in self._buffers[stream].items()}
+        metadata = {
+            STREAM_ID: stream,
+            SEGMENT_INDEX: int(frames[SEGMENT_INDEX][0]),
+            STEP: int(frames[STEP][0]),
+            INTERVENTION: int(frames[INTERVENTION][0]),
+            SUCCESS: bool(frames[SUCCESS].any()),
+        }
+        self.writer.add_segment(frames, self._tasks[stream], episode_metadata=metadata)
+        self._buffers[stream] = self._new_buffer()
+        self._lengths[stream] = 0
+
+    def _new_buffer(self) -> dict[str, np.ndarray]:
+        buffer = {}
+        for key, feature in self.writer.features.items():
+            shape = () if feature["shape"] == (1,) else feature["shape"]
+            dtype = np.uint8 if feature["dtype"] == "video" else feature["dtype"]
+            buffer[key] = np.empty((self.segment_length, *shape), dtype=dtype)
+        return buffer
+
+    def _load_partial_segments(self, partial: Sequence[Mapping[str, Any]]) -> None:
+        if len(partial) != self.num_streams:
+            raise ValueError(f"the state holds {len(partial)} streams, this run records {self.num_streams}")
+        for stream, segment in enumerate(partial):
+            lengths = {len(frames) for frames in segment["frames"].values()}
+            (length,) = lengths
+            for key, frames in segment["frames"].items():
+                self._buffers[stream][key][:length] = frames
+            self._tasks[stream] = segment["task"]
+            self._lengths[stream] = length

@@ -1,0 +1,161 @@
+"""The LeRobotDataset (v3) features of demonstrations and of recorded training streams.
+
+A frame is LeRobot's usual (observation, action, what followed): `observation.*` is what the policy saw,
+`action` what it chose, and `next.*` what came of that action. One LeRobot episode is one *segment* of a
+stream: contiguous in time, under one instruction, crossing no teleport of any body or of the arm. The
+`cronos.*` columns make the stream whole again. They start with neither `observation` nor `action`, so
+LeRobot never takes them for an input or an output of a policy.
+"""
+
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
+from typing import Any
+
+import gymnasium
+import numpy as np
+from lerobot.utils.constants import ACTION, DONE, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE, REWARD
+
+SUCCESS = "next.success"
+STREAM_ID = "cronos.stream_id"
+STEP = "cronos.step"
+SEGMENT_INDEX = "cronos.segment_index"
+INTERVENTION = "cronos.intervention"
+STREAM_INTERVENTIONS = "cronos.stream_interventions"
+TOTAL_INTERVENTIONS = "cronos.total_interventions"
+POLICY_VERSION = "cronos.policy_version"
+LOG_PROB = "cronos.log_prob"
+VALUE = "cronos.value"
+
+ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
+
+Features = dict[str, dict[str, Any]]
+
+
+class Intervention(IntEnum):
+    """What happened to a stream right before a frame (column `cronos.intervention`).
+
+    Ordered by strength. Where several happen at one task switch, the frame carries the strongest:
+    `max(kinds)`. Every value but NONE stands on the first frame of a segment, and only there.
+    """
+
+    NONE = 0
+    """The frame follows its predecessor by one control step."""
+    TASK_SWITCH = 1
+    """Only the instruction changed; the scene and the arm are as the segment before left them."""
+    END_EFFECTOR_RESET = 2
+    """The arm went home with the gripper open; the bodies stayed. Free."""
+    HEURISTIC_RESET = 3
+    """Bodies that had left the workspace were put back. Counts towards the budget."""
+    SCENE_RESET = 4
+    """Every body went to a benchmark configuration, the arm home. Counts towards the budget."""
+    DIVERGENCE = 5
+    """A scene reset that the simulation forced, because its state was no longer finite."""
+    INITIAL = 6
+    """The stream's very first placement. Free."""
+
+
+_STREAM_COLUMNS: dict[str, str] = {
+    STREAM_ID: "int64",
+    STEP: "int64",
+    SEGMENT_INDEX: "int64",
+    INTERVENTION: "int8",
+    STREAM_INTERVENTIONS: "int64",
+    TOTAL_INTERVENTIONS: "int64",
+    POLICY_VERSION: "int64",
+    LOG_PROB: "float32",
+    VALUE: "float32",
+}
+STREAM_COLUMNS = tuple(_STREAM_COLUMNS)
+
+
+def demonstration_features(
+    observation_space: gymnasium.Space,
+    *,
+    state_names: Sequence[str] | None = None,
+    environment_state_names: Sequence[str] | None = None,
+) -> Features:
+    """Features of a demonstration dataset.
+
+    Args:
+        observation_space: of ONE environment, in the raw format of `lerobot.envs`: a Dict with any of
+            "pixels" (a Dict of uint8 (H, W, 3) boxes by camera), "agent_pos", "environment_state".
+        state_names: one name per dimension of `agent_pos`; numbered when None.
+        environment_state_names: the same for `environment_state`.
+
+    Returns:
+        LeRobot's feature dictionary: the observation, `action`, `next.reward`, `next.success`, `next.done`.
+
+    Raises:
+        ValueError: the space is not such a Dict, or a list of names has the wrong length.
+    """
+    if not isinstance(observation_space, gymnasium.spaces.Dict):
+        raise ValueError(f"the observation space must be a gymnasium Dict, got {observation_space}")
+    features: Features = {}
+    names = {"agent_pos": state_names, "environment_state": environment_state_names}
+    for key, space in observation_space.items():
+        if key == "pixels":
+            for camera, box in space.items():
+                features[f"{OBS_IMAGES}.{camera}"] = _video_feature(box.shape)
+        elif key in _VECTOR_KEYS:
+            features[_VECTOR_KEYS[key]] = _vector_feature(key, space.shape, names[key])
+        else:
+            raise ValueError(f"unknown observation {key!r}; valid: 'pixels', {sorted(_VECTOR_KEYS)}")
+    features[ACTION] = _vector_feature(ACTION, (len(ACTION_NAMES),), ACTION_NAMES)
+    features[REWARD] = _scalar_feature("float32")
+    features[SUCCESS] = _scalar_feature("bool")
+    features[DONE] = _scalar_feature("bool")
+    return features
+
+
+def stream_features(observation_space: gymnasium.Space, **names: Sequence[str] | None) -> Features:
+    """Features of a recorded training stream: those of `demonstration_features` and `STREAM_COLUMNS`.
+
+    `cronos.stream_id`: which of the parallel streams. `cronos.step`: control steps of this stream before
+    this one, from 0, without a gap. `cronos.segment_index`: task switches of this stream before this frame.
+    `cronos.intervention`: an `Intervention`. `cronos.stream_interventions`, `cronos.total_interventions`:
+    interventions that count (scene and heuristic resets) so far, those right before this frame included, of
+    this stream and of all streams together. `cronos.policy_version`: policy updates before this action.
+    `cronos.log_prob`: log-probability (nats, summed over the action's dimensions) of the action under the
+    policy that chose it. `cronos.value`: that policy's value estimate of the observation.
+    """
+    columns = {key: _scalar_feature(dtype) for key, dtype in _STREAM_COLUMNS.items()}
+    return demonstration_features(observation_space, **names) | columns
+
+
+def observation_columns(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """A raw batched observation by LeRobot's names.
+
+    Args:
+        observation: the environment's observation dict, every array with leading dimension n.
+
+    Returns:
+        `observation.images.<camera>` uint8 (n, H, W, 3), `observation.state` and
+        `observation.environment_state` float32 (n, D): those of them that are there. Not copied.
+    """
+    columns = {f"{OBS_IMAGES}.{camera}": pixels for camera, pixels in observation.get("pixels", {}).items()}
+    columns |= {name: observation[key] for key, name in _VECTOR_KEYS.items() if key in observation}
+    return columns
+
+
+_VECTOR_KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
+
+
+def _video_feature(shape: tuple[int, ...]) -> dict[str, Any]:
+    if len(shape) != 3 or shape[2] != 3:
+        raise ValueError(f"pixels must have the shape (H, W, 3), got {shape}")
+    if shape[0] % 2 or shape[1] % 2:
+        raise ValueError(f"pixels must have an even height and width to be encoded as yuv420p, got {shape}")
+    return {"dtype": "video", "shape": tuple(shape), "names": ["height", "width", "channels"]}
+
+
+def _vector_feature(key: str, shape: tuple[int, ...], names: Sequence[str] | None) -> dict[str, Any]:
+    if len(shape) != 1:
+        raise ValueError(f"{key} must be a vector, got the shape {shape}")
+    names = [f"{key}_{i}" for i in range(shape[0])] if names is None else list(names)
+    if len(names) != shape[0]:
+        raise ValueError(f"{key} has {shape[0]} dimensions but {len(names)} names: {names}")
+    return {"dtype": "float32", "shape": tuple(shape), "names": names}
+
+
+def _scalar_feature(dtype: str) -> dict[str, Any]:
+    return {"dtype": dtype, "shape": (1,), "names": None}
