@@ -97,7 +97,7 @@ def demonstration_features(
             for camera, box in space.items():
                 features[f"{OBS_IMAGES}.{camera}"] = _video_feature(box.shape)
         elif key in _VECTOR_KEYS:
-            features[_VECTOR_KEYS[key]] = _vector_feature(key, space.shape, names[key])
+            features[_VECTOR_KEYS[key]] = _vector_feature(key, space.shape or (), names[key])
         else:
             raise ValueError(f"unknown observation {key!r}; valid: 'pixels', {sorted(_VECTOR_KEYS)}")
     features[ACTION] = _vector_feature(ACTION, (len(ACTION_NAMES),), ACTION_NAMES)

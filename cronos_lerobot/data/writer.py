@@ -3,29 +3,123 @@
 `StreamRecorder` (recorder.py), the observer that a training loop calls once per step, sits on top of this.
 """
 
+import queue
+import shutil
+import threading
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from lerobot.configs import RGBEncoderConfig
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.datasets.utils import INFO_PATH
 
 from cronos_lerobot.data.schema import Features
+from cronos_lerobot.data.storage import INCOMPLETE, Shard, next_shard_index, truncate
+from cronos_lerobot.data.video import MAX_FILE_DURATION_S, fast_encoder
+
+
+@dataclass
+class _Segment:
+    frames: Mapping[str, np.ndarray]
+    task: str
+    metadata: Mapping[str, Any]
+
+    @property
+    def num_bytes(self) -> int:
+        return sum(array.nbytes for array in self.frames.values())
+
+
+@dataclass
+class _Flush:
+    done: threading.Event = field(default_factory=threading.Event)
 
 
 class SegmentWriter:
-    """Appends segments (arrays in memory) to a LeRobotDataset, one episode each."""
+    """Appends segments (arrays in memory) to a LeRobotDataset, one episode each.
 
-    features: Features
-    """The features given, without LeRobot's own bookkeeping columns."""
+    A thread of its own encodes and writes; frames/s are those of libx264, not of PNG files. Episodes share
+    files: many in one mp4, one parquet and one episodes file per flush (or per 1000 s of video).
+    """
 
-    def __init__(self, repo_id: str, root: str | Path, features: Features, fps: int, **options: Any) -> None:
-        """Start a new dataset in `root`, which must not exist."""
-        raise NotImplementedError
+    def __init__(
+        self,
+        repo_id: str,
+        root: str | Path,
+        features: Features,
+        fps: int,
+        *,
+        robot_type: str | None = None,
+        encoder: RGBEncoderConfig | None = None,
+        max_pending_bytes: int = 256 * 2**20,
+    ) -> None:
+        """Start a new dataset.
+
+        Args:
+            repo_id: the dataset's name, "owner/name".
+            root: its folder, which must not exist yet.
+            features: LeRobot's feature dictionary, without the bookkeeping columns (`timestamp`, ...).
+            fps: frames per second, the control frequency.
+            robot_type: for `info.json`.
+            encoder: of the videos; `fast_encoder()` when None.
+            max_pending_bytes: segments waiting for the encoder; `add_segment` blocks when it is exceeded.
+
+        Raises:
+            FileExistsError: `root` exists.
+        """
+        has_video = any(feature["dtype"] == "video" for feature in features.values())
+        meta = LeRobotDatasetMetadata.create(
+            repo_id, fps, features, robot_type=robot_type, root=Path(root), use_videos=has_video
+        )
+        self._start(meta, encoder, max_pending_bytes)
 
     @classmethod
-    def resume(cls, repo_id: str, root: str | Path, state: Mapping[str, Any], **options: Any) -> Self:
-        """Go on with the dataset in `root` as it was at `state`; what was written after it is dropped."""
-        raise NotImplementedError
+    def resume(
+        cls,
+        repo_id: str,
+        root: str | Path,
+        state: Mapping[str, Any] | None = None,
+        *,
+        encoder: RGBEncoderConfig | None = None,
+        max_pending_bytes: int = 256 * 2**20,
+    ) -> Self:
+        """Go on with the dataset in `root` as it was at `state`; what was written after it is dropped.
+
+        Args:
+            repo_id: the dataset's name.
+            root: its folder.
+            state: of `state_dict()`; None keeps every episode that was flushed.
+            encoder: as for a new dataset; it must match, LeRobot assumes one encoding per camera.
+            max_pending_bytes: as for a new dataset.
+
+        Raises:
+            FileNotFoundError: there is no dataset in `root`.
+            ValueError: the dataset holds fewer episodes than `state`.
+        """
+        if not (Path(root) / INFO_PATH).is_file():
+            raise FileNotFoundError(f"no LeRobotDataset to resume in {root}")
+        meta = LeRobotDatasetMetadata(repo_id, root=Path(root))
+        truncate(meta, meta.info.total_episodes if state is None else state["num_episodes"])
+        writer = cls.__new__(cls)
+        writer._start(meta, encoder, max_pending_bytes)
+        return writer
+
+    @property
+    def root(self) -> Path:
+        """The dataset's folder."""
+        return self._meta.root
+
+    @property
+    def num_episodes(self) -> int:
+        """Episodes on disk, as of the last flush."""
+        return self._meta.info.total_episodes
+
+    @property
+    def num_frames(self) -> int:
+        """Frames on disk, as of the last flush."""
+        return self._meta.info.total_frames
 
     def add_segment(
         self,
@@ -33,18 +127,143 @@ class SegmentWriter:
         task: str,
         *,
         episode_metadata: Mapping[str, Any] | None = None,
-    ) -> int:
-        """Queue one segment; returns its episode index. Blocks while the encoder is behind."""
-        raise NotImplementedError
+    ) -> None:
+        """Queue one segment as the next episode. Blocks while the encoder is too far behind.
+
+        Args:
+            frames: one array (T, *shape) of the feature's dtype per feature ((T,) where the shape is (1,));
+                videos as uint8 (T, H, W, 3). They are NOT copied: leave them alone afterwards.
+            task: the instruction.
+            episode_metadata: columns for the episode's row in `meta/episodes`, the same keys every time.
+
+        Raises:
+            ValueError: a feature is missing, unknown, or of another dtype or shape.
+            RuntimeError: the writer is finalized, or its thread has failed.
+        """
+        self._check_alive()
+        self._check_frames(frames)
+        metadata = dict(episode_metadata or {})
+        if self._metadata_keys is None:
+            self._metadata_keys = set(metadata)
+        if set(metadata) != self._metadata_keys:
+            raise ValueError(
+                f"episode_metadata has the keys {sorted(metadata)}, not {sorted(self._metadata_keys)}"
+            )
+        segment = _Segment(frames, task, metadata)
+        with self._room:
+            self._room.wait_for(
+                lambda: self._pending == 0 or self._pending + segment.num_bytes <= self._max_pending
+            )
+            self._pending += segment.num_bytes
+        self._queue.put(segment)
 
     def flush(self) -> None:
-        """Write everything queued; the dataset on disk then loads in LeRobotDataset."""
-        raise NotImplementedError
+        """Write everything queued. The dataset on disk then loads in LeRobotDataset, whatever follows."""
+        self._check_alive()
+        request = _Flush()
+        self._queue.put(request)
+        request.done.wait()
+        self._check_alive()
 
     def state_dict(self) -> dict[str, Any]:
-        """What `resume` needs, as of the last flush."""
-        raise NotImplementedError
+        """What `resume` needs to come back to the last flush."""
+        return {"num_episodes": self.num_episodes}
 
     def finalize(self) -> None:
-        """Flush, stop the encoder thread, and accept no more segments. Idempotent."""
-        raise NotImplementedError
+        """Flush, stop the thread, and accept no more segments. Idempotent."""
+        if not self._thread.is_alive():
+            self._check_failure()
+            return
+        try:
+            self.flush()
+        finally:
+            self._queue.put(None)
+            self._thread.join()
+        shutil.rmtree(self.root / INCOMPLETE, ignore_errors=True)
+
+    def __enter__(self) -> Self:
+        """The writer."""
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        """Finalize, also after an exception: what was recorded until then stays."""
+        self.finalize()
+
+    def _start(
+        self, meta: LeRobotDatasetMetadata, encoder: RGBEncoderConfig | None, max_pending: int
+    ) -> None:
+        self._meta = meta
+        self._encoder = encoder or fast_encoder()
+        self._max_pending = max_pending
+        self.features: Features = {
+            key: feature for key, feature in meta.features.items() if key not in _BOOKKEEPING
+        }
+        self._tasks: dict[str, int] = {} if meta.tasks is None else dict(meta.tasks["task_index"])
+        self._metadata_keys: set[str] | None = None
+        self._max_shard_frames = int(MAX_FILE_DURATION_S * meta.fps)
+        self._shard: Shard | None = None
+        self._next_shard = next_shard_index(meta)
+        self._failure: BaseException | None = None
+        self._pending = 0
+        self._room = threading.Condition()
+        self._queue: queue.SimpleQueue[_Segment | _Flush | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._work, name="segment-writer", daemon=True)
+        self._thread.start()
+
+    def _check_alive(self) -> None:
+        self._check_failure()
+        if not self._thread.is_alive():
+            raise RuntimeError(f"the writer of {self.root} is finalized")
+
+    def _check_failure(self) -> None:
+        if self._failure is not None:
+            raise RuntimeError(f"writing to {self.root} failed: {self._failure}") from self._failure
+
+    def _check_frames(self, frames: Mapping[str, np.ndarray]) -> None:
+        if set(frames) != set(self.features):
+            missing, unknown = set(self.features) - set(frames), set(frames) - set(self.features)
+            raise ValueError(f"segment lacks {sorted(missing)} and has unknown {sorted(unknown)}")
+        length = len(next(iter(frames.values())))
+        if not 1 <= length <= self._max_shard_frames:
+            raise ValueError(f"a segment needs 1 to {self._max_shard_frames} frames, got {length}")
+        for key, feature in self.features.items():
+            shape = () if feature["shape"] == (1,) else feature["shape"]
+            dtype = np.dtype(np.uint8 if feature["dtype"] == "video" else feature["dtype"])
+            array = frames[key]
+            if array.dtype != dtype or array.shape != (length, *shape):
+                raise ValueError(f"{key} must be {dtype} {(length, *shape)}, got {array.dtype} {array.shape}")
+
+    def _work(self) -> None:
+        while (item := self._queue.get()) is not None:
+            try:
+                if self._failure is None:
+                    self._handle(item)
+            except BaseException as failure:  # handed to the caller's thread by `_check_failure`
+                self._failure = failure
+            if isinstance(item, _Flush):
+                item.done.set()
+            else:
+                with self._room:
+                    self._pending -= item.num_bytes
+                    self._room.notify_all()
+
+    def _handle(self, item: _Segment | _Flush) -> None:
+        if isinstance(item, _Flush):
+            self._publish()
+            return
+        length = len(next(iter(item.frames.values())))
+        if self._shard is not None and self._shard.num_frames + length > self._max_shard_frames:
+            self._publish()
+        if self._shard is None:
+            self._shard = Shard(self._meta, self._next_shard, self._encoder)
+            self._next_shard += 1
+        task_index = self._tasks.setdefault(item.task, len(self._tasks))
+        self._shard.append(item.frames, item.task, task_index, item.metadata)
+
+    def _publish(self) -> None:
+        if self._shard is not None:
+            shard, self._shard = self._shard, None
+            shard.publish(self._tasks, self._encoder)
+
+
+_BOOKKEEPING = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
