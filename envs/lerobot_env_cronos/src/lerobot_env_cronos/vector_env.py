@@ -1,0 +1,234 @@
+"""The native vector environment: all streams in one process, with explicit, counted interventions.
+
+It never resets itself and never emits `terminated` or `truncated`: in reset-free training each intervention is
+an event of the training loop. `lerobot_env_cronos.episodic` adds episodes for evaluation.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from lerobot_env_cronos.configurations import (
+    NUM_CONFIGURATIONS,
+    footprint_corners,
+    load_configurations,
+    sample_place,
+)
+from lerobot_env_cronos.observations import ObservationBuilder
+from lerobot_env_cronos.scenes import CONTROL_HZ, Task, get_scene
+from lerobot_env_cronos.simulation import ACTION_HIGH, ACTION_LOW, Simulation
+
+GRASP_REWARD, SUCCESS_REWARD = 0.1, 1.0
+REWARDS = ("difference", "level")
+
+
+class CronosVectorEnv(gym.vector.VectorEnv):
+    """`num_envs` streams of one scene.
+
+    Args:
+        scene: name of the scene.
+        obs_type: `pixels_agent_pos` or `environment_state_agent_pos`.
+        privileged_state: add `environment_state` to pixel observations (for an asymmetric critic).
+        observation_height, observation_width: size of the rendered observation [px].
+        camera_name: camera(s) of the observation, comma-separated: `front`, `bridge`.
+        reward: `level` pays 0.1 while the right object is grasped and 1.0 on success each step (paper, Section
+            4); `difference` pays the change of that level between two steps (RL4VLA's code).
+        num_threads: physics threads, 0 for all cores; results do not depend on it.
+        render_size: (height, width) of `render()` [px].
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ, "autoreset_mode": gym.vector.AutoresetMode.DISABLED}  # noqa: E501,RUF012
+    render_mode = "rgb_array"
+
+    def __init__(
+        self,
+        num_envs: int,
+        scene: str = "kitchen_2x2",
+        *,
+        obs_type: str = "pixels_agent_pos",
+        privileged_state: bool = False,
+        observation_height: int = 128,
+        observation_width: int = 128,
+        camera_name: str = "front",
+        reward: str = "difference",
+        num_threads: int = 0,
+        render_size: tuple[int, int] = (480, 640),
+    ):
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        if reward not in REWARDS:
+            raise ValueError(f"unknown reward {reward!r}; valid rewards: {list(REWARDS)}")
+        self.scene = get_scene(scene)
+        self.num_envs = num_envs
+        self.reward = reward
+        self.simulation = Simulation(self.scene, num_envs, num_threads)
+        self._observations = ObservationBuilder(
+            self.simulation, obs_type, privileged_state, observation_height, observation_width, camera_name,
+            render_size,
+        )  # fmt: skip
+        self.single_observation_space = self._observations.space
+        self.single_action_space = gym.spaces.Box(
+            ACTION_LOW.astype(np.float32), ACTION_HIGH.astype(np.float32), dtype=np.float32
+        )
+        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
+        self.tasks: list[Task] = [self.scene.tasks[0]] * num_envs
+        self.is_success = np.zeros(num_envs, dtype=bool)
+        self.is_grasped = np.zeros(num_envs, dtype=bool)
+        self._level = np.zeros(num_envs, dtype=np.float32)
+        self._all = np.arange(num_envs)
+        self.scene_reset(self._all, self._all % NUM_CONFIGURATIONS)
+
+    # Gymnasium --------------------------------------------------------------------------------------------
+
+    def reset(self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None):
+        """Scene-reset every stream to a training configuration: `(seed + i) % 64`, or `seeds[i] % 64`."""
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        self.scene_reset(self._all, self._configurations_of(seed))
+        return self.observe(), self._info()
+
+    def _configurations_of(self, seed: int | Sequence[int] | None) -> np.ndarray:
+        if seed is None:
+            return self.np_random.integers(NUM_CONFIGURATIONS, size=self.num_envs)
+        seeds = seed + self._all if isinstance(seed, int | np.integer) else np.asarray(seed)
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"got {len(seeds)} seeds for {self.num_envs} environments")
+        return seeds % NUM_CONFIGURATIONS
+
+    def step(self, actions: np.ndarray):
+        """Apply actions (n, 7) in physical units; out-of-bounds values are clipped.
+
+        Returns the observation under the task that was acted on, the reward (n,), all-False `terminated` and
+        `truncated`, and `info` with (n,) arrays `is_success`, `is_grasped`, `diverged`.
+
+        Raises:
+            ValueError: wrong shape, or an action that is not finite.
+        """
+        reward, diverged = self._step_physics(actions, self._all)
+        never = np.zeros(self.num_envs, dtype=bool)
+        return self.observe(), reward, never, never.copy(), self._info() | {"diverged": diverged}
+
+    def _step_physics(self, actions: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        actions = np.asarray(actions, dtype=np.float64)
+        if actions.shape != (self.num_envs, 7):
+            raise ValueError(f"actions must have shape ({self.num_envs}, 7), got {actions.shape}")
+        bad = ~np.isfinite(actions[ids]).all(axis=1)
+        if bad.any():
+            raise ValueError(f"actions of environments {ids[bad].tolist()} are not finite: {actions[ids[bad]]}")
+        diverged = np.zeros(self.num_envs, dtype=bool)
+        diverged[ids] = self.simulation.step(np.clip(actions[ids], ACTION_LOW, ACTION_HIGH), ids)
+        before = self._level.copy()
+        self._judge(ids)
+        reward = self._level - before if self.reward == "difference" else self._level.copy()
+        return reward, diverged
+
+    def observe(self) -> dict[str, Any]:
+        """The observation now, under the current tasks."""
+        return self._observations.observe()
+
+    def _info(self) -> dict[str, np.ndarray]:
+        return {"is_success": self.is_success.copy(), "is_grasped": self.is_grasped.copy()}
+
+    def _judge(self, ids: np.ndarray) -> None:
+        """Evaluate success, grasp and the reward level of the current tasks of `ids`."""
+        sim = self.simulation
+        for task in {self.tasks[i] for i in ids}:
+            mine = np.array([i for i in ids if self.tasks[i] == task])
+            on = sim.is_on_table(task.object) if task.receptacle is None else sim.is_on(*_pair(task))
+            self.is_success[mine] = on[mine]
+            self.is_grasped[mine] = sim.is_grasped(task.object)[mine]
+        level = np.where(self.is_success, SUCCESS_REWARD, np.where(self.is_grasped, GRASP_REWARD, 0.0))
+        self._level[ids] = level[ids]
+
+    # Interventions ----------------------------------------------------------------------------------------
+
+    def scene_reset(self, ids: np.ndarray, configurations: np.ndarray, split: str = "train") -> None:
+        """Put every body of streams `ids` at benchmark configurations (k,) of a split, and the arm home."""
+        self.place_bodies(ids, load_configurations(self.scene.name, split)[configurations])
+
+    def place_bodies(self, ids: np.ndarray, poses: np.ndarray) -> None:
+        """Put every body of streams `ids` at `poses` (k, bodies, 7), and the arm home."""
+        ids = np.asarray(ids)
+        self.simulation.place(ids, poses)
+        self._judge(ids)
+
+    def end_effector_reset(self, ids: np.ndarray) -> None:
+        """Put the arm of streams `ids` home, gripper open; bodies stay (a held one drops and settles)."""
+        ids = np.asarray(ids)
+        self.simulation.send_arm_home(ids)
+        self._judge(ids)
+
+    def put_back(self, stream: int, body: str, rng: np.random.Generator) -> None:
+        """Put one body of a stream at a free place of the spawn area, drawn from `rng`."""
+        poses = dict(zip(self.scene.bodies, self.simulation.body_poses()[stream], strict=True))
+        others = [
+            footprint_corners(name, pose[:2], 2 * np.arctan2(pose[6], pose[3]))
+            for name, pose in poses.items()
+            if name != body
+        ]
+        pose, _ = sample_place(self.scene, body, others, rng)
+        ids = np.array([stream])
+        self.simulation.move_body(ids, body, pose[None])
+        self._judge(ids)
+
+    def set_task(self, ids: np.ndarray, tasks: Sequence[Task]) -> None:
+        """Give streams `ids` their tasks; the reward's level starts from the state as it is."""
+        valid = self.scene.tasks + self.scene.reset_tasks
+        for i, task in zip(ids, tasks, strict=True):
+            if task not in valid:
+                raise ValueError(f"unknown task {task}; valid tasks: {[t.instruction for t in valid]}")
+            self.tasks[i] = task
+        self._judge(np.asarray(ids))
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Everything that decides the future, as numpy arrays; see `Simulation.get_state`."""
+        state = self.simulation.get_state()
+        valid = self.scene.tasks + self.scene.reset_tasks
+        return state | {
+            "task": np.array([valid.index(task) for task in self.tasks]),
+            "level": self._level.copy(),
+            "is_success": self.is_success.copy(),
+            "is_grasped": self.is_grasped.copy(),
+        }
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """Continue, bit for bit, from a state taken by `get_state`."""
+        self.simulation.set_state(state)
+        valid = self.scene.tasks + self.scene.reset_tasks
+        self.tasks = [valid[i] for i in state["task"]]
+        for name in ("level", "is_success", "is_grasped"):
+            getattr(self, "_level" if name == "level" else name)[:] = state[name]
+
+    # LeRobot ----------------------------------------------------------------------------------------------
+
+    @property
+    def instructions(self) -> list[str]:
+        """The language instruction of every stream."""
+        return [task.instruction for task in self.tasks]
+
+    def render(self) -> tuple[np.ndarray, ...]:
+        """One frame (height, width, 3) uint8 per stream at `render_size`."""
+        return tuple(self._observations.render())
+
+    def call(self, name: str, *args, **kwargs) -> tuple:
+        """What LeRobot asks of the sub-environments of a vector env."""
+        if name == "render":
+            return self.render()
+        return self.get_attr(name)
+
+    def get_attr(self, name: str) -> tuple:
+        """One value per stream: `task_description`, `task` or any attribute of this env."""
+        if name in ("task_description", "task"):
+            return tuple(self.instructions)
+        return (getattr(self, name),) * self.num_envs
+
+    def close_extras(self, **kwargs) -> None:
+        """Free the renderers."""
+        self._observations.close()
+
+
+def _pair(task: Task) -> tuple[str, str]:
+    assert task.receptacle is not None
+    return task.object, task.receptacle
