@@ -198,8 +198,8 @@ class StreamRecorder:
         step = int(columns[STEP][stream])
         if (intervention == Intervention.NONE) == (length == 0):
             raise ValueError(
-                f"stream {stream}, step {step}: intervention {intervention.name} on frame {length} of its segment;"
-                " its first frame follows an intervention (a task switch at least), no other does"
+                f"stream {stream}, step {step}: intervention {intervention.name} on frame {length} of its"
+                " segment; the first follows an intervention (a task switch at least), no other does"
             )
         if length == self.segment_length:
             raise ValueError(f"stream {stream}, step {step}: segment longer than {self.segment_length} steps")

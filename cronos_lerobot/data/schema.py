@@ -9,7 +9,7 @@ LeRobot never takes them for an input or an output of a policy.
 
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -94,8 +94,9 @@ def demonstration_features(
     names = {"agent_pos": state_names, "environment_state": environment_state_names}
     for key, space in observation_space.items():
         if key == "pixels":
-            for camera, box in space.items():
-                features[f"{OBS_IMAGES}.{camera}"] = _video_feature(box.shape)
+            cameras = cast(gymnasium.spaces.Dict, space)
+            for camera, box in cameras.items():
+                features[f"{OBS_IMAGES}.{camera}"] = _video_feature(box.shape or ())
         elif key in _VECTOR_KEYS:
             features[_VECTOR_KEYS[key]] = _vector_feature(key, space.shape or (), names[key])
         else:

@@ -23,6 +23,8 @@ class VideoFile:
 
     def __init__(self, path: Path, fps: int, height: int, width: int, encoder: RGBEncoderConfig) -> None:
         """Open `path` (its folder must exist) for frames of `height` x `width` pixels."""
+        # LeRobot's video probing leaves libav printing at INFO level, a page of x264 statistics per file.
+        av.logging.set_libav_level(av.logging.ERROR)
         self.path = path
         self.num_frames = 0
         self._closed = False
@@ -31,8 +33,6 @@ class VideoFile:
         self._container = av.open(str(path), "w", format="mp4", options={"movflags": "faststart"})
         # One thread: at these sizes libx264's own threads cost more than they bring.
         options = encoder.get_codec_options(encoder_threads=1, as_strings=True)
-        if encoder.vcodec == "h264":
-            options.setdefault("x264-params", "log=-1")  # else a page of statistics on stderr per file
         stream = self._container.add_stream(encoder.vcodec, fps, options=options)
         self._stream = cast(av.VideoStream, stream)
         self._stream.pix_fmt = encoder.pix_fmt
