@@ -1,0 +1,254 @@
+"""Configuration of the PocketVLA policy."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+
+from lerobot_policy_pocketvla.action_bounds import BRIDGE_ORIG_BOUNDS
+from lerobot_policy_pocketvla.precision import Precision
+
+Observation = Literal["auto", "image", "environment_state"]
+CriticObservation = Literal["actor", "environment_state"]
+ActionHead = Literal["gaussian", "categorical"]
+BoundsSource = Literal["bridge_orig", "dataset"]
+
+
+@PreTrainedConfig.register_subclass("pocketvla")
+@dataclass
+class PocketVLAConfig(PreTrainedConfig):
+    """A language-conditioned policy with discretised actions, small enough for a laptop CPU.
+
+    The actor sees one camera image, or the environment's state in its place, the proprioception
+    (`observation.state`) and the instruction (`task`), and returns one bin per action dimension.
+    """
+
+    observation: Observation = "auto"
+    """What the actor sees besides proprioception and instruction: `image`, `environment_state`, or `auto`:
+    the image if the data has one. A data set may hold both; the actor ignores the one not named here."""
+    image_key: str | None = None
+    """Which camera, e.g. `observation.images.front`. None: the only one there is."""
+    critic_observation: CriticObservation = "actor"
+    """What the value network sees: `actor` (as the actor does) or `environment_state` (a privileged critic,
+    asymmetric actor-critic). It is used in training only."""
+    value_detach: bool = True
+    """With an image actor and `critic_observation=actor`, the value head reads the actor's features; True
+    keeps the value loss from changing them."""
+
+    action_head: ActionHead = "gaussian"
+    """`gaussian`: a mean and one sigma per dimension generate the bins' logits, the gripper has a sign.
+    `categorical`: a free logit for every bin."""
+    num_bins: int = 256
+    """Bins per action dimension, equal parts of [-1, 1]."""
+    gripper_dim: int | None = -1
+    """Index of the gripper among the action's dimensions (`gaussian` head only); None for none."""
+    sigma_init: float = 0.2
+    """Initial standard deviation of the `gaussian` head, in normalised action units."""
+    sigma_min: float = 0.05
+    """Smallest standard deviation that can be learned; below half a bin there would be no exploration left."""
+    sigma_max: float = 0.6
+    """Largest standard deviation that can be learned."""
+    temperature: float = 0.6
+    """Sampling temperature of `select_action`: logits are divided by it; 0 takes the likeliest bin."""
+    action_bounds: BoundsSource = "bridge_orig"
+    """Physical actions that -1 and 1 stand for: the 1st and 99th percentile of BridgeData V2, as in OpenVLA
+    (7 dimensions), or the data set's own minimum and maximum. Fixed at the first training."""
+
+    task_width: int = 64
+    """Width of the instruction's embedding."""
+    vocabulary_size: int = 4096
+    """Hash buckets for words and pairs of words."""
+    hidden_width: int = 384
+    """Width of the trunk's layers."""
+    hidden_depth: int = 3
+    """Number of the trunk's layers."""
+    value_width: int = 256
+    """Width of the value head's hidden layer."""
+    keypoints: int = 64
+    """Number of spatial-softmax keypoints of the image encoder."""
+    random_shift_px: int = 4
+    """Largest random shift of the image in behaviour cloning (pixels); never applied elsewhere. 0: none."""
+    dtype: Precision = "auto"
+    """Format of the convolutions: `auto` is bfloat16 where the hardware multiplies it, float32 elsewhere.
+    All else, action probabilities included, is float32."""
+
+    optimizer_lr: float = 1e-3
+    """Peak learning rate of behaviour cloning."""
+    optimizer_sigma_lr: float = 1e-2
+    """Peak learning rate of the raw sigmas, which have far to go and see every sample."""
+    optimizer_weight_decay: float = 1e-4
+    """AdamW's weight decay of the weight matrices; biases, norms, embeddings and sigmas have none."""
+    optimizer_grad_clip_norm: float = 10.0
+    """Largest gradient norm in behaviour cloning."""
+    scheduler_warmup_steps: int = 1000
+    """Warm-up updates of a run of `scheduler_decay_steps`; LeRobot scales both down for shorter runs."""
+    scheduler_decay_steps: int = 100_000
+    """Updates until the learning rate has decayed."""
+    scheduler_decay_lr: float = 1e-5
+    """Learning rate after the decay."""
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.MEAN_STD,
+            "ENV": NormalizationMode.MEAN_STD,
+            # The processor's own action-bounds step scales actions; see action_bounds.py.
+            "ACTION": NormalizationMode.IDENTITY,
+        }
+    )
+    """LeRobot's normalisation per kind of feature."""
+
+    def __post_init__(self) -> None:
+        """Check all that can be checked without the features.
+
+        Raises:
+            ValueError: naming the bad value and the valid ones.
+        """
+        super().__post_init__()
+        for name, choices in (
+            ("observation", Observation),
+            ("critic_observation", CriticObservation),
+            ("action_head", ActionHead),
+            ("action_bounds", BoundsSource),
+            ("dtype", Precision),
+        ):
+            if getattr(self, name) not in get_args(choices):
+                raise ValueError(f"{name}={getattr(self, name)!r} is not one of {list(get_args(choices))}")
+        if self.n_obs_steps != 1:
+            raise ValueError(
+                f"n_obs_steps={self.n_obs_steps}: PocketVLA sees one step, n_obs_steps must be 1"
+            )
+        if not 0 < self.sigma_min < self.sigma_init < self.sigma_max:
+            raise ValueError(
+                "0 < sigma_min < sigma_init < sigma_max is needed, got "
+                f"{self.sigma_min}, {self.sigma_init}, {self.sigma_max}"
+            )
+        if self.temperature < 0:
+            raise ValueError(f"temperature={self.temperature} must be 0 (greedy) or more")
+        for name, least in (
+            ("num_bins", 2),
+            ("hidden_depth", 1),
+            ("vocabulary_size", 2),
+            ("random_shift_px", 0),
+        ):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}={getattr(self, name)} must be at least {least}")
+
+    @property
+    def actor_observation(self) -> Literal["image", "environment_state"]:
+        """`observation` with `auto` resolved by the input features."""
+        if self.observation == "auto":
+            return "image" if self.image_features else "environment_state"
+        return self.observation
+
+    @property
+    def camera(self) -> tuple[str, tuple[int, int, int]]:
+        """Key and (channels, height, width) of the image the actor sees.
+
+        Raises:
+            ValueError: when there is no image feature, several and no `image_key`, or none of that name.
+        """
+        images = self.image_features
+        if self.image_key is not None and self.image_key not in images:
+            raise ValueError(f"image_key={self.image_key!r} is not among the image features {sorted(images)}")
+        if not images:
+            raise ValueError(
+                f"observation='image', but none of the input features {sorted(self.input_features or {})} is an "
+                "image; use observation='environment_state' or data with a camera"
+            )
+        if self.image_key is None and len(images) > 1:
+            raise ValueError(f"choose one of the cameras {sorted(images)} with image_key")
+        key = self.image_key or next(iter(images))
+        shape = tuple(images[key].shape)
+        if len(shape) != 3 or shape[0] != 3:
+            raise ValueError(f"{key} has shape {shape}; (3, height, width) is needed")
+        return key, (shape[0], shape[1], shape[2])
+
+    @property
+    def state_width(self) -> int:
+        """Width of `observation.state`, 0 without it."""
+        return self.robot_state_feature.shape[0] if self.robot_state_feature else 0
+
+    @property
+    def environment_state_width(self) -> int:
+        """Width of the environment state, 0 without it."""
+        return self.env_state_feature.shape[0] if self.env_state_feature else 0
+
+    @property
+    def action_dim(self) -> int:
+        """Number of action dimensions."""
+        if self.action_feature is None:
+            raise ValueError(f"output_features must hold 'action', got {sorted(self.output_features or {})}")
+        return self.action_feature.shape[0]
+
+    def physical_bounds(self, stats: dict[str, dict[str, Any]] | None) -> tuple[list[float], list[float]]:
+        """Lowest and highest physical action, from `action_bounds` and, for `dataset`, its statistics.
+
+        Raises:
+            ValueError: when the bounds do not fit the action, or statistics are needed and missing.
+        """
+        if self.action_bounds == "bridge_orig":
+            low, high = (list(side) for side in BRIDGE_ORIG_BOUNDS)
+        elif stats is None or "action" not in stats:
+            raise ValueError("action_bounds='dataset' needs the data set's statistics of 'action'")
+        else:
+            low, high = ([float(v) for v in stats["action"][side]] for side in ("min", "max"))
+        if len(low) != self.action_dim:
+            raise ValueError(
+                f"action_bounds={self.action_bounds!r} has {len(low)} dimensions, the action has "
+                f"{self.action_dim}; use action_bounds='dataset'"
+            )
+        return low, high
+
+    def validate_features(self) -> None:
+        """Check the features once they are known; LeRobot's policies call this when they are built.
+
+        Raises:
+            ValueError: when an input that the configuration asks for is missing.
+        """
+        if self.actor_observation == "image":
+            _ = self.camera
+        for name, wanted in (
+            ("observation", self.actor_observation),
+            ("critic_observation", self.critic_observation),
+        ):
+            if wanted == "environment_state" and not self.environment_state_width:
+                raise ValueError(
+                    f"{name}='environment_state' needs the feature 'observation.environment_state', got "
+                    f"{sorted(self.input_features or {})}"
+                )
+        if self.gripper_dim is not None and not -self.action_dim <= self.gripper_dim < self.action_dim:
+            raise ValueError(f"gripper_dim={self.gripper_dim} is outside an action of {self.action_dim}")
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        """Return AdamW for behaviour cloning from scratch."""
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        """Return linear warm-up and cosine decay."""
+        return CosineDecayWithWarmupSchedulerConfig(
+            num_warmup_steps=self.scheduler_warmup_steps,
+            num_decay_steps=self.scheduler_decay_steps,
+            peak_lr=self.optimizer_lr,
+            decay_lr=self.scheduler_decay_lr,
+        )
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """No history of observations."""
+        return None
+
+    @property
+    def action_delta_indices(self) -> None:
+        """No action chunks: the action of the same step."""
+        return None
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """No rewards."""
+        return None

@@ -1,0 +1,151 @@
+"""Action heads: features to a categorical distribution over bins, one per action dimension."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+IMPOSSIBLE = -1e4
+"""Logit of a bin that the gripper never takes: finite, so that 0 * log(0) is 0 and not NaN."""
+
+
+def bin_centres(num_bins: int) -> Tensor:
+    """Centres of `num_bins` equal bins over [-1, 1], shape (num_bins,)."""
+    width = 2.0 / num_bins
+    return -1.0 + width * (torch.arange(num_bins, dtype=torch.float32) + 0.5)
+
+
+def tokens_to_actions(tokens: Tensor, num_bins: int) -> Tensor:
+    """Bin indices to the normalised actions at the bins' centres, any shape."""
+    return -1.0 + (2.0 * tokens.to(torch.float32) + 1.0) / num_bins
+
+
+def actions_to_tokens(actions: Tensor, num_bins: int) -> Tensor:
+    """Normalised actions to the bins they fall in, any shape; outside [-1, 1] it is the edge bin."""
+    return ((actions.float() + 1.0) * (0.5 * num_bins)).floor().long().clamp(0, num_bins - 1)
+
+
+@dataclass(frozen=True)
+class BinDistribution:
+    """Independent categorical distributions over the bins of each action dimension."""
+
+    logits: Tensor
+    """Unnormalised log-probabilities at temperature 1, shape (B, action dimensions, bins), float32."""
+
+    def log_probs(self, temperature: float = 1.0) -> Tensor:
+        """Log-probability of every bin, softmax(logits / temperature), shape (B, D, bins)."""
+        if not temperature > 0:
+            raise ValueError(f"temperature must be above 0 for a log-probability, got {temperature}")
+        return torch.log_softmax(self.logits / temperature, dim=-1)
+
+    def mode(self) -> Tensor:
+        """The likeliest bin of each dimension, shape (B, D)."""
+        return self.logits.argmax(dim=-1)
+
+    def sample(self, temperature: float = 1.0, generator: torch.Generator | None = None) -> Tensor:
+        """Draw one bin per dimension, shape (B, D); temperature 0 is the mode."""
+        if temperature == 0:
+            return self.mode()
+        probs = self.log_probs(temperature).exp()
+        batch, dims, bins = probs.shape
+        return torch.multinomial(probs.reshape(-1, bins), 1, generator=generator).reshape(batch, dims)
+
+    def log_prob(self, tokens: Tensor, temperature: float = 1.0) -> Tensor:
+        """Log-probability of bins (B, D), summed over the dimensions, shape (B,).
+
+        At temperature 0 the distribution is a point: 0 for the mode, minus infinity for the rest.
+        """
+        if temperature == 0:
+            hit = (tokens == self.mode()).all(dim=-1)
+            return torch.where(hit, 0.0, -math.inf)
+        return self.log_probs(temperature).gather(-1, tokens.unsqueeze(-1)).squeeze(-1).sum(-1)
+
+    def entropy(self, temperature: float = 1.0) -> Tensor:
+        """Entropy in nats, mean over the dimensions, shape (B,)."""
+        if temperature == 0:
+            return self.logits.new_zeros(self.logits.shape[0])
+        log_probs = self.log_probs(temperature)
+        return -(log_probs.exp() * log_probs).sum(-1).mean(-1)
+
+
+class CategoricalHead(nn.Module):
+    """A free logit for every bin of every dimension."""
+
+    def __init__(self, features: int, action_dim: int, num_bins: int) -> None:
+        super().__init__()
+        self.shape = (action_dim, num_bins)
+        self.project = nn.Linear(features, action_dim * num_bins)
+        nn.init.orthogonal_(self.project.weight, gain=0.1)
+        nn.init.zeros_(self.project.bias)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Features (B, F) to logits (B, D, bins)."""
+        return self.project(features).unflatten(-1, self.shape)
+
+
+class GaussianHead(nn.Module):
+    """A predicted mean and one learned sigma per dimension generate the logits of the bins.
+
+    The logit of the bin with centre c is log N(c; mean, sigma) up to a constant, so dividing the logits by
+    a temperature is the same as multiplying sigma by its square root. The gripper, if there is one, takes
+    only its two outermost bins, chosen by a single logit.
+
+    Args:
+        features: width of the input.
+        action_dim: number of action dimensions D.
+        num_bins: bins over [-1, 1].
+        gripper_dim: index of the gripper dimension, None for none.
+        sigma_init, sigma_min, sigma_max: start and range of sigma, in normalised action units.
+        mean_limit: the mean stays inside (-mean_limit, mean_limit); above 1 so that edge bins are reachable.
+    """
+
+    def __init__(
+        self,
+        features: int,
+        action_dim: int,
+        num_bins: int,
+        gripper_dim: int | None,
+        sigma_init: float,
+        sigma_min: float,
+        sigma_max: float,
+        mean_limit: float = 1.25,
+    ) -> None:
+        super().__init__()
+        self.gripper_dim = None if gripper_dim is None else gripper_dim % action_dim
+        self.mean_limit = mean_limit
+        self.log_sigma_range = (math.log(sigma_min), math.log(sigma_max))
+        self.project = nn.Linear(features, action_dim)
+        nn.init.orthogonal_(self.project.weight, gain=0.1)
+        nn.init.zeros_(self.project.bias)
+        low, high = self.log_sigma_range
+        fraction = (math.log(sigma_init) - low) / (high - low)
+        # A sigmoid onto the range, not a clamp: a clamped sigma has no gradient to come back with.
+        self.raw_sigma = nn.Parameter(torch.full((action_dim,), math.log(fraction / (1.0 - fraction))))
+        self.register_buffer("centres", bin_centres(num_bins), persistent=False)
+
+    def sigma(self) -> Tensor:
+        """Standard deviation of each dimension in normalised units, shape (D,)."""
+        low, high = self.log_sigma_range
+        return (low + (high - low) * torch.sigmoid(self.raw_sigma)).exp()
+
+    def mean(self, features: Tensor) -> Tensor:
+        """Mean of each dimension in normalised units, shape (B, D)."""
+        return self.mean_limit * torch.tanh(self.project(features) / self.mean_limit)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Features (B, F) to logits (B, D, bins)."""
+        raw = self.project(features)
+        mean = self.mean_limit * torch.tanh(raw / self.mean_limit)
+        distance = (self.centres - mean.unsqueeze(-1)) / self.sigma().unsqueeze(-1)
+        logits = -0.5 * distance.square()
+        if self.gripper_dim is None:
+            return logits
+        return self._with_gripper(logits, raw[:, self.gripper_dim])
+
+    def _with_gripper(self, logits: Tensor, sign_logit: Tensor) -> Tensor:
+        """Put the two-point distribution with P(top bin) = sigmoid(sign_logit) in the gripper's place."""
+        gripper = torch.full_like(logits[:, 0], IMPOSSIBLE)
+        gripper = torch.cat((-0.5 * sign_logit[:, None], gripper[:, 1:-1], 0.5 * sign_logit[:, None]), dim=-1)
+        parts = [logits[:, : self.gripper_dim], gripper[:, None], logits[:, self.gripper_dim + 1 :]]
+        return torch.cat(parts, dim=1)

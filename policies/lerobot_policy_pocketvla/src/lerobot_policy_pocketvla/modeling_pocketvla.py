@@ -1,0 +1,253 @@
+"""The PocketVLA policy: behaviour cloning, acting, and what an actor-critic trainer needs."""
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from torch import Tensor, nn
+
+from lerobot_policy_pocketvla.configuration_pocketvla import PocketVLAConfig
+from lerobot_policy_pocketvla.heads import (
+    BinDistribution,
+    CategoricalHead,
+    GaussianHead,
+    actions_to_tokens,
+    tokens_to_actions,
+)
+from lerobot_policy_pocketvla.images import check_image_size, random_shift
+from lerobot_policy_pocketvla.networks import ImageNetwork, StateNetwork, ValueHead
+from lerobot_policy_pocketvla.precision import use_bfloat16
+
+Batch = Mapping[str, Any]
+"""A batch after the preprocessor: `observation.images.<camera>` (B, 3, H, W), uint8 or floats in [0, 1];
+`observation.state` (B, P) and `observation.environment_state` (B, E), normalised; `task`, B strings."""
+
+
+class PocketVLAPolicy(PreTrainedPolicy):
+    """Actor and critic; see `PocketVLAConfig` for what each of them sees.
+
+    Raises:
+        ValueError: when the configuration's features lack an input that it asks for.
+    """
+
+    config_class = PocketVLAConfig
+    name = "pocketvla"
+
+    def __init__(self, config: PocketVLAConfig, **kwargs: Any) -> None:
+        """Build the networks; LeRobot's further arguments (data set statistics, metadata) are not needed."""
+        super().__init__(config)
+        config.validate_features()
+        self.config: PocketVLAConfig = config
+        self.uses_images = config.actor_observation == "image"
+        sizes = (config.hidden_width, config.hidden_depth, config.task_width, config.vocabulary_size)
+        if self.uses_images:
+            bfloat16 = use_bfloat16(config.dtype, config.device or "cpu")
+            self.actor: nn.Module = ImageNetwork(config.state_width, *sizes, config.keypoints, bfloat16)
+        else:
+            self.actor = StateNetwork(config.state_width + config.environment_state_width, *sizes)
+        self.head = self._build_head()
+        # A critic that sees a vector has a network of its own; one that sees the image reads the actor's.
+        self.critic: nn.Module | None = None
+        if config.critic_observation == "environment_state" or not self.uses_images:
+            self.critic = StateNetwork(config.state_width + config.environment_state_width, *sizes)
+        self.value_head = ValueHead(config.hidden_width, config.value_width)
+        self.to(config.device)
+
+    def _build_head(self) -> GaussianHead | CategoricalHead:
+        config = self.config
+        if config.action_head == "categorical":
+            return CategoricalHead(config.hidden_width, config.action_dim, config.num_bins)
+        return GaussianHead(
+            config.hidden_width,
+            config.action_dim,
+            config.num_bins,
+            config.gripper_dim,
+            config.sigma_init,
+            config.sigma_min,
+            config.sigma_max,
+        )
+
+    # What the networks are fed.
+
+    def _vector(self, batch: Batch, with_environment: bool) -> Tensor:
+        keys = [OBS_STATE] * bool(self.config.state_width) + [OBS_ENV_STATE] * with_environment
+        missing = [key for key in keys if key not in batch]
+        if missing:
+            raise ValueError(f"the batch lacks {missing}; it has {sorted(batch)}")
+        if not keys:
+            return torch.zeros(len(self._texts(batch)), 0, device=self.value_head.out.weight.device)
+        return torch.cat([batch[key] for key in keys], dim=-1)
+
+    @staticmethod
+    def _texts(batch: Batch) -> list[str]:
+        texts = batch.get("task")
+        if texts is None:
+            raise ValueError(f"the batch lacks 'task', the instructions; it has {sorted(batch)}")
+        return [texts] if isinstance(texts, str) else list(texts)
+
+    def _features(self, batch: Batch, shift_px: int = 0) -> Tensor:
+        """Actor features, (B, hidden_width)."""
+        if not self.uses_images:
+            return self.actor(self._vector(batch, with_environment=True), self._texts(batch))
+        key, shape = self.config.camera
+        if key not in batch:
+            raise ValueError(f"the batch lacks {key!r}; it has {sorted(batch)}")
+        check_image_size(batch[key], shape, key)
+        images = random_shift(batch[key], shift_px)
+        return self.actor(images, self._vector(batch, with_environment=False), self._texts(batch))
+
+    def _values(self, batch: Batch, features: Tensor | None) -> Tensor:
+        """Values (B,); `features` are the actor's, if they are at hand."""
+        if self.critic is not None:
+            return self.value_head(
+                self.critic(self._vector(batch, with_environment=True), self._texts(batch))
+            )
+        features = self._features(batch) if features is None else features
+        return self.value_head(features.detach() if self.config.value_detach else features)
+
+    def _full_precision(self) -> torch.autocast:
+        """Switch off a caller's autocast: only the convolutions may run in bfloat16."""
+        return torch.autocast(self.value_head.out.weight.device.type, enabled=False)
+
+    # LeRobot's policy interface.
+
+    def forward(
+        self, batch: Batch, reduction: Literal["mean", "none"] = "mean"
+    ) -> tuple[Tensor, dict[str, float]]:
+        """Behaviour cloning: negative log-likelihood of the bins of the demonstrated actions.
+
+        Args:
+            batch: with `action` (B, D) or (B, 1, D), normalised, and `action_is_pad` (B,) or (B, 1) if some
+                actions are padding.
+            reduction: `mean` over the samples that are not padding, or `none`.
+
+        Returns:
+            The loss, a scalar or (B,), in nats summed over the action's dimensions, and numbers for the log.
+        """
+        with self._full_precision():
+            shift_px = self.config.random_shift_px if self.training else 0
+            distribution = BinDistribution(self.head(self._features(batch, shift_px)))
+        target = batch[ACTION].reshape(-1, self.config.action_dim)
+        tokens = self._target_tokens(target)
+        losses = -distribution.log_prob(tokens)
+        valid = torch.ones_like(losses)
+        if "action_is_pad" in batch:
+            valid = 1.0 - batch["action_is_pad"].reshape(-1).to(losses.dtype)
+        losses = losses * valid
+        loss = losses if reduction == "none" else losses.sum() / valid.sum().clamp(min=1.0)
+        return loss, self._metrics(distribution, target, valid)
+
+    def _target_tokens(self, actions: Tensor) -> Tensor:
+        tokens = actions_to_tokens(actions, self.config.num_bins)
+        if isinstance(self.head, GaussianHead) and self.head.gripper_dim is not None:
+            gripper = self.head.gripper_dim
+            tokens[:, gripper] = torch.where(actions[:, gripper] >= 0, self.config.num_bins - 1, 0)
+        return tokens
+
+    @torch.no_grad()
+    def _metrics(self, distribution: BinDistribution, target: Tensor, valid: Tensor) -> dict[str, float]:
+        greedy = tokens_to_actions(distribution.mode(), self.config.num_bins)
+        error = (greedy - target.clamp(-1.0, 1.0)).abs().mean(-1)
+        metrics = {"greedy_abs_error": float((error * valid).sum() / valid.sum().clamp(min=1.0))}
+        if isinstance(self.head, GaussianHead):
+            metrics["sigma_mean"] = float(self.head.sigma().mean())
+        return metrics
+
+    @torch.no_grad()
+    def select_action(
+        self,
+        batch: Batch,
+        *,
+        temperature: float | None = None,
+        generator: torch.Generator | None = None,
+        **_: Any,
+    ) -> Tensor:
+        """Choose one normalised action per sample, (B, D) float32; the critic's inputs are not needed.
+
+        Args:
+            batch: observations and `task`.
+            temperature: of the sampling, 0 is greedy; None takes the configuration's.
+            generator: random source; None is torch's global one.
+        """
+        temperature = self.config.temperature if temperature is None else temperature
+        with self._full_precision():
+            tokens = BinDistribution(self.head(self._features(batch))).sample(temperature, generator)
+        return tokens_to_actions(tokens, self.config.num_bins)
+
+    def predict_action_chunk(self, batch: Batch, **kwargs: Any) -> Tensor:
+        """`select_action` as a chunk of one action, (B, 1, D)."""
+        return self.select_action(batch, **kwargs).unsqueeze(1)
+
+    def reset(self) -> None:
+        """Nothing to forget: the policy has no memory between steps."""
+
+    def get_optim_params(self) -> list[dict[str, Any]]:
+        """Parameter groups for behaviour cloning: the actor's, weight decay on its matrices only."""
+        matrices, others, sigmas = [], [], []
+        for name, parameter in [*self.actor.named_parameters(), *self.head.named_parameters()]:
+            if name == "raw_sigma":
+                sigmas.append(parameter)
+            elif parameter.ndim < 2 or "embedding" in name:
+                others.append(parameter)
+            else:
+                matrices.append(parameter)
+        groups = [{"params": matrices}, {"params": others, "weight_decay": 0.0}]
+        if sigmas:
+            groups.append({"params": sigmas, "weight_decay": 0.0, "lr": self.config.optimizer_sigma_lr})
+        return groups
+
+    # What an actor-critic trainer needs (structurally; nothing is imported from it).
+
+    @torch.no_grad()
+    def sample_actions(
+        self, batch: Batch, *, temperature: float = 1.0, generator: torch.Generator | None = None
+    ) -> dict[str, Tensor]:
+        """Draw actions with what is needed to learn from them.
+
+        Returns:
+            `action` (B, D) float32, normalised; `tokens` (B, D) int64; `log_prob` (B,), summed over the
+            dimensions, at this temperature; `value` (B,). Temperature 0 is greedy, its `log_prob` is 0.
+        """
+        with self._full_precision():
+            features = self._features(batch)
+            distribution = BinDistribution(self.head(features))
+            tokens = distribution.sample(temperature, generator)
+            return {
+                "action": tokens_to_actions(tokens, self.config.num_bins),
+                "tokens": tokens,
+                "log_prob": distribution.log_prob(tokens, temperature),
+                "value": self._values(batch, features),
+            }
+
+    def evaluate_actions(
+        self, batch: Batch, tokens: Tensor, *, temperature: float = 1.0
+    ) -> dict[str, Tensor]:
+        """Evaluate drawn bins (B, D) under the policy as it is now, differentiable.
+
+        Returns:
+            `log_prob` (B,), summed over the dimensions; `entropy` (B,), mean over the dimensions, in nats;
+            `value` (B,).
+        """
+        with self._full_precision():
+            features = self._features(batch)
+            distribution = BinDistribution(self.head(features))
+            return {
+                "log_prob": distribution.log_prob(tokens, temperature),
+                "entropy": distribution.entropy(temperature),
+                "value": self._values(batch, features),
+            }
+
+    def predict_values(self, batch: Batch) -> Tensor:
+        """Values of the observations, (B,), differentiable."""
+        with self._full_precision():
+            return self._values(batch, None)
+
+    def rl_parameter_groups(self) -> list[dict[str, Any]]:
+        """Two disjoint groups that hold every parameter: `policy` and `value`."""
+        value = list(self.value_head.parameters())
+        if self.critic is not None:
+            value += list(self.critic.parameters())
+        policy = [*self.actor.parameters(), *self.head.parameters()]
+        return [{"name": "policy", "params": policy}, {"name": "value", "params": value}]

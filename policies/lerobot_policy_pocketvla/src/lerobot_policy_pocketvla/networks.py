@@ -1,0 +1,175 @@
+"""The networks: text encoder, image encoder, and the trunk that the task modulates."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812
+
+from lerobot_policy_pocketvla.images import spatial_softmax, to_signed_unit_range
+from lerobot_policy_pocketvla.tokenizer import token_ids
+
+STATE_LIMIT = 10.0
+"""Normalised states are clipped to this many standard deviations: a dimension that hardly moved in the
+demonstrations must not drown all others when it does move."""
+
+
+class TextEncoder(nn.Module):
+    """Mean of hashed word and word-pair embeddings, then a small MLP.
+
+    Args:
+        vocabulary_size: number of hash buckets.
+        width: width of the result.
+    """
+
+    def __init__(self, vocabulary_size: int, width: int) -> None:
+        super().__init__()
+        self.vocabulary_size = vocabulary_size
+        self.embedding = nn.EmbeddingBag(vocabulary_size, width, mode="mean", padding_idx=0)
+        self.mlp = nn.Sequential(
+            nn.LayerNorm(width), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width)
+        )
+
+    def forward(self, texts: list[str]) -> Tensor:
+        """Encode B instructions, shape (B, width); each different one is encoded once."""
+        index: dict[str, int] = {}
+        rows = [index.setdefault(text, len(index)) for text in texts]
+        tokens = [token_ids(text, self.vocabulary_size) for text in index]
+        longest = max(len(ids) for ids in tokens)
+        padded = [ids + (0,) * (longest - len(ids)) for ids in tokens]
+        device = self.embedding.weight.device
+        unique = self.mlp(self.embedding(torch.tensor(padded, device=device)))
+        return unique[torch.tensor(rows, device=device)]
+
+
+class Film(nn.Module):
+    """Feature-wise linear modulation by the task (Perez et al. 2018), the identity at the start."""
+
+    def __init__(self, task_width: int, features: int) -> None:
+        super().__init__()
+        self.project = nn.Linear(task_width, 2 * features)
+        nn.init.zeros_(self.project.weight)
+        nn.init.zeros_(self.project.bias)
+
+    def forward(self, x: Tensor, task: Tensor) -> Tensor:
+        """Scale and shift x, (B, features) or (B, features, H, W), by the task (B, task_width)."""
+        scale, shift = self.project(task).chunk(2, dim=-1)
+        if x.ndim == 4:
+            scale, shift = scale[..., None, None], shift[..., None, None]
+        return x * (1.0 + scale.to(x.dtype)) + shift.to(x.dtype)
+
+
+class FilmMLP(nn.Module):
+    """Hidden layers of one width, each normalised and modulated by the task; residual from the second on.
+
+    Args:
+        inputs: width of the input.
+        width: width of the hidden layers and of the result.
+        depth: number of hidden layers, at least 1.
+        task_width: width of the task embedding, which is also appended to the input.
+    """
+
+    def __init__(self, inputs: int, width: int, depth: int, task_width: int) -> None:
+        super().__init__()
+        sizes = [inputs + task_width] + [width] * (depth - 1)
+        self.linears = nn.ModuleList(nn.Linear(size, width) for size in sizes)
+        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in sizes)
+        self.films = nn.ModuleList(Film(task_width, width) for _ in sizes)
+
+    def forward(self, x: Tensor, task: Tensor) -> Tensor:
+        """Map x (B, inputs) under the task (B, task_width) to (B, width)."""
+        x = torch.cat((x, task), dim=-1)
+        for layer, (linear, norm, film) in enumerate(zip(self.linears, self.norms, self.films, strict=True)):
+            hidden = F.silu(film(norm(linear(x)), task))
+            x = hidden if layer == 0 else x + hidden
+        return x
+
+
+class ImageEncoder(nn.Module):
+    """Three convolutions, modulated by the task, read out as keypoints and as a coarse pooled map.
+
+    The stem (8 x 8, stride 4) decides the speed on a CPU; a finer one costs five times as much.
+
+    Args:
+        task_width: width of the task embedding.
+        keypoints: number of spatial-softmax keypoints.
+        bfloat16: run the convolutions in bfloat16; all that follows them is float32.
+    """
+
+    POOLED_CHANNELS = 16
+    POOLED_SIZE = 4
+
+    def __init__(self, task_width: int, keypoints: int, bfloat16: bool) -> None:
+        super().__init__()
+        self.bfloat16 = bfloat16
+        self.conv1 = nn.Conv2d(3, 32, 8, stride=4, padding=2)
+        self.conv2 = nn.Conv2d(32, 64, 3, stride=2, padding=1)
+        self.conv3 = nn.Conv2d(64, 64, 3, padding=1)
+        self.film2 = Film(task_width, 64)
+        self.film3 = Film(task_width, 64)
+        self.to_keypoints = nn.Conv2d(64, keypoints, 1)
+        self.to_pooled = nn.Conv2d(64, self.POOLED_CHANNELS, 1)
+        self.width = 2 * keypoints + self.POOLED_CHANNELS * self.POOLED_SIZE**2
+
+    def forward(self, images: Tensor, task: Tensor) -> Tensor:
+        """Encode images (B, 3, H, W), uint8 or floats in [0, 1], under tasks (B, task_width) to (B, width)."""
+        dtype = torch.bfloat16 if self.bfloat16 else torch.float32
+        x = to_signed_unit_range(images, dtype).contiguous(memory_format=torch.channels_last)
+        with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=self.bfloat16):
+            x = F.relu(self.conv1(x))
+            x = F.relu(self.film2(self.conv2(x), task))
+            x = F.relu(self.film3(self.conv3(x), task))
+            maps, pooled = self.to_keypoints(x), self.to_pooled(x)
+        pooled = F.adaptive_avg_pool2d(pooled.float(), self.POOLED_SIZE)
+        return torch.cat((spatial_softmax(maps), pooled.flatten(1)), dim=-1)
+
+
+class StateNetwork(nn.Module):
+    """Text encoder and trunk on vector observations; an actor's body or a critic of its own."""
+
+    def __init__(self, inputs: int, width: int, depth: int, task_width: int, vocabulary_size: int) -> None:
+        super().__init__()
+        self.text = TextEncoder(vocabulary_size, task_width)
+        self.trunk = FilmMLP(inputs, width, depth, task_width)
+
+    def forward(self, state: Tensor, texts: list[str]) -> Tensor:
+        """Normalised states (B, inputs) and B instructions to features (B, width)."""
+        return self.trunk(state.float().clamp(-STATE_LIMIT, STATE_LIMIT), self.text(texts))
+
+
+class ImageNetwork(nn.Module):
+    """Text encoder, image encoder and trunk on an image and the proprioception."""
+
+    def __init__(
+        self,
+        inputs: int,
+        width: int,
+        depth: int,
+        task_width: int,
+        vocabulary_size: int,
+        keypoints: int,
+        bfloat16: bool,
+    ) -> None:
+        super().__init__()
+        self.text = TextEncoder(vocabulary_size, task_width)
+        self.encoder = ImageEncoder(task_width, keypoints, bfloat16)
+        self.trunk = FilmMLP(self.encoder.width + inputs, width, depth, task_width)
+
+    def forward(self, images: Tensor, state: Tensor, texts: list[str]) -> Tensor:
+        """Images (B, 3, H, W), normalised proprioception (B, inputs), B instructions to (B, width)."""
+        task = self.text(texts)
+        state = state.float().clamp(-STATE_LIMIT, STATE_LIMIT)
+        return self.trunk(torch.cat((self.encoder(images, task), state), dim=-1), task)
+
+
+class ValueHead(nn.Module):
+    """Two-layer readout of a scalar value, zero at the start."""
+
+    def __init__(self, features: int, width: int) -> None:
+        super().__init__()
+        self.hidden = nn.Linear(features, width)
+        self.out = nn.Linear(width, 1)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Features (B, F) to values (B,)."""
+        return self.out(F.silu(self.hidden(features))).squeeze(-1)
