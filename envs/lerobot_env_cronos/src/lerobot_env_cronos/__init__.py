@@ -1,6 +1,21 @@
 """CRONOS scenes as a LeRobot environment plugin."""
 
+from lerobot_env_cronos.config import CronosEnvConfig, register_gymnasium
+from lerobot_env_cronos.episodic import CronosEnv, IndependentVectorEnv
 from lerobot_env_cronos.scenes import CONTROL_HZ, SCENES, STEPS_PER_TASK, Scene, Task, get_scene
 from lerobot_env_cronos.vector_env import CronosVectorEnv
 
-__all__ = ["CONTROL_HZ", "SCENES", "STEPS_PER_TASK", "CronosVectorEnv", "Scene", "Task", "get_scene"]
+register_gymnasium()
+
+__all__ = [
+    "CONTROL_HZ",
+    "SCENES",
+    "STEPS_PER_TASK",
+    "CronosEnv",
+    "CronosEnvConfig",
+    "CronosVectorEnv",
+    "IndependentVectorEnv",
+    "Scene",
+    "Task",
+    "get_scene",
+]

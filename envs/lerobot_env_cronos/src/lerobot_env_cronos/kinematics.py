@@ -84,9 +84,7 @@ def quaternion_to_matrix(quat: np.ndarray) -> np.ndarray:
 def _skew(w: np.ndarray) -> np.ndarray:
     x, y, z = np.moveaxis(w, -1, 0)
     o = np.zeros_like(x)
-    return np.stack(
-        [np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], axis=-2
-    )
+    return np.stack([np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], axis=-2)
 
 
 def inverse_kinematics(

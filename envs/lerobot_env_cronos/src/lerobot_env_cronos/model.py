@@ -91,13 +91,23 @@ def _set_options(spec: mujoco.MjSpec) -> None:
 def _add_furniture(spec: mujoco.MjSpec) -> None:
     size = [(hi - lo) / 2 for lo, hi in zip(TABLE_LOW, TABLE_HIGH, strict=True)]
     centre = [(hi + lo) / 2 for lo, hi in zip(TABLE_LOW, TABLE_HIGH, strict=True)]
-    contact = {"friction": [1.0, 0.01, 0.003], "condim": 6, "solref": CONTACT_SOLREF, "solimp": CONTACT_SOLIMP}
+    contact = {
+        "friction": [1.0, 0.01, 0.003],
+        "condim": 6,
+        "solref": CONTACT_SOLREF,
+        "solimp": CONTACT_SOLIMP,
+    }
     spec.worldbody.add_geom(
         name="table", type=mujoco.mjtGeom.mjGEOM_BOX, size=[*size, TABLE_THICKNESS / 2],
         pos=[*centre, -TABLE_THICKNESS / 2], group=3, **contact,
     )  # fmt: skip
     spec.worldbody.add_geom(
-        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1], pos=[0, 0, FLOOR_Z], group=3, **contact
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[3, 3, 0.1],
+        pos=[0, 0, FLOOR_Z],
+        group=3,
+        **contact,
     )
 
 
@@ -113,9 +123,7 @@ def _add_contact_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
             )
 
 
-def _add_force_sensor(
-    spec: mujoco.MjSpec, name: str, other: tuple[mujoco.mjtObj, str], obj: str
-) -> None:
+def _add_force_sensor(spec: mujoco.MjSpec, name: str, other: tuple[mujoco.mjtObj, str], obj: str) -> None:
     data_spec = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
     net_force, num = 3, 1
     spec.add_sensor(

@@ -90,9 +90,9 @@ class ObservationBuilder:
             }
         return observation
 
-    def render(self) -> np.ndarray:
-        """Frames (n, height, width, 3) for videos, from the first camera of the observation."""
-        return self._renderer(self.render_size, self.cameras[0]).render(self.simulation.qpos)
+    def render(self, ids: np.ndarray) -> np.ndarray:
+        """Frames (k, height, width, 3) of simulations `ids` for videos, from the first camera."""
+        return self._renderer(self.render_size, self.cameras[0]).render(self.simulation.qpos[ids])
 
     def _agent_pos(self, p: np.ndarray, R: np.ndarray) -> np.ndarray:
         sim = self.simulation

@@ -84,9 +84,7 @@ BODIES: dict[str, Body] = {
 
 SCENES: dict[str, Scene] = {
     scene.name: scene
-    for scene in (
-        Scene("kitchen_2x2", ("ketchup bottle", "kitchen shovel"), ("yellow plate", "cloth")),
-    )
+    for scene in (Scene("kitchen_2x2", ("ketchup bottle", "kitchen shovel"), ("yellow plate", "cloth")),)
 }
 
 

@@ -39,7 +39,11 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         render_size: (height, width) of `render()` [px].
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ, "autoreset_mode": gym.vector.AutoresetMode.DISABLED}  # noqa: E501,RUF012
+    metadata = {
+        "render_modes": ["rgb_array"],
+        "render_fps": CONTROL_HZ,
+        "autoreset_mode": gym.vector.AutoresetMode.DISABLED,
+    }  # noqa: E501,RUF012
     render_mode = "rgb_array"
 
     def __init__(
@@ -116,7 +120,9 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             raise ValueError(f"actions must have shape ({self.num_envs}, 7), got {actions.shape}")
         bad = ~np.isfinite(actions[ids]).all(axis=1)
         if bad.any():
-            raise ValueError(f"actions of environments {ids[bad].tolist()} are not finite: {actions[ids[bad]]}")
+            raise ValueError(
+                f"actions of environments {ids[bad].tolist()} are not finite: {actions[ids[bad]]}"
+            )
         diverged = np.zeros(self.num_envs, dtype=bool)
         diverged[ids] = self.simulation.step(np.clip(actions[ids], ACTION_LOW, ACTION_HIGH), ids)
         before = self._level.copy()
@@ -210,12 +216,16 @@ class CronosVectorEnv(gym.vector.VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...]:
         """One frame (height, width, 3) uint8 per stream at `render_size`."""
-        return tuple(self._observations.render())
+        return tuple(self.render_streams(self._all))
 
-    def call(self, name: str, *args, **kwargs) -> tuple:
+    def render_streams(self, ids: np.ndarray) -> np.ndarray:
+        """Frames (k, height, width, 3) uint8 of some streams."""
+        return self._observations.render(ids)
+
+    def call(self, name: str, *args, **kwargs) -> Sequence:
         """What LeRobot asks of the sub-environments of a vector env."""
         if name == "render":
-            return self.render()
+            return LazyFrames(self)
         return self.get_attr(name)
 
     def get_attr(self, name: str) -> tuple:
@@ -227,6 +237,21 @@ class CronosVectorEnv(gym.vector.VectorEnv):
     def close_extras(self, **kwargs) -> None:
         """Free the renderers."""
         self._observations.close()
+
+
+class LazyFrames(Sequence):
+    """The frames of all streams, rendered when they are asked for: LeRobot slices off the few it keeps."""
+
+    def __init__(self, env: CronosVectorEnv):
+        self._env = env
+
+    def __len__(self) -> int:
+        return self._env.num_envs
+
+    def __getitem__(self, index):
+        ids = np.arange(len(self))[index]
+        frames = self._env.render_streams(np.atleast_1d(ids))
+        return list(frames) if isinstance(index, slice) else frames[0]
 
 
 def _pair(task: Task) -> tuple[str, str]:

@@ -1,0 +1,126 @@
+"""`--env.type=cronos`: the LeRobot configuration of the CRONOS scenes."""
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import parse_camera_names
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+
+from lerobot_env_cronos.configurations import SPLITS
+from lerobot_env_cronos.episodic import IndependentVectorEnv, LazyVectorEnv, find_task
+from lerobot_env_cronos.observations import AGENT_POS_NAMES, OBS_TYPES, environment_state_names
+from lerobot_env_cronos.scenes import CONTROL_HZ, SCENES, get_scene
+from lerobot_env_cronos.simulation import ACTION_NAMES
+
+SUITES = ("independent",)
+
+
+@EnvConfig.register_subclass("cronos")
+@dataclass
+class CronosEnvConfig(EnvConfig):
+    """Shared-scene pick and place on the Bridge table (CRONOS, Section 4)."""
+
+    task: str | None = None
+    """Instruction of the one task to evaluate; null for all tasks of the suite."""
+    fps: int = CONTROL_HZ
+    """Control frequency [Hz]; fixed by the protocol."""
+    scene: str = "kitchen_2x2"
+    """Scene: kitchen_2x2."""
+    suite: str = "independent"
+    """Evaluation suite: independent (every task from every configuration, 80 steps)."""
+    split: str = "train"
+    """Configurations: train or held_out, 64 each."""
+    obs_type: str = "pixels_agent_pos"
+    """pixels_agent_pos, or environment_state_agent_pos for the privileged state in place of pixels."""
+    privileged_state: bool = False
+    """Add observation.environment_state to pixel observations, for an asymmetric critic."""
+    observation_height: int = 128
+    """Height of the observed image [px]."""
+    observation_width: int = 128
+    """Width of the observed image [px]."""
+    camera_name: str = "front"
+    """Camera(s), comma-separated: front (sees every body), bridge (the Bridge set-up's third-person view)."""
+    render_size: tuple[int, int] = (480, 640)
+    """Height and width of videos [px]."""
+    num_threads: int = 0
+    """Physics threads, 0 for all cores; results are the same at any number."""
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self):
+        scene = get_scene(self.scene)
+        _check("suite", self.suite, SUITES)
+        _check("split", self.split, SPLITS)
+        _check("obs_type", self.obs_type, OBS_TYPES)
+        if self.fps != CONTROL_HZ:
+            raise ValueError(f"env.fps is fixed at {CONTROL_HZ} Hz by the protocol, got {self.fps}")
+        find_task(self.scene, self.task)
+        pixels = self.obs_type == "pixels_agent_pos"
+        self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),))}
+        self.features["agent_pos"] = PolicyFeature(FeatureType.STATE, (len(AGENT_POS_NAMES),))
+        self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE}
+        if self.privileged_state or not pixels:
+            size = len(environment_state_names(scene))
+            self.features["environment_state"] = PolicyFeature(FeatureType.ENV, (size,))
+            self.features_map["environment_state"] = OBS_ENV_STATE
+        for camera in parse_camera_names(self.camera_name) if pixels else []:
+            key = f"{OBS_IMAGES}.{camera}"
+            shape = (self.observation_height, self.observation_width, 3)
+            self.features[key] = PolicyFeature(FeatureType.VISUAL, shape)
+            self.features_map[key] = key
+
+    @property
+    def package_name(self) -> str:
+        """The module that registers the Gymnasium ids."""
+        return "lerobot_env_cronos"
+
+    @property
+    def gym_id(self) -> str:
+        """Gymnasium id of the single-environment form."""
+        return f"lerobot_env_cronos/{self.scene}-v0"
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Keyword arguments of `CronosVectorEnv`."""
+        names = (
+            "obs_type", "privileged_state", "observation_height", "observation_width", "camera_name",
+            "render_size", "num_threads",
+        )  # fmt: skip
+        return {name: getattr(self, name) for name in names}
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """One native vector env per task, built lazily; `use_async_envs` is not needed and ignored."""
+        scene = get_scene(self.scene)
+        task = find_task(self.scene, self.task)
+        envs = {
+            i: LazyVectorEnv(
+                partial(
+                    IndependentVectorEnv, n_envs, self.scene, task=t, split=self.split, **self.gym_kwargs
+                ),
+                n_envs,
+            )
+            for i, t in enumerate(scene.tasks)
+            if task in (None, t)
+        }
+        return {f"{self.suite}_{self.split}": envs}
+
+
+def _check(name: str, value: str, valid: tuple[str, ...]) -> None:
+    if value not in valid:
+        raise ValueError(f"unknown env.{name} {value!r}; valid values: {list(valid)}")
+
+
+def register_gymnasium() -> None:
+    """Register `lerobot_env_cronos/<scene>-v0` for every scene."""
+    for name in SCENES:
+        gym.register(
+            id=f"lerobot_env_cronos/{name}-v0",
+            entry_point="lerobot_env_cronos.episodic:CronosEnv",
+            kwargs={"scene": name},
+        )

@@ -1,0 +1,197 @@
+"""Episodes for evaluation: independent tasks, each from a benchmark configuration within 80 steps.
+
+These environments are what `lerobot-eval` and `gym.make` run; training streams use `CronosVectorEnv` itself.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from lerobot_env_cronos.configurations import SPLITS, load_configurations
+from lerobot_env_cronos.scenes import STEPS_PER_TASK, Task, get_scene
+from lerobot_env_cronos.vector_env import CronosVectorEnv
+
+
+class IndependentVectorEnv(CronosVectorEnv):
+    """`num_envs` independent episodes of one task (paper, Section 4, "Independent-task evaluation").
+
+    An episode starts from configuration `seed % 64` of `split` with the arm at home. It is `terminated` when the
+    task is complete and `truncated` after 80 steps; from then on it is frozen, pays no reward and reports no
+    success until the next `reset`, which is what LeRobot's rollout expects of a finished episode.
+
+    Args:
+        task: the task of every episode; None draws one of the scene's per episode.
+        split: `train` or `held_out`.
+        **kwargs: see `CronosVectorEnv`.
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        scene: str = "kitchen_2x2",
+        *,
+        task: Task | None = None,
+        split: str = "train",
+        **kwargs,
+    ):
+        if split not in SPLITS:
+            raise ValueError(f"unknown split {split!r}; valid splits: {list(SPLITS)}")
+        self.split, self.task = split, task
+        self._max_episode_steps = STEPS_PER_TASK
+        super().__init__(num_envs, scene, **kwargs)
+        self.done = np.zeros(num_envs, dtype=bool)
+        self._elapsed = np.zeros(num_envs, dtype=int)
+
+    def reset(self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None):
+        """Start new episodes in all environments, at configurations `seed + i` or `seeds[i]`, modulo 64."""
+        gym.vector.VectorEnv.reset(self, seed=seed if isinstance(seed, int) else None)
+        configurations = self._configurations_of(seed)
+        self.scene_reset(self._all, configurations, self.split)
+        if self.task is None:
+            drawn = self.np_random.integers(len(self.scene.tasks), size=self.num_envs)
+            self.set_task(self._all, [self.scene.tasks[i] for i in drawn])
+        else:
+            self.set_task(self._all, [self.task] * self.num_envs)
+        self.done[:] = False
+        self._elapsed[:] = 0
+        return self.observe(), self._info()
+
+    def step(self, actions: np.ndarray):
+        """Step the unfinished episodes; see `CronosVectorEnv.step`."""
+        running = self._all[~self.done]
+        reward, diverged = self._step_physics(actions, running)
+        reward[self.done] = 0.0
+        success = self.is_success & ~self.done
+        self._elapsed[running] += 1
+        # A diverged simulation cannot be judged any further: its episode ends as a failure.
+        truncated = ~self.done & ~success & ((self._elapsed >= self._max_episode_steps) | diverged)
+        self.done |= success | truncated
+        info = {"is_success": success, "is_grasped": self.is_grasped.copy(), "diverged": diverged}
+        return self.observe(), reward, success.copy(), truncated, info
+
+
+class LazyVectorEnv(gym.vector.VectorEnv):
+    """Builds its environment at the first use and frees it on `close`.
+
+    `lerobot-eval` creates the environments of all tasks up front and evaluates them one after the other; built
+    lazily, only one of them occupies memory and an OpenGL context at a time.
+    """
+
+    metadata = CronosVectorEnv.metadata
+    render_mode = "rgb_array"
+
+    def __init__(self, make: Callable[[], CronosVectorEnv], num_envs: int):
+        self._make = make
+        self._env: CronosVectorEnv | None = None
+        self.num_envs = num_envs
+
+    @property
+    def env(self) -> CronosVectorEnv:
+        """The environment, built if need be."""
+        if self._env is None:
+            self._env = self._make()
+        return self._env
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "_env":
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    def reset(self, *, seed=None, options=None):
+        """See `IndependentVectorEnv.reset`."""
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, actions):
+        """See `IndependentVectorEnv.step`."""
+        return self.env.step(actions)
+
+    def render(self):
+        """See `CronosVectorEnv.render`."""
+        return self.env.render()
+
+    def close(self, **kwargs) -> None:
+        """Free the environment; the next use builds it again."""
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+
+class CronosEnv(gym.Env):
+    """One episode at a time, Gymnasium's single-environment form of `IndependentVectorEnv`.
+
+    Args:
+        scene: name of the scene.
+        task: an instruction such as "put the ketchup bottle on the cloth", or None to draw one per episode.
+        split: `train` or `held_out`.
+        render_mode: None or `rgb_array`.
+        **kwargs: see `CronosVectorEnv`.
+
+    `reset(options={"configuration": i})` picks configuration i; otherwise it is drawn from the seeded generator.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": CronosVectorEnv.metadata["render_fps"]}  # noqa: RUF012
+
+    def __init__(
+        self,
+        scene: str = "kitchen_2x2",
+        *,
+        task: str | None = None,
+        split: str = "train",
+        render_mode: str | None = None,
+        **kwargs,
+    ):
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"unknown render_mode {render_mode!r}; valid: {self.metadata['render_modes']}")
+        self.render_mode = render_mode
+        self._env = IndependentVectorEnv(1, scene, task=find_task(scene, task), split=split, **kwargs)
+        self.observation_space = self._env.single_observation_space
+        self.action_space = self._env.single_action_space
+        self._num_configurations = len(load_configurations(scene, split))
+
+    @property
+    def task_description(self) -> str:
+        """The current language instruction."""
+        return self._env.instructions[0]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        """Start an episode; see the class."""
+        super().reset(seed=seed)
+        configuration = (options or {}).get("configuration")
+        if configuration is None:
+            configuration = int(self.np_random.integers(self._num_configurations))
+        if not 0 <= configuration < self._num_configurations:
+            raise ValueError(
+                f"configuration must be in 0..{self._num_configurations - 1}, got {configuration}"
+            )
+        observation, info = self._env.reset(seed=[configuration])
+        return _first(observation), _first(info) | {"task": self.task_description}
+
+    def step(self, action: np.ndarray):
+        """Apply an action (7,) in physical units."""
+        observation, reward, terminated, truncated, info = self._env.step(np.asarray(action)[None])
+        info = _first(info) | {"task": self.task_description}
+        return _first(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def render(self) -> np.ndarray | None:
+        """Frame (height, width, 3) uint8 at `render_size`, or None without a render mode."""
+        return self._env.render()[0] if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Free the renderers."""
+        self._env.close()
+
+
+def find_task(scene: str, instruction: str | None) -> Task | None:
+    """Task of a scene by its instruction; None stays None, and a ValueError names the valid ones."""
+    if instruction is None:
+        return None
+    tasks = {task.instruction: task for task in get_scene(scene).tasks}
+    if instruction not in tasks:
+        raise ValueError(f"unknown task {instruction!r} of {scene}; valid tasks: {list(tasks)}")
+    return tasks[instruction]
+
+
+def _first(batch: dict[str, Any]) -> dict[str, Any]:
+    return {k: _first(v) if isinstance(v, dict) else v[0] for k, v in batch.items()}
