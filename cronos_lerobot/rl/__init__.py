@@ -1,0 +1,1 @@
+"""Reinforcement learning: the policy's interface, rollouts, advantages, PPO."""

@@ -1,0 +1,1 @@
+"""Everything around Algorithm 1: configuration, checkpoints, logs, evaluation."""
