@@ -92,17 +92,13 @@ class CronosEnvConfig(EnvConfig):
         )  # fmt: skip
         return {name: getattr(self, name) for name in names}
 
-    def create_envs(
-        self, n_envs: int, use_async_envs: bool = False
-    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """One native vector env per task, built lazily; `use_async_envs` is not needed and ignored."""
         scene = get_scene(self.scene)
         task = find_task(self.scene, self.task)
-        envs = {
+        envs: dict[int, gym.vector.VectorEnv] = {
             i: LazyVectorEnv(
-                partial(
-                    IndependentVectorEnv, n_envs, self.scene, task=t, split=self.split, **self.gym_kwargs
-                ),
+                partial(IndependentVectorEnv, n_envs, self.scene, task=t, split=self.split, **self.gym_kwargs),
                 n_envs,
             )
             for i, t in enumerate(scene.tasks)

@@ -22,7 +22,7 @@ class IndependentVectorEnv(CronosVectorEnv):
     success until the next `reset`, which is what LeRobot's rollout expects of a finished episode.
 
     Args:
-        task: the task of every episode; None draws one of the scene's per episode.
+        task: the task of every episode.
         split: `train` or `held_out`.
         **kwargs: see `CronosVectorEnv`.
     """
@@ -49,11 +49,7 @@ class IndependentVectorEnv(CronosVectorEnv):
         gym.vector.VectorEnv.reset(self, seed=seed if isinstance(seed, int) else None)
         configurations = self._configurations_of(seed)
         self.scene_reset(self._all, configurations, self.split)
-        if self.task is None:
-            drawn = self.np_random.integers(len(self.scene.tasks), size=self.num_envs)
-            self.set_task(self._all, [self.scene.tasks[i] for i in drawn])
-        else:
-            self.set_task(self._all, [self.task] * self.num_envs)
+        self.set_task(self._all, [self.task] * self.num_envs)
         self.done[:] = False
         self._elapsed[:] = 0
         return self.observe(), self._info()
@@ -145,7 +141,9 @@ class CronosEnv(gym.Env):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"unknown render_mode {render_mode!r}; valid: {self.metadata['render_modes']}")
         self.render_mode = render_mode
-        self._env = IndependentVectorEnv(1, scene, task=find_task(scene, task), split=split, **kwargs)
+        chosen = find_task(scene, task)
+        self._tasks = get_scene(scene).tasks if chosen is None else (chosen,)
+        self._env = IndependentVectorEnv(1, scene, task=self._tasks[0], split=split, **kwargs)
         self.observation_space = self._env.single_observation_space
         self.action_space = self._env.single_action_space
         self._num_configurations = len(load_configurations(scene, split))
@@ -162,9 +160,8 @@ class CronosEnv(gym.Env):
         if configuration is None:
             configuration = int(self.np_random.integers(self._num_configurations))
         if not 0 <= configuration < self._num_configurations:
-            raise ValueError(
-                f"configuration must be in 0..{self._num_configurations - 1}, got {configuration}"
-            )
+            raise ValueError(f"configuration must be in 0..{self._num_configurations - 1}, got {configuration}")
+        self._env.task = self._tasks[self.np_random.integers(len(self._tasks))]
         observation, info = self._env.reset(seed=[configuration])
         return _first(observation), _first(info) | {"task": self.task_description}
 

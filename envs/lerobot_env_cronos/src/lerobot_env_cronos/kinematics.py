@@ -102,9 +102,7 @@ def inverse_kinematics(
     """
     for _ in range(iterations):
         p, R, jacobian = forward_kinematics(q)
-        error = np.concatenate(
-            [p_target - p, matrix_to_rotation_vector(R_target @ R.transpose(0, 2, 1))], axis=1
-        )
+        error = np.concatenate([p_target - p, matrix_to_rotation_vector(R_target @ R.transpose(0, 2, 1))], axis=1)
         # Rotations weigh 0.3 m/rad, so that a position error is not traded for a tiny rotation error.
         weight = np.array([1, 1, 1, 0.3, 0.3, 0.3])
         Jw, ew = jacobian * weight[:, None], error * weight

@@ -1,5 +1,7 @@
 """The MuJoCo model of a scene, built with MjSpec."""
 
+from typing import Any
+
 import mujoco
 import numpy as np
 
@@ -16,7 +18,7 @@ TABLE_LOW, TABLE_HIGH, TABLE_THICKNESS = (-0.20, -0.45), (0.70, 0.45), 0.04
 """Table top in the base frame, surface at z = 0 [m]. A body pushed over its edge falls to the floor."""
 FLOOR_Z = -0.75
 
-CAMERAS = {
+CAMERAS: dict[str, dict[str, Any]] = {
     # A front view that sees every body at the edge of the widened spawn area, also behind the arm.
     "front": {"pos": [0.75, 0, 0.62], "xyaxes": [0, 1, 0, -0.82, 0, 0.57], "fovy": 39.0},
     # The Bridge set-up's third-person Logitech C920, as identified by SimplerEnv.
@@ -118,9 +120,7 @@ def _add_contact_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
             _add_force_sensor(spec, grasp_sensor(side, obj), (mujoco.mjtObj.mjOBJ_GEOM, f"{side}_pad"), obj)
         _add_force_sensor(spec, support_sensor(obj, "table"), (mujoco.mjtObj.mjOBJ_GEOM, "table"), obj)
         for receptacle in scene.receptacles:
-            _add_force_sensor(
-                spec, support_sensor(obj, receptacle), (mujoco.mjtObj.mjOBJ_BODY, receptacle), obj
-            )
+            _add_force_sensor(spec, support_sensor(obj, receptacle), (mujoco.mjtObj.mjOBJ_BODY, receptacle), obj)
 
 
 def _add_force_sensor(spec: mujoco.MjSpec, name: str, other: tuple[mujoco.mjtObj, str], obj: str) -> None:

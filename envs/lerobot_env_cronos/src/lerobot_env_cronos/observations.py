@@ -24,6 +24,10 @@ AGENT_POS_NAMES = (
 (0 closed, 1 open), and the commanded minus the measured position [m]."""
 
 
+STATE_LIMIT = 10.0
+"""Bound of every state observation; a body further away than this has left the room [m]."""
+
+
 def environment_state_names(scene: Scene) -> tuple[str, ...]:
     """Names of the privileged state: 12 per body: position [m], two rotation columns, position from the hand."""
     parts = (
@@ -67,14 +71,14 @@ class ObservationBuilder:
 
     def _space(self) -> gym.spaces.Dict:
         def box(n: int) -> gym.spaces.Box:
-            return gym.spaces.Box(-np.inf, np.inf, (n,), np.float32)
+            return gym.spaces.Box(-STATE_LIMIT, STATE_LIMIT, (n,), np.float32)
 
         spaces: dict[str, gym.Space] = {"agent_pos": box(len(AGENT_POS_NAMES))}
         if self.privileged:
             spaces["environment_state"] = box(len(environment_state_names(self.simulation.scene)))
         if self.pixels:
             image = gym.spaces.Box(0, 255, (*self.size, 3), np.uint8)
-            spaces["pixels"] = gym.spaces.Dict({camera: image for camera in self.cameras})
+            spaces["pixels"] = gym.spaces.Dict(dict.fromkeys(self.cameras, image))
         return gym.spaces.Dict(spaces)
 
     def observe(self) -> dict[str, Any]:
@@ -85,8 +89,7 @@ class ObservationBuilder:
             observation["environment_state"] = self._environment_state(p)
         if self.pixels:
             observation["pixels"] = {
-                camera: self._renderer(self.size, camera).render(self.simulation.qpos)
-                for camera in self.cameras
+                camera: self._renderer(self.size, camera).render(self.simulation.qpos) for camera in self.cameras
             }
         return observation
 
@@ -97,13 +100,14 @@ class ObservationBuilder:
     def _agent_pos(self, p: np.ndarray, R: np.ndarray) -> np.ndarray:
         sim = self.simulation
         columns = (p, R[:, :, 0], R[:, :, 1], sim.gripper_opening()[:, None], sim.target_position() - p)
-        return np.concatenate(columns, axis=1, dtype=np.float32)
+        return np.concatenate(columns, axis=1, dtype=np.float32).clip(-STATE_LIMIT, STATE_LIMIT)
 
     def _environment_state(self, p: np.ndarray) -> np.ndarray:
         position = self.simulation.body_poses()[..., :3]
         R = self.simulation.body_rotations()
         parts = (position, R[..., 0], R[..., 1], position - p[:, None])
-        return np.concatenate(parts, axis=2, dtype=np.float32).reshape(len(p), -1)
+        flat = np.concatenate(parts, axis=2, dtype=np.float32).reshape(len(p), -1)
+        return flat.clip(-STATE_LIMIT, STATE_LIMIT)
 
     def _renderer(self, size: tuple[int, int], camera: str) -> BatchRenderer:
         key = (size, camera)

@@ -39,11 +39,11 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         render_size: (height, width) of `render()` [px].
     """
 
-    metadata = {
+    metadata = {  # noqa: RUF012 - Gymnasium declares it this way
         "render_modes": ["rgb_array"],
         "render_fps": CONTROL_HZ,
         "autoreset_mode": gym.vector.AutoresetMode.DISABLED,
-    }  # noqa: E501,RUF012
+    }
     render_mode = "rgb_array"
 
     def __init__(
@@ -120,9 +120,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             raise ValueError(f"actions must have shape ({self.num_envs}, 7), got {actions.shape}")
         bad = ~np.isfinite(actions[ids]).all(axis=1)
         if bad.any():
-            raise ValueError(
-                f"actions of environments {ids[bad].tolist()} are not finite: {actions[ids[bad]]}"
-            )
+            raise ValueError(f"actions of environments {ids[bad].tolist()} are not finite: {actions[ids[bad]]}")
         diverged = np.zeros(self.num_envs, dtype=bool)
         diverged[ids] = self.simulation.step(np.clip(actions[ids], ACTION_LOW, ACTION_HIGH), ids)
         before = self._level.copy()
