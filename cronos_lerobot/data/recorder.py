@@ -6,6 +6,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, REWARD
+from lerobot_env_cronos import CronosVectorEnv
 
 from cronos_lerobot.data.schema import (
     INTERVENTION,
@@ -19,6 +20,7 @@ from cronos_lerobot.data.schema import (
     TOTAL_INTERVENTIONS,
     VALUE,
     Intervention,
+    feature_names,
     observation_columns,
     stream_features,
 )
@@ -76,7 +78,7 @@ class StreamRecorder:
     @classmethod
     def open(
         cls,
-        env: Any,
+        env: CronosVectorEnv,
         repo_id: str,
         root: str | Path,
         *,
@@ -88,7 +90,7 @@ class StreamRecorder:
         """A recorder of `env`'s streams: into a new dataset, or on from a checkpoint.
 
         Args:
-            env: a vector environment; its observation space, `num_envs` and `render_fps` are read.
+            env: whose streams will be recorded; only its spaces, scene, size and frame rate are read.
             repo_id: the dataset's name, "owner/name".
             root: its folder; must not exist for a new dataset and must for a resumed one.
             segment_length: the most steps between two task switches (K).
@@ -97,11 +99,7 @@ class StreamRecorder:
             writer_options: passed on to `SegmentWriter`.
         """
         if state is None:
-            features = stream_features(
-                env.single_observation_space,
-                state_names=getattr(env, "state_names", None),
-                environment_state_names=getattr(env, "environment_state_names", None),
-            )
+            features = stream_features(env.single_observation_space, **feature_names(env))
             fps = int(env.metadata["render_fps"])
             writer = SegmentWriter(repo_id, root, features, fps, **writer_options)
         else:

@@ -14,6 +14,9 @@ from typing import Any, cast
 import gymnasium
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE, REWARD
+from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos.observations import AGENT_POS_NAMES, environment_state_names
+from lerobot_env_cronos.simulation import ACTION_NAMES
 
 SUCCESS = "next.success"
 STREAM_ID = "cronos.stream_id"
@@ -25,8 +28,6 @@ TOTAL_INTERVENTIONS = "cronos.total_interventions"
 POLICY_VERSION = "cronos.policy_version"
 LOG_PROB = "cronos.log_prob"
 VALUE = "cronos.value"
-
-ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 
 Features = dict[str, dict[str, Any]]
 
@@ -121,6 +122,14 @@ def stream_features(observation_space: gymnasium.Space, **names: Sequence[str] |
     """
     columns = {key: _scalar_feature(dtype) for key, dtype in _STREAM_COLUMNS.items()}
     return demonstration_features(observation_space, **names) | columns
+
+
+def feature_names(env: CronosVectorEnv) -> dict[str, Sequence[str]]:
+    """The names of `env`'s state dimensions, as keyword arguments of `demonstration_features`."""
+    return {
+        "state_names": AGENT_POS_NAMES,
+        "environment_state_names": environment_state_names(env.scene),
+    }
 
 
 def observation_columns(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:

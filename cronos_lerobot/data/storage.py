@@ -221,9 +221,7 @@ def next_shard_index(meta: LeRobotDatasetMetadata) -> int:
     return max((chunk * meta.info.chunks_size + file + 1 for chunk, file in numbers), default=0)
 
 
-def _replace_or_delete(
-    root: Path, path: Path, table: pa.Table, write: Callable[[pa.Table, Path], None]
-) -> None:
+def _replace_or_delete(root: Path, path: Path, table: pa.Table, write: Callable[[pa.Table, Path], None]) -> None:
     if table.num_rows == 0:
         path.unlink()
         return

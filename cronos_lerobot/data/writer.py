@@ -189,9 +189,7 @@ class SegmentWriter:
         """Finalize, also after an exception: what was recorded until then stays."""
         self.finalize()
 
-    def _start(
-        self, meta: LeRobotDatasetMetadata, encoder: RGBEncoderConfig | None, max_pending: int
-    ) -> None:
+    def _start(self, meta: LeRobotDatasetMetadata, encoder: RGBEncoderConfig | None, max_pending: int) -> None:
         self._meta = meta
         self._encoder = encoder or fast_encoder()
         self._max_pending = max_pending

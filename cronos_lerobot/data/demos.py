@@ -1,0 +1,259 @@
+"""Demonstrations of the scripted expert, as a LeRobotDataset: every task, from many starts, in balance."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from lerobot.utils.constants import ACTION, DONE, REWARD
+from lerobot_env_cronos import CronosVectorEnv, Task
+from lerobot_env_cronos.configurations import NUM_CONFIGURATIONS, sample_configuration
+from lerobot_env_cronos.simulation import ACTION_HIGH, ACTION_LOW
+
+from cronos_lerobot.data.perturbations import (
+    ActionNoise,
+    GraspMisses,
+    MissConfig,
+    NoiseConfig,
+    move_arm_at_random,
+)
+from cronos_lerobot.data.schema import SUCCESS, observation_columns
+from cronos_lerobot.data.writer import SegmentWriter
+
+ARM_POSES = ("home", "random", "after_task")
+LAYOUTS = ("train", "random")
+CONFIGURATION = "cronos.configuration"
+MAX_FAILURES_IN_A_ROW = 200
+
+
+class Expert(Protocol):
+    """A reactive controller of a vector environment."""
+
+    def reset(self, ids: np.ndarray) -> None:
+        """Forget what happened in the streams `ids`; a new task begins there."""
+
+    def act(self) -> np.ndarray:
+        """Actions (n, 7) in physical units for the environment's state as it is now."""
+
+
+@dataclass
+class StartConfig:
+    """Where a demonstration starts."""
+
+    layouts: str = "train"
+    """`train`: the scene's 64 training configurations in turn; `random`: freshly drawn layouts."""
+    arm_pose: str = "home"
+    """`home`; `random`: at a random place above the table; `after_task`: where another task left it."""
+    occupied_receptacles: bool = False
+    """The target receptacle already holds another object."""
+    share: float = 1.0
+    """Share of the episodes that `arm_pose` and `occupied_receptacles` apply to; the others start at home."""
+
+    def __post_init__(self) -> None:
+        """Check the choices."""
+        if self.layouts not in LAYOUTS:
+            raise ValueError(f"unknown start.layouts {self.layouts!r}; valid: {list(LAYOUTS)}")
+        if self.arm_pose not in ARM_POSES:
+            raise ValueError(f"unknown start.arm_pose {self.arm_pose!r}; valid: {list(ARM_POSES)}")
+        if not 0 <= self.share <= 1:
+            raise ValueError(f"start.share must be between 0 and 1, got {self.share}")
+
+
+@dataclass
+class DemoConfig:
+    """What a demonstration is."""
+
+    max_steps: int = 80
+    """Control steps until an episode counts as failed."""
+    steps_after_release: int = 3
+    """Frames kept after the object lies on its receptacle and is released."""
+    keep_failures: bool = False
+    """Also keep episodes that did not succeed within `max_steps`."""
+    start: StartConfig = field(default_factory=StartConfig)
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    misses: MissConfig = field(default_factory=MissConfig)
+
+
+@dataclass
+class _Episode:
+    """One attempt of a stream. A `prelude` task is carried out, unrecorded, before the task itself."""
+
+    task: Task
+    configuration: int
+    prelude: Task | None
+    at_home: bool
+    rng: np.random.Generator
+    settling: bool = True
+    steps: int = 0
+    released: int = 0
+    frames: dict[str, list] = field(default_factory=dict)
+
+
+class DemoCollector:
+    """Lets the expert act in all streams at once and writes each finished episode.
+
+    A stream is reset on its own, as soon as its episode is over. It then spends one unrecorded step at rest:
+    the observation after that step is the episode's first, and no frame is rendered twice.
+    """
+
+    def __init__(
+        self,
+        env: CronosVectorEnv,
+        expert: Expert,
+        writer: SegmentWriter,
+        config: DemoConfig,
+        *,
+        seed: int = 0,
+        tasks: Sequence[Task] | None = None,
+    ) -> None:
+        """Collect from all streams of `env` into `writer`, which may already hold episodes.
+
+        Args:
+            env: its layouts, arm poses and tasks are set by this class.
+            expert: acts in `env`.
+            writer: its features are those of `demonstration_features`.
+            config: what a demonstration is.
+            seed: decides layouts, noise, misses and starts.
+            tasks: to demonstrate; all of the scene's when None.
+        """
+        self.env, self.expert, self.writer, self.config = env, expert, writer, config
+        self.finished, self.successes = 0, 0
+        self._started = 0
+        self._seed = (seed, writer.num_episodes)
+        self._kept = dict.fromkeys(tasks or env.scene.tasks, 0)
+        self._tried = dict.fromkeys(self._kept, 0)
+        self._episodes: list[_Episode | None] = [None] * env.num_envs
+        self._noise = ActionNoise(config.noise, env.num_envs)
+        self._misses = GraspMisses(config.misses, env)
+        self._failures_in_a_row = 0
+
+    def collect(self, num_episodes: int, on_episode: Callable[[int], object] = lambda frames: None) -> None:
+        """Write `num_episodes` more episodes, the same number of each task as far as that divides.
+
+        Args:
+            num_episodes: how many.
+            on_episode: called with the number of frames of each episode written.
+
+        Raises:
+            RuntimeError: the expert failed 200 times in a row.
+        """
+        self._on_episode = on_episode
+        self._start_idle_streams(num_episodes)
+        observation = self.env.observe()
+        while any(episode is not None for episode in self._episodes):
+            labels = np.clip(self.expert.act(), ACTION_LOW, ACTION_HIGH).astype(np.float32)
+            columns = observation_columns(observation) | {ACTION: labels}
+            observation, reward, _, _, info = self.env.step(self._perturb(labels))
+            columns |= {REWARD: reward, SUCCESS: info["is_success"]}
+            for stream in range(self.env.num_envs):
+                self._after_step(stream, columns, info)
+            self._start_idle_streams(num_episodes)
+
+    def _perturb(self, labels: np.ndarray) -> np.ndarray:
+        recording = np.array([episode is not None and not episode.prelude for episode in self._episodes])
+        executed = self._misses.apply(labels, recording)
+        executed = self._noise.apply(executed, recording)
+        for stream, episode in enumerate(self._episodes):
+            if episode is None or episode.settling:
+                executed[stream] = _REST
+        return executed
+
+    def _after_step(self, stream: int, columns: Mapping[str, np.ndarray], info: Mapping[str, np.ndarray]) -> None:
+        episode = self._episodes[stream]
+        if episode is None:
+            return
+        if episode.settling:
+            episode.settling = False
+            return
+        episode.steps += 1
+        resting = info["is_success"][stream] and not info["is_grasped"][stream]
+        episode.released = episode.released + 1 if resting else 0
+        if not episode.prelude:
+            for key, column in columns.items():
+                episode.frames.setdefault(key, []).append(column[stream].copy())
+        succeeded = episode.released > self.config.steps_after_release
+        if info["diverged"][stream]:
+            self._end(stream, episode, succeeded=False, keep=False)
+        elif succeeded and episode.prelude:
+            self._end_prelude(stream, episode)
+        elif succeeded:
+            self._end(stream, episode, succeeded=True, keep=True)
+        elif episode.steps >= self.config.max_steps:
+            self._end(stream, episode, succeeded=False, keep=self.config.keep_failures and not episode.prelude)
+
+    def _end(self, stream: int, episode: _Episode, *, succeeded: bool, keep: bool) -> None:
+        self._episodes[stream] = None
+        self.finished += 1
+        self.successes += succeeded
+        self._failures_in_a_row = 0 if succeeded else self._failures_in_a_row + 1
+        if self._failures_in_a_row >= MAX_FAILURES_IN_A_ROW:
+            raise RuntimeError(f"the expert failed {MAX_FAILURES_IN_A_ROW} times in a row, last: {episode.task}")
+        if keep:
+            frames = {key: np.stack(values) for key, values in episode.frames.items()}
+            frames[DONE] = np.arange(episode.steps) == episode.steps - 1
+            metadata = {CONFIGURATION: episode.configuration, SUCCESS: succeeded}
+            self.writer.add_segment(frames, episode.task.instruction, episode_metadata=metadata)
+            self._kept[episode.task] += 1
+            self._on_episode(episode.steps)
+
+    def _end_prelude(self, stream: int, episode: _Episode) -> None:
+        ids = np.array([stream])
+        if self.config.start.arm_pose == "home":
+            self.env.end_effector_reset(ids)
+        self._begin_task(ids, episode)
+        episode.prelude = None
+
+    def _start_idle_streams(self, num_episodes: int) -> None:
+        """Give every idle stream an episode of the task that has the fewest, until enough are under way."""
+        under_way = dict(self._kept)
+        for episode in self._episodes:
+            if episode is not None:
+                under_way[episode.task] += 1
+        for stream, episode in enumerate(self._episodes):
+            if episode is None and sum(under_way.values()) < num_episodes:
+                task = min(under_way, key=lambda task: under_way[task])
+                under_way[task] += 1
+                self._episodes[stream] = self._new_episode(stream, task)
+
+    def _new_episode(self, stream: int, task: Task) -> _Episode:
+        rng = np.random.default_rng((*self._seed, self._started))
+        number = self._tried[task] % NUM_CONFIGURATIONS
+        self._tried[task] += 1
+        self._started += 1
+        start, ids = self.config.start, np.array([stream])
+        if start.layouts == "train":
+            self.env.scene_reset(ids, np.array([number]))
+        else:
+            number = -1
+            self.env.place_bodies(ids, sample_configuration(self.env.scene, rng)[None])
+        episode = _Episode(task, number, prelude=None, at_home=rng.random() >= start.share, rng=rng)
+        if not episode.at_home and (start.occupied_receptacles or start.arm_pose == "after_task"):
+            episode.prelude = self._prelude(task, rng)
+            self.env.set_task(ids, [episode.prelude])
+            self.expert.reset(ids)
+        else:
+            self._begin_task(ids, episode)
+        return episode
+
+    def _prelude(self, task: Task, rng: np.random.Generator) -> Task:
+        """Another object onto the target receptacle, or onto another one if that shall stay free."""
+        occupied = self.config.start.occupied_receptacles
+        choices = [
+            other
+            for other in self.env.scene.tasks
+            if other.object != task.object and (other.receptacle == task.receptacle) == occupied
+        ]
+        return choices[rng.integers(len(choices))]
+
+    def _begin_task(self, ids: np.ndarray, episode: _Episode) -> None:
+        if self.config.start.arm_pose == "random" and not episode.at_home:
+            move_arm_at_random(self.env, int(ids[0]), episode.rng)
+        self.env.set_task(ids, [episode.task])
+        self.expert.reset(ids)
+        self._noise.reset(ids[0], episode.rng)
+        self._misses.reset(ids[0], episode.rng)
+        episode.settling, episode.steps, episode.released = True, 0, 0
+
+
+_REST = np.array([0, 0, 0, 0, 0, 0, 1], dtype=np.float32)
+"""No motion, gripper open."""

@@ -1,0 +1,169 @@
+"""What is done to the expert on purpose while it demonstrates: noise, missed grasps, unusual arm poses.
+
+Only the EXECUTED action is perturbed. The recorded action stays the expert's own for the state that it finds
+itself in, so the data show how to come back from states the expert alone would never visit (Laskey et al.
+2017, "DART: Noise Injection for Robust Imitation Learning").
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos.kinematics import inverse_kinematics
+from lerobot_env_cronos.simulation import ACTION_HIGH, ACTION_LOW
+
+MOTION = slice(0, 6)
+"""The end-effector part of an action; the gripper command is never perturbed by noise."""
+
+
+@dataclass
+class NoiseConfig:
+    """Bursts of noise on the executed action; within a burst the arm is pushed one constant way."""
+
+    share: float = 0.0
+    """Share of the episodes that have bursts, from 0 to 1."""
+    rate: float = 0.15
+    """Probability per control step that a burst begins."""
+    min_steps: int = 1
+    """Shortest burst [control steps]."""
+    max_steps: int = 4
+    """Longest burst [control steps]."""
+    scale: float = 0.6
+    """Standard deviation of the push, as a fraction of half the action range of each dimension."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if not 0 <= self.share <= 1 or not 0 <= self.rate <= 1:
+            raise ValueError(f"noise.share and noise.rate must be from 0 to 1, got {self.share}, {self.rate}")
+        if not 1 <= self.min_steps <= self.max_steps:
+            raise ValueError(f"need 1 <= noise.min_steps <= noise.max_steps: {self.min_steps}, {self.max_steps}")
+
+
+@dataclass
+class MissConfig:
+    """Deliberately missed grasps: the gripper first closes beside the object, then the expert recovers."""
+
+    share: float = 0.0
+    """Share of the episodes that begin with a miss, from 0 to 1."""
+    min_offset_m: float = 0.025
+    """Smallest horizontal distance between the object and where the gripper closes [m]."""
+    max_offset_m: float = 0.06
+    """Largest such distance [m]."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if not 0 <= self.share <= 1:
+            raise ValueError(f"misses.share must be from 0 to 1, got {self.share}")
+        if not 0 < self.min_offset_m <= self.max_offset_m:
+            raise ValueError(f"need 0 < misses.min_offset_m <= misses.max_offset_m: {self}")
+
+
+class ActionNoise:
+    """The bursts of every stream."""
+
+    def __init__(self, config: NoiseConfig, num_envs: int) -> None:
+        """No bursts until `reset`."""
+        self._config = config
+        self._rngs: list[np.random.Generator | None] = [None] * num_envs
+        self._remaining = np.zeros(num_envs, dtype=np.int64)
+        self._push = np.zeros((num_envs, 6))
+
+    def reset(self, stream: int, rng: np.random.Generator) -> None:
+        """A new episode begins in `stream`; `rng` decides whether it has bursts, and draws them."""
+        self._rngs[stream] = rng if rng.random() < self._config.share else None
+        self._remaining[stream] = 0
+
+    def apply(self, actions: np.ndarray, active: np.ndarray) -> np.ndarray:
+        """Add the noise of this step to actions (n, 7) of the `active` (n,) streams; returns a copy."""
+        actions, config = actions.copy(), self._config
+        for stream in np.flatnonzero(active):
+            rng = self._rngs[stream]
+            if rng is None:
+                continue
+            if self._remaining[stream] == 0 and rng.random() < config.rate:
+                self._remaining[stream] = rng.integers(config.min_steps, config.max_steps, endpoint=True)
+                half_range = (ACTION_HIGH - ACTION_LOW)[MOTION] / 2
+                self._push[stream] = rng.normal(size=6) * config.scale * half_range
+            if self._remaining[stream] > 0:
+                self._remaining[stream] -= 1
+                actions[stream, MOTION] += self._push[stream]
+        return np.clip(actions, ACTION_LOW, ACTION_HIGH).astype(np.float32)
+
+
+class GraspMisses:
+    """Steers the gripper beside the object, closes it there, and hands the arm back to the expert."""
+
+    HOVER_M = 0.06
+    """Height above the object at which the approach ends and the descent begins [m]."""
+    TOLERANCE_M = 0.008
+    """A waypoint counts as reached within this distance [m]."""
+    CLOSED_STEPS = 3
+    MAX_STEPS = 25
+    """A miss that takes longer (the object was knocked away, the place is out of reach) is given up."""
+
+    def __init__(self, config: MissConfig, env: CronosVectorEnv) -> None:
+        """No misses until `reset`."""
+        self._config, self._env = config, env
+        self._offset: list[np.ndarray | None] = [None] * env.num_envs
+        self._descending = np.zeros(env.num_envs, dtype=bool)
+        self._closed_steps = np.zeros(env.num_envs, dtype=np.int64)
+        self._steps = np.zeros(env.num_envs, dtype=np.int64)
+
+    def reset(self, stream: int, rng: np.random.Generator) -> None:
+        """A new episode begins in `stream`; `rng` decides whether and where it misses first."""
+        self._offset[stream] = None
+        self._descending[stream] = False
+        self._closed_steps[stream] = self._steps[stream] = 0
+        if rng.random() < self._config.share:
+            angle = rng.uniform(0, 2 * np.pi)
+            distance = rng.uniform(self._config.min_offset_m, self._config.max_offset_m)
+            self._offset[stream] = distance * np.array([np.cos(angle), np.sin(angle), 0.0])
+
+    def apply(self, actions: np.ndarray, active: np.ndarray) -> np.ndarray:
+        """Replace translation and gripper of actions (n, 7) in the `active` streams that are missing.
+
+        The rotation stays the expert's: the gripper turns as for the real grasp.
+        """
+        missing = [i for i in np.flatnonzero(active) if self._offset[i] is not None]
+        if not missing:
+            return actions
+        actions = actions.copy()
+        targets = self._env.simulation.target_position()
+        for stream in missing:
+            actions[stream, :3], actions[stream, 6] = self._steer(stream, targets[stream])
+            self._steps[stream] += 1
+            if self._closed_steps[stream] == self.CLOSED_STEPS or self._steps[stream] == self.MAX_STEPS:
+                self._offset[stream] = None
+        return actions
+
+    def _steer(self, stream: int, position: np.ndarray) -> tuple[np.ndarray, float]:
+        """Translation [m] and gripper command of one stream that is missing."""
+        body = self._env.simulation.body_pose(self._env.tasks[stream].object)[stream, :3]
+        grasp = body + self._offset[stream]
+        hover = grasp + np.array([0.0, 0.0, self.HOVER_M])
+        if not self._descending[stream]:
+            self._descending[stream] = np.linalg.norm(hover - position) < self.TOLERANCE_M
+        goal = grasp if self._descending[stream] else hover
+        # Above the table the target's height is clamped, so that only the horizontal distance can vanish.
+        arrived = np.linalg.norm((grasp - position)[:2]) < self.TOLERANCE_M
+        low = position[2] - grasp[2] < self.TOLERANCE_M + MIN_TARGET_HEIGHT_M
+        if self._descending[stream] and arrived and low:
+            self._closed_steps[stream] += 1
+            return np.zeros(3), 0.0
+        return np.clip(goal - position, ACTION_LOW[:3], ACTION_HIGH[:3]), 1.0
+
+
+MIN_TARGET_HEIGHT_M = 0.032
+"""The environment keeps the end effector's target about this far above the table: its fingers' reach [m]."""
+
+
+def move_arm_at_random(env: CronosVectorEnv, stream: int, rng: np.random.Generator) -> None:
+    """Put the arm of a stream at a random place well above the table, the hand turned a little."""
+    sim, ids = env.simulation, np.array([stream])
+    position, rotation = sim.end_effector()
+    position = np.array([[*rng.uniform((0.20, -0.18), (0.42, 0.18)), rng.uniform(0.12, 0.26)]])
+    angle = rng.uniform(-0.6, 0.6)
+    c, s = np.cos(angle), np.sin(angle)
+    turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ rotation[ids]
+    # The solver converges from where the arm is; a few rounds cover the widest moves.
+    sim.move_arm(ids, inverse_kinematics(sim.qpos[ids, :6], position, turned, iterations=40))

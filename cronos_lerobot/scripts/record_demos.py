@@ -1,0 +1,140 @@
+"""`cronos-record-demos`: let the scripted expert demonstrate every task, into a LeRobotDataset.
+
+```bash
+cronos-record-demos --env.type=cronos --env.scene=kitchen_2x2 \\
+    --dataset.repo_id=me/kitchen_demos --dataset.num_episodes=500
+```
+"""
+
+import logging
+import shutil
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lerobot.configs import parser
+from lerobot.datasets.utils import INFO_PATH
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.constants import HF_LEROBOT_HOME
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.utils import init_logging
+from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos.config import CronosEnvConfig
+from lerobot_env_cronos.episodic import find_task
+from tqdm import tqdm
+
+from cronos_lerobot.data.demos import DemoCollector, DemoConfig
+from cronos_lerobot.data.schema import demonstration_features, feature_names
+from cronos_lerobot.data.writer import SegmentWriter
+
+
+@dataclass
+class DemoDatasetConfig:
+    """The dataset to write."""
+
+    repo_id: str = ""
+    """Its name, "owner/name"."""
+    root: Path | None = None
+    """Its folder; LeRobot's cache (`$HF_LEROBOT_HOME/<repo_id>`) when null."""
+    num_episodes: int = 500
+    """Episodes to have in the end, all tasks together."""
+    overwrite: bool = False
+    """Delete a dataset that is already there."""
+
+
+@dataclass
+class RecordDemosConfig(DemoConfig):
+    """Flags of `cronos-record-demos`, besides those of `DemoConfig`."""
+
+    env: EnvConfig = field(default_factory=CronosEnvConfig)
+    """Scene and observations; `--env.task` restricts the demonstrations to one task."""
+    dataset: DemoDatasetConfig = field(default_factory=DemoDatasetConfig)
+    seed: int = 0
+    """Decides layouts, noise, misses and starts."""
+    num_envs: int = 32
+    """Streams that the expert acts in at once."""
+    resume: bool = False
+    """Go on with a dataset that is already there, until it has `dataset.num_episodes`."""
+
+    def __post_init__(self) -> None:
+        """Check what draccus cannot."""
+        if not isinstance(self.env, CronosEnvConfig):
+            raise ValueError(f"the scripted expert needs --env.type=cronos, got {self.env.type!r}")
+        if not self.dataset.repo_id:
+            raise ValueError("--dataset.repo_id is required, e.g. --dataset.repo_id=me/kitchen_demos")
+        if self.resume and self.dataset.overwrite:
+            raise ValueError("--resume=true and --dataset.overwrite=true exclude each other")
+        if self.dataset.root is None:
+            self.dataset.root = HF_LEROBOT_HOME / self.dataset.repo_id
+
+
+@parser.wrap()
+def record_demos(cfg: RecordDemosConfig) -> None:
+    """Record the demonstrations; Ctrl-C ends early and keeps what is there."""
+    from lerobot_env_cronos.expert import ScriptedExpert
+
+    assert isinstance(cfg.env, CronosEnvConfig)
+    env = CronosVectorEnv(cfg.num_envs, cfg.env.scene, **cfg.env.gym_kwargs)
+    task = find_task(cfg.env.scene, cfg.env.task)
+    start = time.perf_counter()
+    try:
+        with open_writer(cfg, env) as writer:
+            before = writer.num_episodes
+            expert = ScriptedExpert(env, seed=cfg.seed)
+            collector = DemoCollector(
+                env, expert, writer, cfg, seed=cfg.seed, tasks=None if task is None else [task]
+            )
+            with tqdm(total=cfg.dataset.num_episodes, initial=before, unit="episode") as bar:
+                frames = 0
+
+                def show(length: int) -> None:
+                    nonlocal frames
+                    frames += length
+                    bar.set_postfix_str(f"{frames / (time.perf_counter() - start):.0f} frames/s")
+                    bar.update()
+
+                try:
+                    collector.collect(cfg.dataset.num_episodes - before, show)
+                except KeyboardInterrupt:
+                    logging.warning("interrupted: keeping the episodes recorded so far")
+    finally:
+        env.close()
+    rate = collector.successes / max(collector.finished, 1)
+    logging.info(
+        f"{writer.num_episodes} episodes, {writer.num_frames} frames in {writer.root};"
+        f" the expert succeeded in {rate:.1%} of {collector.finished} attempts"
+    )
+
+
+def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv) -> SegmentWriter:
+    """A new dataset, or the one that is there if `resume` or `overwrite` says what to do with it.
+
+    Raises:
+        FileExistsError: the folder exists and neither flag is set.
+    """
+    root = cfg.dataset.root
+    assert root is not None
+    if cfg.resume:
+        return SegmentWriter.resume(cfg.dataset.repo_id, root)
+    if root.exists():
+        if not cfg.dataset.overwrite:
+            raise FileExistsError(
+                f"{root} exists: --resume=true goes on with it, --dataset.overwrite=true replaces it"
+            )
+        if any(root.iterdir()) and not (root / INFO_PATH).is_file():
+            raise FileExistsError(f"{root} exists and is not a LeRobotDataset: not overwriting it")
+        shutil.rmtree(root)
+    features = demonstration_features(env.single_observation_space, **feature_names(env))
+    fps = int(env.metadata["render_fps"])
+    return SegmentWriter(cfg.dataset.repo_id, root, features, fps, robot_type="widowx")
+
+
+def main() -> None:
+    """Entry point of `cronos-record-demos`."""
+    init_logging()
+    register_third_party_plugins()
+    record_demos()  # ty: ignore[missing-argument]  # the parser fills in `cfg`
+
+
+if __name__ == "__main__":
+    main()
