@@ -1,5 +1,7 @@
 """CRONOS scenes as a LeRobot environment plugin."""
 
+from lerobot_env_cronos import gl as gl  # isort: skip  # chooses the OpenGL platform before mujoco is imported
+
 from lerobot_env_cronos.config import CronosEnvConfig, register_gymnasium
 from lerobot_env_cronos.episodic import CronosEnv, IndependentVectorEnv
 from lerobot_env_cronos.scenes import CONTROL_HZ, SCENES, STEPS_PER_TASK, Scene, Task, get_scene

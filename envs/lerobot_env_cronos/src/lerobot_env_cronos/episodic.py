@@ -32,7 +32,7 @@ class IndependentVectorEnv(CronosVectorEnv):
         num_envs: int,
         scene: str = "kitchen_2x2",
         *,
-        task: Task | None = None,
+        task: Task,
         split: str = "train",
         **kwargs,
     ):

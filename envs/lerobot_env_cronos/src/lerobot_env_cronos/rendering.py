@@ -1,9 +1,13 @@
 """Frames of many simulations, by MuJoCo's classic renderer on a few threads."""
 
+import os
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
 import numpy as np
+
+from lerobot_env_cronos import gl
 
 
 class BatchRenderer:
@@ -22,9 +26,13 @@ class BatchRenderer:
         self._shadows = shadows
         self._pools = [ThreadPoolExecutor(1, thread_name_prefix="render") for _ in range(num_workers)]
         self._workers = [pool.submit(self._make_worker).result() for pool in self._pools]
+        self._finalizer = weakref.finalize(self, _free, self._pools, self._workers)
 
     def _make_worker(self) -> tuple[mujoco.Renderer, mujoco.MjData]:
-        renderer = mujoco.Renderer(self.model, self.height, self.width, max_geom=500)
+        try:
+            renderer = mujoco.Renderer(self.model, self.height, self.width, max_geom=500)
+        except Exception as error:  # The platforms raise whatever their bindings do.
+            raise RuntimeError(gl.HELP.format(platform=os.environ.get("MUJOCO_GL"))) from error
         renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._shadows
         renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = self._shadows
         return renderer, mujoco.MjData(self.model)
@@ -43,11 +51,18 @@ class BatchRenderer:
         return frames
 
     def close(self) -> None:
-        """Free the OpenGL contexts, each in the thread that made it."""
-        for pool, (renderer, _) in zip(self._pools, self._workers, strict=True):
+        """Free the OpenGL contexts; also done when the renderer is garbage-collected."""
+        self._finalizer()
+
+
+def _free(pools: list[ThreadPoolExecutor], workers: list) -> None:
+    """Free each OpenGL context in the thread in which it is current: elsewhere EGL refuses."""
+    for pool, (renderer, _) in zip(pools, workers, strict=True):
+        try:
             pool.submit(renderer.close).result()
-            pool.shutdown()
-        self._pools, self._workers = [], []
+        except RuntimeError:  # At interpreter exit the threads are gone, and so is their hold on the context.
+            renderer.close()
+        pool.shutdown()
 
 
 def _render_some(worker, camera: str, qpos: np.ndarray, frames: np.ndarray, indices: range) -> None:

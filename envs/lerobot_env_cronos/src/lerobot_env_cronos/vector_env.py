@@ -4,7 +4,7 @@ It never resets itself and never emits `terminated` or `truncated`: in reset-fre
 an event of the training loop. `lerobot_env_cronos.episodic` adds episodes for evaluation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -177,14 +177,15 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         self.simulation.move_body(ids, body, pose[None])
         self._judge(ids)
 
-    def set_task(self, ids: np.ndarray, tasks: Sequence[Task]) -> None:
+    def set_task(self, ids: Iterable[int], tasks: Sequence[Task]) -> None:
         """Give streams `ids` their tasks; the reward's level starts from the state as it is."""
         valid = self.scene.tasks + self.scene.reset_tasks
+        ids = np.asarray(ids)
         for i, task in zip(ids, tasks, strict=True):
             if task not in valid:
                 raise ValueError(f"unknown task {task}; valid tasks: {[t.instruction for t in valid]}")
             self.tasks[i] = task
-        self._judge(np.asarray(ids))
+        self._judge(ids)
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Everything that decides the future, as numpy arrays; see `Simulation.get_state`."""

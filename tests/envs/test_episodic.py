@@ -1,0 +1,96 @@
+"""Evaluation episodes, Gymnasium's checker, and LeRobot's plugin interface."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.factory import make_env, make_env_config
+from lerobot.envs.utils import env_to_policy_features
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot_env_cronos import SCENES, CronosEnvConfig, IndependentVectorEnv, get_scene
+from lerobot_env_cronos.configurations import load_configurations
+
+STATE = "environment_state_agent_pos"
+TASK = get_scene("kitchen_2x2").tasks[0]
+
+
+@pytest.mark.parametrize("obs_type", ["pixels_agent_pos", STATE])
+@pytest.mark.parametrize("scene", SCENES)
+def test_gymnasium_checker_has_no_complaint(scene, obs_type):
+    env = gym.make(f"lerobot_env_cronos/{scene}-v0", obs_type=obs_type, render_mode="rgb_array")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Actions are in metres and radians, on purpose.
+        warnings.filterwarnings("ignore", message=".*symmetric and normalized.*")
+        check_env(env.unwrapped)
+    env.close()
+
+
+def test_configuration_follows_the_seed_whatever_the_batch_size():
+    expected = load_configurations("kitchen_2x2", "held_out")
+    for n, seeds in ((4, [1000, 1001, 1002, 1003]), (2, [1002, 1003])):
+        env = IndependentVectorEnv(n, task=TASK, split="held_out", obs_type=STATE)
+        env.reset(seed=seeds)
+        for i, seed in enumerate(seeds):
+            np.testing.assert_allclose(env.simulation.body_poses()[i], expected[seed % 64], atol=1e-9)
+
+
+def test_finished_episodes_freeze_and_pay_nothing():
+    env = IndependentVectorEnv(2, task=TASK, obs_type=STATE)
+    env.reset(seed=0)
+    plate = env.simulation.body_pose("yellow plate")[0].copy()
+    pose = np.array([[*plate[:2], plate[2] + 0.0135, 1, 0, 0, 0]])
+    env.simulation.move_body(np.array([0]), "ketchup bottle", pose)
+    action = np.tile([0, 0, 0.01, 0, 0, 0, 1.0], (2, 1))
+    _, _, terminated, truncated, info = env.step(action)
+    assert terminated.tolist() == info["is_success"].tolist() == [True, False]
+    assert not truncated.any()
+    frozen = env.simulation.qpos[0].copy()
+    for step in range(2, 81):
+        _, reward, terminated, truncated, info = env.step(action)
+        assert reward[0] == 0.0
+        assert not terminated.any()
+        assert not info["is_success"].any()
+        assert truncated.tolist() == [False, step == 80]
+    np.testing.assert_array_equal(env.simulation.qpos[0], frozen)
+
+
+def test_lerobot_finds_the_plugin_and_builds_every_task():
+    register_third_party_plugins()
+    assert "cronos" in EnvConfig.get_known_choices()
+    cfg = make_env_config("cronos", split="held_out", observation_height=64, observation_width=64)
+    envs = make_env(cfg, n_envs=2)["independent_held_out"]
+    assert sorted(envs) == [0, 1, 2, 3]
+    env = envs[2]
+    observation, _ = env.reset(seed=[0, 1], options={"lerobot_new_rollout": True})
+    assert observation["pixels"]["front"].shape == (2, 64, 64, 3)
+    assert env.call("task_description") == ("put the kitchen shovel on the yellow plate",) * 2
+    assert env.call("_max_episode_steps") == (80, 80)
+    frames = env.call("render")
+    assert len(frames) == 2
+    assert np.stack(frames[:1]).shape == (1, 480, 640, 3)
+    assert env.metadata["render_fps"] == cfg.fps == 5
+    for env in envs.values():
+        env.close()
+
+
+def test_policy_features_match_what_the_env_observes():
+    cfg = CronosEnvConfig(privileged_state=True)
+    features = env_to_policy_features(cfg)
+    env = next(iter(cfg.create_envs(1)["independent_train"].values()))
+    observation, _ = env.reset(seed=[0])
+    assert features["observation.images.front"].shape == (3, 128, 128)
+    assert features["observation.state"].shape == observation["agent_pos"].shape[1:]
+    assert features["observation.environment_state"].shape == observation["environment_state"].shape[1:]
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("suite", "chains"), ("split", "test"), ("scene", "x"), ("task", "tidy up"), ("fps", 30)]
+)
+def test_config_errors_name_the_bad_value(field, value):
+    with pytest.raises(ValueError, match=str(value)):
+        CronosEnvConfig(**{field: value})
