@@ -1,0 +1,59 @@
+"""`cronos-train`: reset-free reinforcement learning of a LeRobot policy.
+
+Example:
+    cronos-train --policy.path=<checkpoint> --env.type=cronos --env.scene=kitchen_2x2 \
+        --protocol.scene_reset_interval=1280 --steps=1300000 --output_dir=outputs/train/eer
+"""
+
+import sys
+from typing import Any
+
+import torch
+from lerobot.configs import parser
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.random_utils import set_seed
+from lerobot.utils.utils import init_logging
+
+from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.factory import make_env, make_policy_and_processors
+from cronos_lerobot.training.trainer import Trainer
+
+
+@parser.wrap()
+def train(config: CronosTrainConfig) -> None:
+    """Train as `config` says, from the start or from a checkpoint."""
+    config.validate()
+    init_logging()
+    if config.torch_threads is not None:
+        torch.set_num_threads(config.torch_threads)
+    set_seed(config.seed)
+    policy, preprocessor, postprocessor = make_policy_and_processors(config)
+    env = make_env(config, config.num_envs)
+    trainer = Trainer(config, env, lambda n: make_env(config, n), policy, preprocessor, postprocessor)
+    try:
+        trainer.train()
+    finally:
+        env.close()
+    push_to_hub(config, policy, preprocessor, postprocessor)
+
+
+def push_to_hub(config: CronosTrainConfig, policy: Any, preprocessor: Any, postprocessor: Any) -> None:
+    """Push the trained policy to `--policy.repo_id`, if it is given and pushing is on."""
+    assert config.policy is not None
+    if config.policy.push_to_hub and config.policy.repo_id:
+        for part in (policy, preprocessor, postprocessor):
+            part.push_to_hub(config.policy.repo_id, private=config.policy.private)
+
+
+def main() -> None:
+    """Parse the command line and train."""
+    register_third_party_plugins()
+    # draccus wants the type of a choice whenever one of its fields is set; PPO is ours.
+    given = [argument.split("=")[0] for argument in sys.argv[1:]]
+    if "--algorithm.type" not in given and "--config_path" not in given:
+        sys.argv.append("--algorithm.type=ppo")
+    train()
+
+
+if __name__ == "__main__":
+    main()

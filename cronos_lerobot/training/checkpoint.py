@@ -1,0 +1,185 @@
+"""Checkpoints in LeRobot's layout that continue a run bit for bit.
+
+checkpoints/
+  0102400/
+    pretrained_model/   config.json, model.safetensors, processors, train_config.json: what LeRobot loads
+    training_state/     optimizer, RNGs, loop.json, env_state.npz, observers.pt, training_step.json
+  last -> 0102400
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.common.train_utils import get_step_identifier, save_training_step
+from lerobot.optim import load_optimizer_state, save_optimizer_state
+from lerobot.utils.constants import (
+    CHECKPOINTS_DIR,
+    LAST_CHECKPOINT_LINK,
+    PRETRAINED_MODEL_DIR,
+    TRAINING_STATE_DIR,
+)
+from lerobot.utils.random_utils import load_rng_state, save_rng_state
+from safetensors.torch import load_model, save_model
+
+from cronos_lerobot.loop_state import LoopState
+from cronos_lerobot.rl.ppo import PPO
+from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.seeding import NamedGenerators
+
+BASE_POLICY = "base_policy.safetensors"
+ENV_STATE = "env_state.npz"
+LOOP = "loop.json"
+OBSERVERS = "observers.pt"
+PARTIAL = ".partial_"
+"""Prefix of folders that a kill may leave behind; the next checkpoint removes them."""
+
+
+@dataclass
+class RunState:
+    """What a run is made of, beside its config."""
+
+    ppo: PPO
+    loop: LoopState
+    generators: NamedGenerators
+    env: Any
+    preprocessor: Any
+    postprocessor: Any
+
+
+def save_checkpoint(
+    run: RunState, config: CronosTrainConfig, observers: dict[str, Any], env_state: dict[str, np.ndarray]
+) -> Path:
+    """Write a checkpoint and point `last` at it; returns its folder.
+
+    A kill at any moment leaves either the whole checkpoint or none: it is written beside its place and
+    renamed into it, and `last` changes hands in one step.
+
+    Args:
+        run: the run between two segments.
+        config: of the run.
+        observers: states of the loggers and recorders by name: numbers, strings, NumPy arrays.
+        env_state: of `env.get_state()`.
+    """
+    assert config.output_dir is not None
+    folder = Path(config.output_dir) / CHECKPOINTS_DIR
+    folder.mkdir(parents=True, exist_ok=True)
+    final = folder / get_step_identifier(run.loop.n, config.total_steps)
+    _remove_partial(folder)
+    partial = Path(tempfile.mkdtemp(prefix=PARTIAL, dir=folder))
+    try:
+        _write_model(run, config, partial / PRETRAINED_MODEL_DIR)
+        _write_training_state(run, partial / TRAINING_STATE_DIR, observers, env_state)
+        partial.chmod(0o755)
+        _flush_to_disk(partial)
+        if final.exists():
+            final.rename(folder / f"{PARTIAL}{final.name}")
+        partial.rename(final)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    _point_last_at(final)
+    _remove_partial(folder)
+    if config.keep_checkpoints is not None:
+        for old in list_checkpoints(folder)[: -config.keep_checkpoints]:
+            shutil.rmtree(old)
+    return final
+
+
+def load_checkpoint(run: RunState, folder: Path) -> dict[str, Any]:
+    """Bring `run` to where `save_checkpoint` found it; returns the observers' states.
+
+    Raises:
+        NotADirectoryError: `folder` is no checkpoint of a run.
+        ValueError: the run has another number of streams or tasks.
+    """
+    state_dir = folder / TRAINING_STATE_DIR
+    if not state_dir.is_dir():
+        raise NotADirectoryError(f"{folder} is no checkpoint of a run: it has no {TRAINING_STATE_DIR}.")
+    state = json.loads((state_dir / LOOP).read_text())
+    for name in ("num_streams", "num_tasks"):
+        if state["loop"][name] != getattr(run.loop, name):
+            raise ValueError(
+                f"The checkpoint has {name}={state['loop'][name]}, this run {getattr(run.loop, name)}."
+            )
+    load_model(run.ppo.policy, str(folder / PRETRAINED_MODEL_DIR / "model.safetensors"))
+    load_optimizer_state(run.ppo.optimizer, state_dir)
+    if run.ppo.base_policy is not None:
+        load_model(run.ppo.base_policy, str(state_dir / BASE_POLICY))
+    run.ppo.num_updates = state["num_updates"]
+    run.loop.__dict__.update(vars(LoopState.from_state_dict(state["loop"])))
+    run.generators.load_state_dict(state["generators"])
+    with np.load(state_dir / ENV_STATE) as arrays:
+        run.env.set_state(dict(arrays))
+    load_rng_state(state_dir)
+    return _map_leaves(torch.load(state_dir / OBSERVERS), torch.Tensor, lambda tensor: tensor.numpy())
+
+
+def list_checkpoints(folder: Path) -> list[Path]:
+    """Return the checkpoints in `folder`, oldest first."""
+    return sorted(p for p in folder.iterdir() if p.is_dir() and not p.is_symlink() and p.name.isdigit())
+
+
+def _write_model(run: RunState, config: CronosTrainConfig, folder: Path) -> None:
+    run.ppo.policy.save_pretrained(folder)
+    config.save_pretrained(folder)
+    run.preprocessor.save_pretrained(folder)
+    run.postprocessor.save_pretrained(folder)
+
+
+def _write_training_state(
+    run: RunState, folder: Path, observers: dict[str, Any], env_state: dict[str, np.ndarray]
+) -> None:
+    folder.mkdir()
+    save_optimizer_state(run.ppo.optimizer, folder)
+    save_rng_state(folder)
+    save_training_step(run.loop.n, folder)
+    if run.ppo.base_policy is not None:
+        save_model(run.ppo.base_policy, str(folder / BASE_POLICY))
+    np.savez(folder / ENV_STATE, **env_state)
+    # As tensors, which torch reads back without executing anything.
+    torch.save(_map_leaves(observers, np.ndarray, torch.from_numpy), folder / OBSERVERS)
+    state = {
+        "loop": run.loop.state_dict(),
+        "num_updates": run.ppo.num_updates,
+        "generators": run.generators.state_dict(),
+    }
+    (folder / LOOP).write_text(json.dumps(state))
+
+
+def _map_leaves(tree: Any, leaf: type, convert: Callable[[Any], Any]) -> Any:
+    """Convert every `leaf` in nested dicts and lists."""
+    if isinstance(tree, dict):
+        return {key: _map_leaves(value, leaf, convert) for key, value in tree.items()}
+    if isinstance(tree, list):
+        return [_map_leaves(value, leaf, convert) for value in tree]
+    return convert(tree) if isinstance(tree, leaf) else tree
+
+
+def _remove_partial(folder: Path) -> None:
+    for path in folder.glob(f"{PARTIAL}*"):
+        shutil.rmtree(path)
+
+
+def _flush_to_disk(folder: Path) -> None:
+    for path in folder.rglob("*"):
+        if path.is_file():
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
+
+
+def _point_last_at(checkpoint: Path) -> None:
+    link = checkpoint.parent / LAST_CHECKPOINT_LINK
+    new = checkpoint.parent / f".{LAST_CHECKPOINT_LINK}"
+    new.unlink(missing_ok=True)
+    new.symlink_to(checkpoint.name)
+    new.replace(link)

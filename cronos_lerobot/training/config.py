@@ -1,0 +1,221 @@
+"""The configuration of a training run, `cronos-train`, LeRobot's way."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import draccus
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs.default import WandBConfig
+from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.envs import EnvConfig
+from lerobot.rl.algorithms.configs import RLAlgorithmConfig
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+
+from cronos_lerobot.protocol import ProtocolConfig
+from cronos_lerobot.rl.ppo_config import PPOConfig
+from cronos_lerobot.task_orders import TASK_ORDERS
+
+NUM_CONFIGURATIONS = 64
+"""Benchmark configurations of each split."""
+
+
+@dataclass
+class RecordConfig:
+    """Record training streams as a LeRobotDataset."""
+
+    repo_id: str | None = None
+    """Name of the dataset, user/name; null records nothing."""
+    root: Path | None = None
+    """Folder of the dataset; <output_dir>/streams by default."""
+    streams: str = "1"
+    """How many of the streams to record, the first ones: a number or `all`."""
+
+    @property
+    def num_streams(self) -> int | str:
+        """`streams` as a number, or "all".
+
+        Raises:
+            ValueError: it is neither.
+        """
+        if self.streams == "all" or str(self.streams).isdigit():
+            return "all" if self.streams == "all" else int(self.streams)
+        raise ValueError(f"record.streams must be a number or 'all', got {self.streams!r}.")
+
+
+@dataclass
+class PeriodicEvaluationConfig:
+    """Independent evaluation on environments of its own: every task from every configuration."""
+
+    n_episodes: int = 64
+    """Configurations for each task, 1 to 64: the first ones of the split."""
+    split: str = "train"
+    """Configurations to evaluate on: `train` or `held_out`."""
+    temperature: float = 0.6
+    """Sampling temperature; 0 takes the likeliest action."""
+    batch_size: int = 64
+    """Parallel environments of the evaluation."""
+    seed: int = 1000
+    """Seed of the action sampling, the same at every evaluation."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.n_episodes <= NUM_CONFIGURATIONS:
+            raise ValueError(f"eval.n_episodes must be 1 to {NUM_CONFIGURATIONS}, got {self.n_episodes}.")
+        if self.split not in ("train", "held_out"):
+            raise ValueError(f"eval.split must be 'train' or 'held_out', got {self.split!r}.")
+        if self.temperature < 0:
+            raise ValueError(f"eval.temperature must be >= 0, got {self.temperature}.")
+        if self.batch_size < 1:
+            raise ValueError(f"eval.batch_size must be >= 1, got {self.batch_size}.")
+
+
+@dataclass
+class CronosTrainConfig:
+    """Reset-free reinforcement learning of a LeRobot policy.
+
+    Raises:
+        ValueError: a value is out of its range.
+    """
+
+    env: EnvConfig | None = None
+    """The scene: --env.type=cronos --env.scene=kitchen_2x2 ..."""
+    policy: PreTrainedConfig | None = None
+    """The policy to start from: --policy.path=<checkpoint or Hub id>, or --policy.type=... from scratch."""
+    output_dir: Path | None = None
+    """Folder of the run: checkpoints, metrics, TensorBoard; must not exist unless resuming."""
+    job_name: str | None = None
+    """Name of the run; <env>_<policy> by default."""
+    resume: bool = False
+    """Continue a run: --resume=true --config_path=<run>/checkpoints/last/pretrained_model/train_config.json"""
+    seed: int = 1000
+    """Seed of everything random in the run."""
+    steps: int = 1_300_000
+    """S: interaction steps, summed over the streams; rounded up to whole policy updates."""
+    num_envs: int = 64
+    """N: parallel streams."""
+    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
+    """When a stream switches task, when the policy learns, and what help a stream gets."""
+    algorithm: RLAlgorithmConfig = field(default_factory=PPOConfig)
+    """How the policy learns: --algorithm.type=ppo (PocketVLA's settings, default) or ppo_paper."""
+    record: RecordConfig = field(default_factory=RecordConfig)
+    """Recording of the streams."""
+    eval: PeriodicEvaluationConfig = field(default_factory=PeriodicEvaluationConfig)
+    """The periodic evaluation."""
+    eval_freq: int = 102_400
+    """Interaction steps between two evaluations; one more before the first step, one after the last.
+    0 never evaluates."""
+    save_checkpoint: bool = True
+    """Save checkpoints."""
+    save_freq: int = 102_400
+    """Interaction steps between two checkpoints; one more at the end. 0 saves only that one."""
+    keep_checkpoints: int | None = None
+    """Keep only this many checkpoints, the latest; null keeps all."""
+    log_freq: int = 1
+    """Policy updates between two lines on the console; metrics.jsonl has every update."""
+    tensorboard: bool = True
+    """Write TensorBoard events to <output_dir>/tensorboard."""
+    wandb: WandBConfig = field(default_factory=WandBConfig)
+    """Weights & Biases."""
+    torch_threads: int | None = None
+    """Threads of PyTorch on the CPU; null leaves PyTorch's default."""
+    checkpoint_path: Path | None = field(init=False, default=None)
+    """The checkpoint to resume from, set by `validate`."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "num_envs", "log_freq"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be >= 1, got {getattr(self, name)}.")
+        for name in ("eval_freq", "save_freq"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}.")
+        if self.keep_checkpoints is not None and self.keep_checkpoints < 1:
+            raise ValueError(f"keep_checkpoints must be >= 1 or null, got {self.keep_checkpoints}.")
+        if self.protocol.task_order not in TASK_ORDERS:
+            raise ValueError(
+                f"protocol.task_order must be one of {sorted(TASK_ORDERS)}, got {self.protocol.task_order!r}."
+            )
+        _ = self.record.num_streams
+
+    @property
+    def steps_per_update(self) -> int:
+        """Interaction steps, summed over the streams, between two policy updates."""
+        return self.num_envs * self.protocol.update_interval
+
+    @property
+    def total_steps(self) -> int:
+        """`steps` rounded up to whole policy updates."""
+        return -(-self.steps // self.steps_per_update) * self.steps_per_update
+
+    def validate(self) -> None:
+        """Resolve paths given on the command line, as LeRobot's own training config does.
+
+        Raises:
+            ValueError: the policy, the environment or, when resuming, the checkpoint is missing.
+            FileExistsError: the output folder exists and the run is not a resumed one.
+        """
+        if self.env is None:
+            raise ValueError("Choose an environment: --env.type=cronos --env.scene=kitchen_2x2.")
+        if not isinstance(self.algorithm, PPOConfig):
+            raise ValueError(f"--algorithm.type must be ppo or ppo_paper, got {self.algorithm.type!r}.")
+        if self.resume:
+            self._resolve_checkpoint()
+        elif path := parser.get_path_arg("policy"):
+            overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
+            self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+            self.policy.pretrained_path = Path(path)
+        if self.policy is None:
+            raise ValueError("Choose a policy: --policy.path=<checkpoint or Hub id>, or --policy.type=<name>.")
+        self.job_name = self.job_name or f"{self.env.type}_{self.policy.type}"
+        if self.output_dir is None:
+            self.output_dir = Path("outputs/train") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_{self.job_name}"
+        if not self.resume and Path(self.output_dir).exists():
+            raise FileExistsError(f"{self.output_dir} exists; choose another --output_dir or --resume=true.")
+
+    def _resolve_checkpoint(self) -> None:
+        given = parser.parse_arg("config_path")
+        if given is None and self.checkpoint_path is None:
+            raise ValueError(
+                f"Resuming needs --config_path=<run>/checkpoints/last/{PRETRAINED_MODEL_DIR}/{TRAIN_CONFIG_NAME}."
+            )
+        if given is not None:
+            folder = Path(given) if Path(given).is_dir() else Path(given).parent
+            self.checkpoint_path = folder.resolve().parent
+        assert self.checkpoint_path is not None
+        if self.policy is not None:
+            self.policy.pretrained_path = self.checkpoint_path / PRETRAINED_MODEL_DIR
+
+    @classmethod
+    def __get_path_fields__(cls) -> list[str]:
+        """Fields that take `--<field>.path`."""
+        return ["policy"]
+
+    @classmethod
+    def from_pretrained(cls, path: str | Path, *, cli_args: list[str] | None = None) -> CronosTrainConfig:
+        """Read a saved config, a train_config.json or its folder, with flags that override it.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+        """
+        file = Path(path) / TRAIN_CONFIG_NAME if Path(path).is_dir() else Path(path)
+        if not file.is_file():
+            raise FileNotFoundError(f"No training config at {file}.")
+        with draccus.config_type("json" if file.suffix == ".json" else "yaml"):
+            return draccus.parse(cls, file, args=cli_args or [])
+
+    def save_pretrained(self, folder: Path) -> None:
+        """Write train_config.json into `folder`."""
+        (folder / TRAIN_CONFIG_NAME).write_text(json.dumps(self.to_dict(), indent=4))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the config as JSON-ready values."""
+        config = draccus.encode(self)
+        config.pop("checkpoint_path", None)
+        return config
+
+    # What lerobot's WandBLogger asks of a training config.
+    is_reward_model_training = False
+    dataset = None

@@ -1,0 +1,153 @@
+"""Independent evaluation: scene reset, one task, 80 steps, success if complete at any step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from math import sqrt
+from typing import Any
+
+import numpy as np
+import torch
+
+from cronos_lerobot.data.schema import observation_columns
+from cronos_lerobot.rl.processing import PolicyProcessors
+
+STEPS_PER_TASK = 80
+"""Control steps of one evaluation episode (paper, Section 5)."""
+Z_95 = 1.959963984540054
+"""97.5 % quantile of the normal distribution."""
+
+
+def wilson_interval(successes: int, n: int) -> tuple[float, float]:
+    """Return the 95 % Wilson score interval of a success rate.
+
+    Raises:
+        ValueError: there are no trials, or more successes than trials.
+    """
+    if not 0 <= successes <= n or n == 0:
+        raise ValueError(f"Need 0 <= successes <= n and n > 0, got successes={successes}, n={n}.")
+    p, z2 = successes / n, Z_95**2
+    centre = (p + z2 / (2 * n)) / (1 + z2 / n)
+    half = Z_95 * sqrt(p * (1 - p) / n + z2 / (4 * n * n)) / (1 + z2 / n)
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+@dataclass(frozen=True)
+class SuccessRate:
+    """Successes of n episodes."""
+
+    successes: int
+    n: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Rate, n and the ends of the 95 % interval."""
+        low, high = wilson_interval(self.successes, self.n)
+        return {"success": self.successes / self.n, "n": self.n, "ci95": [low, high]}
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """What an independent evaluation came to."""
+
+    split: str
+    temperature: float
+    configurations: list[int]
+    successes: dict[str, list[bool]] = field(default_factory=dict)
+    """By instruction: one flag for each configuration."""
+
+    @property
+    def overall(self) -> SuccessRate:
+        """All tasks together."""
+        flags = [flag for task in self.successes.values() for flag in task]
+        return SuccessRate(sum(flags), len(flags))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return rates with their intervals, overall and by task."""
+        return {
+            "split": self.split,
+            "temperature": self.temperature,
+            **self.overall.to_dict(),
+            "per_task": {task: SuccessRate(sum(f), len(f)).to_dict() for task, f in self.successes.items()},
+        }
+
+
+@torch.inference_mode()
+def evaluate_independent(
+    env: Any,
+    tasks: Sequence[Any],
+    policy: Any,
+    processors: PolicyProcessors,
+    *,
+    configurations: Sequence[int] = tuple(range(64)),
+    split: str = "train",
+    temperature: float = 0.6,
+    seed: int = 1000,
+    num_steps: int = STEPS_PER_TASK,
+) -> EvaluationResult:
+    """Evaluate a policy on every task from every configuration.
+
+    The sampling is seeded, so the same policy gets the same result whenever it is asked, as long as
+    `env.num_envs` and the order of tasks and configurations stay the same.
+
+    Args:
+        env: environments of the evaluation's own, never those of a training stream.
+        tasks: the tasks to evaluate.
+        policy: a TrainablePolicy.
+        processors: between `env` and `policy`.
+        configurations: indices into the split.
+        split: `train` or `held_out`.
+        temperature: of the sampling, 0 for the likeliest action.
+        seed: of the sampling.
+        num_steps: control steps of an episode.
+    """
+    was_training = policy.training
+    policy.eval()
+    generator = torch.Generator(device=processors.device)
+    generator.manual_seed(seed)
+    result = EvaluationResult(split, temperature, list(configurations), {task.instruction: [] for task in tasks})
+    jobs = [(task, configuration) for task in tasks for configuration in configurations]
+    for batch in _batches(jobs, env.num_envs):
+        _place(env, batch, split)
+        succeeded = _rollout(env, policy, processors, temperature, generator, num_steps, len(batch))
+        for (task, _), success in zip(batch, succeeded[: len(batch)], strict=True):
+            result.successes[task.instruction].append(bool(success))
+    policy.train(was_training)
+    return result
+
+
+def _batches(jobs: list[tuple[Any, int]], size: int) -> Iterator[list[tuple[Any, int]]]:
+    for start in range(0, len(jobs), size):
+        yield jobs[start : start + size]
+
+
+def _place(env: Any, batch: list[tuple[Any, int]], split: str) -> None:
+    """Put one episode on each environment; those left over repeat the last one and are not counted."""
+    padded = batch + [batch[-1]] * (env.num_envs - len(batch))
+    ids = np.arange(env.num_envs)
+    env.scene_reset(ids, np.array([configuration for _, configuration in padded]), split=split)
+    env.set_task(ids, [task for task, _ in padded])
+
+
+def _rollout(
+    env: Any,
+    policy: Any,
+    processors: PolicyProcessors,
+    temperature: float,
+    generator: torch.Generator,
+    num_steps: int,
+    num_episodes: int,
+) -> np.ndarray:
+    """Return (num_envs,) bool, whether the task was complete at any step; stops once all counted ones were."""
+    instructions = [task.instruction for task in env.tasks]
+    succeeded = np.zeros(env.num_envs, np.bool_)
+    observation = env.observe()
+    for _ in range(num_steps):
+        batch = processors.batch(observation_columns(observation), instructions)
+        sample = policy.sample_actions(batch, temperature=temperature, generator=generator)
+        observation, _, _, _, info = env.step(processors.physical_actions(sample["action"]))
+        # A simulation that broke down proves nothing, whatever it shows.
+        succeeded |= info["is_success"] & ~info["diverged"]
+        if succeeded[:num_episodes].all():
+            break
+    return succeeded

@@ -1,0 +1,56 @@
+"""Makes the environments and the policy that a training config names."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.utils.constants import OBS_ENV_STATE
+from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
+
+from cronos_lerobot.rl.policy import check_trainable
+from cronos_lerobot.training.config import CronosTrainConfig
+
+
+def make_env(config: CronosTrainConfig, num_envs: int) -> CronosVectorEnv:
+    """Return `num_envs` streams of the config's scene; they never reset themselves.
+
+    Raises:
+        ValueError: the environment is not a CRONOS scene.
+    """
+    env_config = config.env
+    if not isinstance(env_config, CronosEnvConfig):
+        name = env_config.type if env_config else None
+        raise ValueError(f"Reset-free training needs --env.type=cronos, got {name!r}.")
+    return CronosVectorEnv(
+        num_envs, scene=env_config.scene, reward=config.protocol.reward, **env_config.gym_kwargs
+    )
+
+
+def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any]:
+    """Return the config's policy on its device, its preprocessor and its postprocessor.
+
+    A policy that reads the privileged state (a critic may) turns it on in the environment.
+
+    Raises:
+        TypeError: the policy cannot be trained by reinforcement.
+    """
+    policy_config, env_config = config.policy, config.env
+    assert policy_config is not None
+    assert isinstance(env_config, CronosEnvConfig)
+    if OBS_ENV_STATE in (policy_config.input_features or {}) and not env_config.privileged_state:
+        env_config.privileged_state = True
+        env_config.__post_init__()
+    if not policy_config.pretrained_path:
+        logging.warning("Training a policy from scratch: its states are not normalised, its success starts at 0.")
+    policy = make_policy(policy_config, env_cfg=env_config)
+    check_trainable(policy)
+    path = policy_config.pretrained_path
+    overrides = {"device_processor": {"device": policy_config.device}}
+    preprocessor, postprocessor = make_pre_post_processors(
+        policy_config,
+        pretrained_path=str(path) if path else None,
+        **({"preprocessor_overrides": overrides} if path else {}),
+    )
+    return policy, preprocessor, postprocessor

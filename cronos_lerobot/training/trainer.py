@@ -1,0 +1,217 @@
+"""Runs Algorithm 1 and everything that watches it: logs, recordings, evaluations, checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cronos_lerobot.loop_state import Event, LoopState, SegmentEnd, Step, Update
+from cronos_lerobot.resets import make_resets
+from cronos_lerobot.rf_mtrl import rf_mtrl
+from cronos_lerobot.rl.agent import PPOAgent
+from cronos_lerobot.rl.ppo import PPO
+from cronos_lerobot.rl.ppo_config import PPOConfig
+from cronos_lerobot.rl.processing import PolicyProcessors
+from cronos_lerobot.rl.rollout_buffer import RolloutBuffer
+from cronos_lerobot.stopwatch import Stopwatch
+from cronos_lerobot.task_orders import make_task_order
+from cronos_lerobot.training.checkpoint import RunState, load_checkpoint, save_checkpoint
+from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.evaluation import evaluate_independent
+from cronos_lerobot.training.logging import RolloutStatistics, RunLogger, write_manifest
+from cronos_lerobot.training.recording import StreamObserver
+from cronos_lerobot.training.seeding import NamedGenerators
+
+
+class TimedEnv:
+    """The streams' environment, with the time spent in it on a stopwatch.
+
+    An env that keeps a dict `seconds` of its own (physics, render) is reported in that detail.
+    """
+
+    def __init__(self, env: Any, stopwatch: Stopwatch) -> None:
+        self._env = env
+        self._stopwatch = stopwatch
+
+    def __getattr__(self, name: str) -> Any:
+        """Pass on everything that is not timed."""
+        return getattr(self._env, name)
+
+    def step(self, actions: np.ndarray) -> tuple:
+        """Step the environment."""
+        with self._stopwatch("env"):
+            return self._env.step(actions)
+
+    def observe(self) -> dict[str, Any]:
+        """Observe, as after an intervention."""
+        with self._stopwatch("env"):
+            return self._env.observe()
+
+    def scene_reset(self, *args: Any, **kwargs: Any) -> None:
+        """Reset scenes."""
+        with self._stopwatch("reset"):
+            self._env.scene_reset(*args, **kwargs)
+
+    def end_effector_reset(self, ids: np.ndarray) -> None:
+        """Send arms home."""
+        with self._stopwatch("reset"):
+            self._env.end_effector_reset(ids)
+
+
+class Trainer:
+    """One training run.
+
+    Args:
+        config: validated; its output folder is made.
+        env: the N streams; never reset by anyone but the run.
+        make_eval_env: makes the evaluation's own environments, n of them, when first needed.
+        policy: a LeRobot policy that is a TrainablePolicy.
+        preprocessor: the policy's LeRobot preprocessor.
+        postprocessor: the policy's LeRobot postprocessor.
+
+    Raises:
+        TypeError: the policy is not trainable.
+        ValueError: the checkpoint to resume does not fit the config.
+    """
+
+    def __init__(
+        self,
+        config: CronosTrainConfig,
+        env: Any,
+        make_eval_env: Callable[[int], Any],
+        policy: Any,
+        preprocessor: Any,
+        postprocessor: Any,
+    ) -> None:
+        assert isinstance(config.algorithm, PPOConfig)
+        self.config = config
+        self.stopwatch = Stopwatch()
+        self.env = TimedEnv(env, self.stopwatch)
+        self.tasks = list(env.scene.tasks)
+        self._make_eval_env = make_eval_env
+        self._eval_env: Any = None
+        device = str(next(policy.parameters()).device)
+        self.generators = NamedGenerators(config.seed, device)
+        self.processors = PolicyProcessors(preprocessor, postprocessor, device)
+        ppo = PPO(policy, self.processors, config.algorithm, self.generators.numpy("minibatches"))
+        buffer = RolloutBuffer(config.protocol.update_interval, config.num_envs)
+        self.agent = PPOAgent(ppo, buffer, self.generators.torch("actions"), self.stopwatch)
+        self.loop = LoopState(config.num_envs, len(self.tasks))
+        self.run_state = RunState(ppo, self.loop, self.generators, env, preprocessor, postprocessor)
+        self.statistics = RolloutStatistics([task.instruction for task in self.tasks])
+        # Every named generator exists before a checkpoint is loaded into them.
+        self._resets = make_resets(config.protocol, self.generators.numpy("configurations"))
+        self._task_order = make_task_order(config.protocol.task_order, self.generators.numpy("task_order"))
+
+    def train(self) -> None:
+        """Run to the last step or the end of the budget, from the start or from the config's checkpoint."""
+        observers: dict[str, Any] = {}
+        if self.config.checkpoint_path is not None:
+            observers = load_checkpoint(self.run_state, self.config.checkpoint_path)
+        write_manifest(self.config)
+        self.logger = RunLogger(self.config, self.loop, observers.get("logger", {}).get("offset"))
+        self.recorder = StreamObserver.open(self.config, self.env, observers.get("recorder"))
+        try:
+            if self.loop.t == 0:
+                self._evaluate()
+            self._run()
+        finally:
+            self.recorder.close()
+            self.logger.close()
+
+    def _run(self) -> None:
+        last_eval = last_save = self.loop.n
+        updated = False
+        self.stopwatch.lap()
+        for event in self._events():
+            self._observe(event)
+            updated |= isinstance(event, Update)
+            if not (updated and isinstance(event, SegmentEnd)):
+                continue
+            updated = False
+            # Reading the simulations' state wakes sleeping bodies, so it is done at every update: the run
+            # must not depend on how often it is saved.
+            env_state = self.env.get_state()
+            self._log_update()
+            if _due(self.loop.n, last_eval, self.config.eval_freq):
+                self._evaluate()
+                last_eval = self.loop.n
+            if self.config.save_checkpoint and _due(self.loop.n, last_save, self.config.save_freq):
+                self._save(env_state)
+                last_save = self.loop.n
+        if last_eval < self.loop.n:
+            self._evaluate()
+        if self.config.save_checkpoint and (last_save < self.loop.n or not self._has_checkpoint()):
+            self._save(self.env.get_state())
+
+    def _events(self) -> Any:
+        return rf_mtrl(
+            self.env,
+            self.tasks,
+            self.agent,
+            self._task_order,
+            self._resets,
+            self.config.protocol,
+            self.loop,
+            self.config.total_steps,
+        )
+
+    def _observe(self, event: Event) -> None:
+        self.statistics.on_event(event)
+        if isinstance(event, Step):
+            with self.stopwatch("record"):
+                self.recorder.on_step(event)
+        elif isinstance(event, Update):
+            self._update_metrics = event.metrics
+
+    def _log_update(self) -> None:
+        wall, seconds = self.stopwatch.lap()
+        shares = {name: spent / wall for name, spent in sorted(seconds.items())}
+        steps_per_s = self.config.steps_per_update / wall
+        rollout = self.statistics.pop()
+        record = {"rollout": rollout, "ppo": self._update_metrics, "steps_per_s": steps_per_s}
+        self.logger.log("update", record | {"time_share": shares})
+        if self.loop.updates % self.config.log_freq == 0:
+            self.logger.progress({"success": rollout["success"], "steps_per_s": steps_per_s})
+
+    def _evaluate(self) -> None:
+        if not self.config.eval_freq:
+            return
+        options = self.config.eval
+        if self._eval_env is None:
+            num_episodes = len(self.tasks) * options.n_episodes
+            self._eval_env = self._make_eval_env(min(options.batch_size, num_episodes))
+        result = evaluate_independent(
+            self._eval_env,
+            self.tasks,
+            self.agent.ppo.policy,
+            self.processors,
+            configurations=range(options.n_episodes),
+            split=options.split,
+            temperature=options.temperature,
+            seed=options.seed,
+        )
+        self.logger.log("evaluation", result.to_dict())
+        self.stopwatch.lap()
+
+    def _save(self, env_state: dict[str, np.ndarray]) -> None:
+        observers = {"logger": self.logger.state_dict(), "recorder": self.recorder.state_dict()}
+        self.logger.log_checkpoint(save_checkpoint(self.run_state, self.config, observers, env_state))
+        self.stopwatch.lap()
+
+    def _has_checkpoint(self) -> bool:
+        return self.config.checkpoint_path is not None
+
+
+def _due(n: int, last: int, frequency: int) -> bool:
+    """Whether a multiple of `frequency` lies in (last, n]; 0 is never."""
+    return frequency > 0 and n // frequency > last // frequency
+
+
+def output_dir(config: CronosTrainConfig) -> Path:
+    """Return the run's folder of a validated config."""
+    assert config.output_dir is not None
+    return Path(config.output_dir)
