@@ -72,7 +72,7 @@ class ActionBoundsProcessorStep(ProcessorStep):
         if action is None:
             return transition
         converted = transition.copy()
-        converted[TransitionKey.ACTION] = self.convert(torch.as_tensor(action))
+        converted["action"] = self.convert(torch.as_tensor(action))
         return converted
 
     def convert(self, action: Tensor) -> Tensor:

@@ -46,7 +46,7 @@ class PocketVLAConfig(PreTrainedConfig):
     sigma_init: float = 0.2
     """Initial standard deviation of the `gaussian` head, in normalised action units."""
     sigma_min: float = 0.05
-    """Smallest standard deviation that can be learned; below half a bin there would be no exploration left."""
+    """Smallest standard deviation that can be learned; below half a bin nothing is explored."""
     sigma_max: float = 0.6
     """Largest standard deviation that can be learned."""
     temperature: float = 0.6
@@ -116,9 +116,7 @@ class PocketVLAConfig(PreTrainedConfig):
             if getattr(self, name) not in get_args(choices):
                 raise ValueError(f"{name}={getattr(self, name)!r} is not one of {list(get_args(choices))}")
         if self.n_obs_steps != 1:
-            raise ValueError(
-                f"n_obs_steps={self.n_obs_steps}: PocketVLA sees one step, n_obs_steps must be 1"
-            )
+            raise ValueError(f"n_obs_steps={self.n_obs_steps}: PocketVLA sees one step, n_obs_steps must be 1")
         if not 0 < self.sigma_min < self.sigma_init < self.sigma_max:
             raise ValueError(
                 "0 < sigma_min < sigma_init < sigma_max is needed, got "
@@ -154,8 +152,8 @@ class PocketVLAConfig(PreTrainedConfig):
             raise ValueError(f"image_key={self.image_key!r} is not among the image features {sorted(images)}")
         if not images:
             raise ValueError(
-                f"observation='image', but none of the input features {sorted(self.input_features or {})} is an "
-                "image; use observation='environment_state' or data with a camera"
+                "observation='image' needs an image among the features, got "
+                f"{sorted(self.input_features or {})}; else use observation='environment_state'"
             )
         if self.image_key is None and len(images) > 1:
             raise ValueError(f"choose one of the cameras {sorted(images)} with image_key")

@@ -69,10 +69,18 @@ class BinDistribution:
         return -(log_probs.exp() * log_probs).sum(-1).mean(-1)
 
 
+def two_point_logits(sign_logit: Tensor, num_bins: int) -> Tensor:
+    """Logits (B, bins) with P(last bin) = sigmoid(sign_logit), the rest on the first; sign_logit is (B,)."""
+    half = 0.5 * sign_logit[:, None]
+    between = torch.full((len(half), num_bins - 2), IMPOSSIBLE, device=half.device)
+    return torch.cat((-half, between, half), dim=-1)
+
+
 class CategoricalHead(nn.Module):
     """A free logit for every bin of every dimension."""
 
     def __init__(self, features: int, action_dim: int, num_bins: int) -> None:
+        """Build the layers."""
         super().__init__()
         self.shape = (action_dim, num_bins)
         self.project = nn.Linear(features, action_dim * num_bins)
@@ -100,6 +108,8 @@ class GaussianHead(nn.Module):
         mean_limit: the mean stays inside (-mean_limit, mean_limit); above 1 so that edge bins are reachable.
     """
 
+    centres: Tensor
+
     def __init__(
         self,
         features: int,
@@ -111,6 +121,7 @@ class GaussianHead(nn.Module):
         sigma_max: float,
         mean_limit: float = 1.25,
     ) -> None:
+        """Build the layers."""
         super().__init__()
         self.gripper_dim = None if gripper_dim is None else gripper_dim % action_dim
         self.mean_limit = mean_limit
@@ -129,10 +140,6 @@ class GaussianHead(nn.Module):
         low, high = self.log_sigma_range
         return (low + (high - low) * torch.sigmoid(self.raw_sigma)).exp()
 
-    def mean(self, features: Tensor) -> Tensor:
-        """Mean of each dimension in normalised units, shape (B, D)."""
-        return self.mean_limit * torch.tanh(self.project(features) / self.mean_limit)
-
     def forward(self, features: Tensor) -> Tensor:
         """Features (B, F) to logits (B, D, bins)."""
         raw = self.project(features)
@@ -141,11 +148,6 @@ class GaussianHead(nn.Module):
         logits = -0.5 * distance.square()
         if self.gripper_dim is None:
             return logits
-        return self._with_gripper(logits, raw[:, self.gripper_dim])
-
-    def _with_gripper(self, logits: Tensor, sign_logit: Tensor) -> Tensor:
-        """Put the two-point distribution with P(top bin) = sigmoid(sign_logit) in the gripper's place."""
-        gripper = torch.full_like(logits[:, 0], IMPOSSIBLE)
-        gripper = torch.cat((-0.5 * sign_logit[:, None], gripper[:, 1:-1], 0.5 * sign_logit[:, None]), dim=-1)
-        parts = [logits[:, : self.gripper_dim], gripper[:, None], logits[:, self.gripper_dim + 1 :]]
-        return torch.cat(parts, dim=1)
+        dim = self.gripper_dim
+        gripper = two_point_logits(raw[:, dim], logits.shape[-1])
+        return torch.cat((logits[:, :dim], gripper[:, None], logits[:, dim + 1 :]), dim=1)

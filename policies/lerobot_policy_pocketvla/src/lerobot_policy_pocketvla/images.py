@@ -14,8 +14,8 @@ def to_signed_unit_range(images: Tensor, dtype: torch.dtype) -> Tensor:
     """
     if images.dtype == torch.uint8:
         # 0..255 and its half steps are exact in bfloat16, so this equals the float path up to one rounding.
-        return (images.to(dtype) - 127.5) * (1.0 / 127.5)
-    return (images.float() * 2.0 - 1.0).to(dtype)
+        return images.to(dtype).sub_(127.5).mul_(1.0 / 127.5)
+    return (images.float() * 2.0).sub_(1.0).to(dtype)
 
 
 def check_image_size(images: Tensor, expected: tuple[int, int, int], key: str) -> None:
@@ -26,9 +26,9 @@ def check_image_size(images: Tensor, expected: tuple[int, int, int], key: str) -
     """
     if images.ndim != 4 or tuple(images.shape[1:]) != expected:
         raise ValueError(
-            f"{key} has shape {tuple(images.shape)}, but this policy was trained at (batch, channels, height, "
-            f"width) = (batch, {expected[0]}, {expected[1]}, {expected[2]}). Render or resize to "
-            f"{expected[1]} x {expected[2]}, or train a policy at the other size."
+            f"{key} has shape {tuple(images.shape)}, but this policy was trained at "
+            f"(batch, {expected[0]}, {expected[1]}, {expected[2]}), height and width last. "
+            f"Render or resize to {expected[1]} x {expected[2]}, or train a policy at the other size."
         )
 
 

@@ -32,8 +32,8 @@ class PocketVLAPolicy(PreTrainedPolicy):
         ValueError: when the configuration's features lack an input that it asks for.
     """
 
-    config_class = PocketVLAConfig
-    name = "pocketvla"
+    config_class = PocketVLAConfig  # ty: ignore[invalid-assignment]
+    name = "pocketvla"  # ty: ignore[invalid-assignment]
 
     def __init__(self, config: PocketVLAConfig, **kwargs: Any) -> None:
         """Build the networks; LeRobot's further arguments (data set statistics, metadata) are not needed."""
@@ -101,9 +101,7 @@ class PocketVLAPolicy(PreTrainedPolicy):
     def _values(self, batch: Batch, features: Tensor | None) -> Tensor:
         """Values (B,); `features` are the actor's, if they are at hand."""
         if self.critic is not None:
-            return self.value_head(
-                self.critic(self._vector(batch, with_environment=True), self._texts(batch))
-            )
+            return self.value_head(self.critic(self._vector(batch, with_environment=True), self._texts(batch)))
         features = self._features(batch) if features is None else features
         return self.value_head(features.detach() if self.config.value_detach else features)
 
@@ -156,7 +154,7 @@ class PocketVLAPolicy(PreTrainedPolicy):
         return metrics
 
     @torch.no_grad()
-    def select_action(
+    def select_action(  # ty: ignore[incompatible-method-override]
         self,
         batch: Batch,
         *,
@@ -183,7 +181,7 @@ class PocketVLAPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Nothing to forget: the policy has no memory between steps."""
 
-    def get_optim_params(self) -> list[dict[str, Any]]:
+    def get_optim_params(self) -> list[dict[str, Any]]:  # ty: ignore[incompatible-method-override]
         """Parameter groups for behaviour cloning: the actor's, weight decay on its matrices only."""
         matrices, others, sigmas = [], [], []
         for name, parameter in [*self.actor.named_parameters(), *self.head.named_parameters()]:
@@ -221,9 +219,7 @@ class PocketVLAPolicy(PreTrainedPolicy):
                 "value": self._values(batch, features),
             }
 
-    def evaluate_actions(
-        self, batch: Batch, tokens: Tensor, *, temperature: float = 1.0
-    ) -> dict[str, Tensor]:
+    def evaluate_actions(self, batch: Batch, tokens: Tensor, *, temperature: float = 1.0) -> dict[str, Tensor]:
         """Evaluate drawn bins (B, D) under the policy as it is now, differentiable.
 
         Returns:

@@ -21,11 +21,17 @@ class TextEncoder(nn.Module):
     """
 
     def __init__(self, vocabulary_size: int, width: int) -> None:
+        """Build the layers."""
         super().__init__()
         self.vocabulary_size = vocabulary_size
         self.embedding = nn.EmbeddingBag(vocabulary_size, width, mode="mean", padding_idx=0)
+        # Normalised at the end: instructions must weigh as much as the standardised observations beside them.
         self.mlp = nn.Sequential(
-            nn.LayerNorm(width), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width)
+            nn.LayerNorm(width),
+            nn.Linear(width, width),
+            nn.SiLU(),
+            nn.Linear(width, width),
+            nn.LayerNorm(width),
         )
 
     def forward(self, texts: list[str]) -> Tensor:
@@ -44,6 +50,7 @@ class Film(nn.Module):
     """Feature-wise linear modulation by the task (Perez et al. 2018), the identity at the start."""
 
     def __init__(self, task_width: int, features: int) -> None:
+        """Build the layers."""
         super().__init__()
         self.project = nn.Linear(task_width, 2 * features)
         nn.init.zeros_(self.project.weight)
@@ -68,6 +75,7 @@ class FilmMLP(nn.Module):
     """
 
     def __init__(self, inputs: int, width: int, depth: int, task_width: int) -> None:
+        """Build the layers."""
         super().__init__()
         sizes = [inputs + task_width] + [width] * (depth - 1)
         self.linears = nn.ModuleList(nn.Linear(size, width) for size in sizes)
@@ -98,8 +106,9 @@ class ImageEncoder(nn.Module):
     POOLED_SIZE = 4
 
     def __init__(self, task_width: int, keypoints: int, bfloat16: bool) -> None:
+        """Build the layers."""
         super().__init__()
-        self.bfloat16 = bfloat16
+        self.use_bfloat16 = bfloat16
         self.conv1 = nn.Conv2d(3, 32, 8, stride=4, padding=2)
         self.conv2 = nn.Conv2d(32, 64, 3, stride=2, padding=1)
         self.conv3 = nn.Conv2d(64, 64, 3, padding=1)
@@ -110,10 +119,10 @@ class ImageEncoder(nn.Module):
         self.width = 2 * keypoints + self.POOLED_CHANNELS * self.POOLED_SIZE**2
 
     def forward(self, images: Tensor, task: Tensor) -> Tensor:
-        """Encode images (B, 3, H, W), uint8 or floats in [0, 1], under tasks (B, task_width) to (B, width)."""
-        dtype = torch.bfloat16 if self.bfloat16 else torch.float32
+        """Images (B, 3, H, W), uint8 or in [0, 1], under tasks (B, task_width) to (B, width)."""
+        dtype = torch.bfloat16 if self.use_bfloat16 else torch.float32
         x = to_signed_unit_range(images, dtype).contiguous(memory_format=torch.channels_last)
-        with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=self.bfloat16):
+        with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=self.use_bfloat16):
             x = F.relu(self.conv1(x))
             x = F.relu(self.film2(self.conv2(x), task))
             x = F.relu(self.film3(self.conv3(x), task))
@@ -126,6 +135,7 @@ class StateNetwork(nn.Module):
     """Text encoder and trunk on vector observations; an actor's body or a critic of its own."""
 
     def __init__(self, inputs: int, width: int, depth: int, task_width: int, vocabulary_size: int) -> None:
+        """Build the layers."""
         super().__init__()
         self.text = TextEncoder(vocabulary_size, task_width)
         self.trunk = FilmMLP(inputs, width, depth, task_width)
@@ -148,6 +158,7 @@ class ImageNetwork(nn.Module):
         keypoints: int,
         bfloat16: bool,
     ) -> None:
+        """Build the layers."""
         super().__init__()
         self.text = TextEncoder(vocabulary_size, task_width)
         self.encoder = ImageEncoder(task_width, keypoints, bfloat16)
@@ -164,6 +175,7 @@ class ValueHead(nn.Module):
     """Two-layer readout of a scalar value, zero at the start."""
 
     def __init__(self, features: int, width: int) -> None:
+        """Build the layers."""
         super().__init__()
         self.hidden = nn.Linear(features, width)
         self.out = nn.Linear(width, 1)

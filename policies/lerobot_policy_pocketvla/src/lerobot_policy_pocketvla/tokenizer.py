@@ -3,6 +3,7 @@
 import re
 import zlib
 from functools import lru_cache
+from itertools import pairwise
 
 WORD = re.compile(r"\w+")
 
@@ -24,7 +25,7 @@ def token_ids(text: str, vocabulary_size: int) -> tuple[int, ...]:
         for a text without a word.
     """
     words = words_of(text)
-    pairs = [f"{first} {second}" for first, second in zip(words, words[1:], strict=False)]
+    pairs = [f"{first} {second}" for first, second in pairwise(words)]
     buckets = vocabulary_size - 1
     ids = tuple(1 + zlib.crc32(item.encode()) % buckets for item in words + pairs)
     return ids or (0,)

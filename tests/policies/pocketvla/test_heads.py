@@ -1,0 +1,129 @@
+"""The distributions over bins against independent numpy computations."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from lerobot_policy_pocketvla.heads import (
+    BinDistribution,
+    CategoricalHead,
+    GaussianHead,
+    actions_to_tokens,
+    bin_centres,
+    tokens_to_actions,
+)
+
+
+def gaussian_head(gripper_dim: int | None = None, sigma: float = 0.2, dims: int = 3) -> GaussianHead:
+    """A head whose mean is exactly its input's (limited) value: the projection is the identity."""
+    head = GaussianHead(dims, dims, 256, gripper_dim, sigma_init=sigma, sigma_min=0.01, sigma_max=0.9)
+    with torch.no_grad():
+        head.project.weight.copy_(torch.eye(dims))
+    return head
+
+
+def test_bin_centres_by_hand():
+    torch.testing.assert_close(bin_centres(4), torch.tensor([-0.75, -0.25, 0.25, 0.75]))
+    assert bin_centres(256)[0].item() == pytest.approx(-255 / 256)
+    assert bin_centres(256)[255].item() == pytest.approx(255 / 256)
+
+
+def test_actions_and_tokens_round_trip_to_half_a_bin():
+    actions = torch.linspace(-1, 1, 5001)
+    error = (tokens_to_actions(actions_to_tokens(actions, 256), 256) - actions).abs()
+    assert error.max() <= 1 / 256 + 1e-6
+    tokens = torch.arange(256)
+    assert torch.equal(actions_to_tokens(tokens_to_actions(tokens, 256), 256), tokens)
+
+
+def test_actions_beyond_the_bounds_take_the_edge_bins():
+    assert actions_to_tokens(torch.tensor([-7.0, -1.0, 1.0, 7.0]), 256).tolist() == [0, 0, 255, 255]
+
+
+@pytest.mark.parametrize("temperature", [1.0, 0.6])
+@pytest.mark.parametrize("sigma", [0.05, 0.4])
+def test_discretised_gaussian_is_the_normal_density_at_the_bin_centres(sigma, temperature):
+    inputs = np.array([-1.1, 0.1, 0.9])
+    logits = gaussian_head(sigma=sigma)(torch.from_numpy(inputs).float()[None])
+    got = BinDistribution(logits).log_probs(temperature).exp()[0].detach().numpy()
+    centres = np.linspace(-255 / 256, 255 / 256, 256)
+    means = 1.25 * np.tanh(inputs / 1.25)
+    # A power 1 / T of a normal density is a normal density with the variance multiplied by T.
+    variance = sigma**2 * temperature
+    density = np.exp(-((centres[None] - means[:, None]) ** 2) / (2 * variance)) / np.sqrt(2 * np.pi * variance)
+    np.testing.assert_allclose(got, density / density.sum(-1, keepdims=True), atol=2e-6)
+
+
+def test_the_gripper_takes_only_its_outermost_bins_with_the_sigmoid_of_one_logit():
+    logits = gaussian_head(gripper_dim=-1)(torch.tensor([[0.0, 0.0, 1.5]]))
+    probs = BinDistribution(logits).log_probs()[0, 2].exp()
+    assert probs[255].item() == pytest.approx(1 / (1 + math.exp(-1.5)), abs=1e-6)
+    assert probs[0].item() == pytest.approx(1 / (1 + math.exp(1.5)), abs=1e-6)
+    assert probs[1:255].sum().item() == 0.0
+    # Halving the temperature doubles the logit.
+    cold = BinDistribution(logits).log_probs(0.5)[0, 2, 255].exp().item()
+    assert cold == pytest.approx(1 / (1 + math.exp(-3.0)), abs=1e-6)
+
+
+def test_gripper_index_zero_is_replaced_and_the_others_are_not():
+    logits = gaussian_head(gripper_dim=0)(torch.tensor([[2.0, 0.3, -0.3]]))
+    plain = gaussian_head()(torch.tensor([[2.0, 0.3, -0.3]]))
+    torch.testing.assert_close(logits[:, 1:], plain[:, 1:])
+    assert BinDistribution(logits).mode()[0, 0] == 255
+
+
+def test_entropy_by_hand():
+    uniform = BinDistribution(torch.zeros(2, 7, 256))
+    torch.testing.assert_close(uniform.entropy(), torch.full((2,), math.log(256)))
+    # One dimension uniform over 4 bins, one certain: the mean of log 4 and 0.
+    logits = torch.zeros(1, 2, 4)
+    logits[0, 1, 2] = 1000.0
+    assert BinDistribution(logits).entropy().item() == pytest.approx(math.log(4) / 2)
+    fair_gripper = gaussian_head(gripper_dim=0, dims=1)(torch.zeros(1, 1))
+    assert BinDistribution(fair_gripper).entropy().item() == pytest.approx(math.log(2))
+
+
+def test_log_prob_sums_over_the_dimensions():
+    distribution = BinDistribution(torch.tensor([[[0.0, math.log(3.0)], [math.log(4.0), 0.0]]]))
+    got = distribution.log_prob(torch.tensor([[1, 1]])).item()
+    assert got == pytest.approx(math.log(3 / 4) + math.log(1 / 5), abs=1e-6)
+
+
+@pytest.mark.parametrize("head", ["gaussian", "categorical"])
+def test_cold_sampling_becomes_the_argmax(head):
+    torch.manual_seed(0)
+    if head == "gaussian":
+        logits = gaussian_head(gripper_dim=2)(torch.randn(64, 3)).detach()
+    else:
+        logits = 5 * CategoricalHead(3, 3, 256)(torch.randn(64, 3)).detach()
+    distribution = BinDistribution(logits)
+    assert torch.equal(distribution.sample(0.0), logits.argmax(-1))
+    cold = distribution.sample(1e-6)
+    # Between two bins that are equally near the mean, either is a mode.
+    chosen = logits.gather(-1, cold.unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(chosen, logits.max(-1).values, atol=1e-4, rtol=0)
+
+
+def test_samples_have_the_frequencies_of_the_distribution():
+    logits = torch.tensor([0.0, math.log(2.0), math.log(5.0)]).expand(20000, 1, 3)
+    tokens = BinDistribution(logits).sample(generator=torch.Generator().manual_seed(1))
+    frequencies = torch.bincount(tokens.flatten(), minlength=3) / 20000
+    np.testing.assert_allclose(frequencies.numpy(), [1 / 8, 2 / 8, 5 / 8], atol=0.015)
+
+
+def test_temperature_zero_is_a_point_and_a_negative_one_is_refused():
+    distribution = BinDistribution(torch.tensor([[[0.0, 1.0]], [[0.0, 1.0]]]))
+    assert distribution.log_prob(torch.tensor([[1], [0]]), 0.0).tolist() == [0.0, -math.inf]
+    with pytest.raises(ValueError, match="-1"):
+        distribution.sample(-1.0)
+
+
+def test_sigma_starts_where_asked_and_stays_in_its_range():
+    head = gaussian_head(sigma=0.2)
+    torch.testing.assert_close(head.sigma(), torch.full((3,), 0.2))
+    with torch.no_grad():
+        head.raw_sigma.copy_(torch.tensor([-100.0, 0.0, 100.0]))
+    low, middle, high = head.sigma().tolist()
+    assert (low, high) == (pytest.approx(0.01), pytest.approx(0.9))
+    assert middle == pytest.approx(math.sqrt(0.01 * 0.9))

@@ -1,0 +1,197 @@
+"""The policy as LeRobot and as an actor-critic trainer use it."""
+
+import pytest
+import torch
+from conftest import CAMERA, TASKS, make_batch, make_config, make_policy, take
+from lerobot_policy_pocketvla import PocketVLAPolicy
+
+HEADS = ["gaussian", "categorical"]
+
+
+@pytest.mark.parametrize("head", HEADS)
+@pytest.mark.parametrize(
+    ("image", "dtype"), [(False, "float32"), (True, "float32"), (True, "bfloat16")], ids=["state", "f32", "bf16"]
+)
+@pytest.mark.parametrize("temperature", [1.0, 0.6])
+def test_the_ratio_is_one_before_the_first_update(head, image, dtype, temperature):
+    policy = make_policy(image=image, dtype=dtype, action_head=head, critic_observation="environment_state")
+    batch = make_batch(24)
+    generator = torch.Generator().manual_seed(3)
+    with torch.inference_mode():
+        sampled = policy.sample_actions(batch, temperature=temperature, generator=generator)
+    policy.train()
+    # Minibatches are other mixtures of the samples than the rollout's batches were.
+    for rows in ([5, 0, 17, 23, 9, 2, 11], list(range(24))):
+        got = policy.evaluate_actions(take(batch, rows), sampled["tokens"][rows], temperature=temperature)
+        torch.testing.assert_close(got["log_prob"].exp(), sampled["log_prob"][rows].exp(), rtol=1e-4, atol=0)
+        torch.testing.assert_close(got["value"], sampled["value"][rows], rtol=1e-4, atol=1e-5)
+    assert sampled["log_prob"].std() > 0.1
+    assert got["entropy"].shape == (24,)
+
+
+def test_sampled_actions_are_the_bin_centres_of_the_tokens_and_inside_the_range():
+    policy = make_policy(image=False)
+    out = policy.sample_actions(make_batch(16))
+    assert out["action"].dtype == torch.float32
+    assert out["tokens"].dtype == torch.int64
+    torch.testing.assert_close(out["action"], -1 + (2 * out["tokens"] + 1) / 256)
+    assert set(out["tokens"][:, 6].tolist()) <= {0, 255}
+    assert out["log_prob"].shape == out["value"].shape == (16,)
+
+
+def test_the_generator_decides_the_sample_and_the_global_one_is_left_alone():
+    policy, batch = make_policy(image=False), make_batch(16)
+    draws = []
+    before = torch.random.get_rng_state()
+    for seed in (1, 1, 2):
+        draws.append(policy.sample_actions(batch, generator=torch.Generator().manual_seed(seed))["tokens"])
+    assert torch.equal(draws[0], draws[1])
+    assert not torch.equal(draws[0], draws[2])
+    assert torch.equal(before, torch.random.get_rng_state())
+
+
+def test_greedy_actions_repeat_and_sampled_ones_spread_with_the_temperature():
+    policy, batch = make_policy(image=False), make_batch(1)
+    with torch.no_grad():
+        policy.head.project.weight.zero_()
+    batch = {k: v * 400 if isinstance(v, list) else v.expand(400, *v.shape[1:]) for k, v in batch.items()}
+    greedy = policy.sample_actions(batch, temperature=0.0)
+    assert (greedy["tokens"] == greedy["tokens"][0]).all()
+    assert (greedy["log_prob"] == 0).all()
+    torch.testing.assert_close(policy.select_action(batch, temperature=0.0), greedy["action"])
+    narrow = policy.select_action(batch, temperature=0.25)[:, :6].std(0)
+    wide = policy.select_action(batch, temperature=1.0)[:, :6].std(0)
+    # The mean is near 0, far from the edges; a quarter of the temperature is half of sigma.
+    sigma = policy.head.sigma()[:6].detach()
+    torch.testing.assert_close(wide, sigma, rtol=0.15, atol=0)
+    torch.testing.assert_close(narrow, sigma / 2, rtol=0.15, atol=0)
+
+
+def test_select_action_takes_the_configured_temperature():
+    batch = make_batch(8)
+    greedy = make_policy(image=False, temperature=0.0)
+    assert torch.equal(greedy.select_action(batch), greedy.select_action(batch))
+    assert greedy.predict_action_chunk(batch).shape == (8, 1, 7)
+    sampled = make_policy(image=False)
+    assert sampled.config.temperature == 0.6
+    assert not torch.equal(sampled.select_action(batch), sampled.select_action(batch))
+
+
+def test_a_privileged_critic_is_not_asked_for_actions():
+    policy, batch = make_policy(critic_observation="environment_state"), make_batch(4)
+    blind = {key: value for key, value in batch.items() if key != "observation.environment_state"}
+    torch.testing.assert_close(
+        policy.select_action(blind, temperature=0.0), policy.select_action(batch, temperature=0.0)
+    )
+    with pytest.raises(ValueError, match=r"observation\.environment_state"):
+        policy.predict_values(blind)
+    moved = batch | {"observation.environment_state": batch["observation.environment_state"] + 1}
+    assert not torch.allclose(policy.predict_values(moved), policy.predict_values(batch))
+    # It does not look at the image.
+    dark = batch | {CAMERA: torch.zeros_like(batch[CAMERA])}
+    torch.testing.assert_close(policy.predict_values(dark), policy.predict_values(batch))
+
+
+def test_the_actor_ignores_what_observation_does_not_name():
+    batch = make_batch(4)
+    other_state = batch | {"observation.environment_state": -batch["observation.environment_state"]}
+    other_image = batch | {CAMERA: 255 - batch[CAMERA]}
+    for observation, ignored, used in (
+        ("auto", other_state, other_image),
+        ("image", other_state, other_image),
+        ("environment_state", other_image, other_state),
+    ):
+        policy = make_policy(observation=observation, temperature=0.0)
+        torch.testing.assert_close(policy.select_action(ignored), policy.select_action(batch))
+        assert not torch.equal(policy.select_action(used), policy.select_action(batch))
+
+
+@pytest.mark.parametrize("detach", [True, False])
+def test_value_detach_keeps_the_value_loss_off_the_image_network(detach):
+    policy = make_policy(value_detach=detach)
+    policy.predict_values(make_batch(2)).sum().backward()
+    touched = any(p.grad is not None and p.grad.abs().sum() > 0 for p in policy.actor.parameters())
+    assert touched is not detach
+    assert policy.value_head.out.weight.grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize("critic", ["actor", "environment_state"])
+@pytest.mark.parametrize("image", [True, False])
+def test_the_rl_groups_hold_every_parameter_once(image, critic):
+    policy = make_policy(image=image, critic_observation=critic)
+    groups = policy.rl_parameter_groups()
+    assert [group["name"] for group in groups] == ["policy", "value"]
+    ids = [id(p) for group in groups for p in group["params"]]
+    assert sorted(ids) == sorted(id(p) for p in policy.parameters())
+    assert sum(p.numel() for p in policy.parameters()) <= 6_000_000
+
+
+def test_fresh_values_are_zero():
+    torch.manual_seed(0)
+    for image in (True, False):
+        assert PocketVLAPolicy(make_config(image=image)).predict_values(make_batch(3)).tolist() == [0.0] * 3
+
+
+def test_unseen_wordings_and_single_strings_work():
+    policy, batch = make_policy(image=False), make_batch(2)
+    batch["task"] = ["Could you kindly relocate the Ketchup-Bottle??", ""]
+    assert torch.isfinite(policy.select_action(batch)).all()
+    one = take(make_batch(2), [0]) | {"task": TASKS[0]}
+    assert policy.select_action(one).shape == (1, 7)
+    with pytest.raises(ValueError, match="task"):
+        policy.select_action({k: v for k, v in batch.items() if k != "task"})
+
+
+def test_wild_states_are_clipped():
+    policy, batch = make_policy(image=False, temperature=0.0), make_batch(2)
+    batch["observation.state"][:, 3] = 1e30
+    limit = {**batch, "observation.state": batch["observation.state"].clamp(max=10.0)}
+    torch.testing.assert_close(policy.select_action(batch), policy.select_action(limit))
+
+
+def test_another_image_size_is_refused_naming_both():
+    policy = make_policy(size=64)
+    with pytest.raises(ValueError, match=r"96.*64 x 64"):
+        policy.select_action(make_batch(2, size=96))
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"image": False, "observation": "image"}, "environment_state"),
+        ({"image_key": "observation.images.wrist"}, r"observation\.images\.front"),
+        ({"action_dim": 4, "gripper_dim": 5}, "5"),
+    ],
+)
+def test_features_that_do_not_fit_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        PocketVLAPolicy(make_config(**kwargs))
+
+
+def test_an_environment_state_that_is_not_there_is_refused():
+    config = make_config(critic_observation="environment_state")
+    del config.input_features["observation.environment_state"]
+    with pytest.raises(ValueError, match="critic_observation"):
+        PocketVLAPolicy(config)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("observation", "video"), ("action_head", "diffusion"), ("temperature", -1.0), ("sigma_init", 0.9)],
+)
+def test_bad_configurations_name_the_value(field, value):
+    with pytest.raises(ValueError, match=str(value)):
+        make_config(**{field: value})
+
+
+@pytest.mark.parametrize("image", [True, False])
+def test_a_saved_policy_is_the_same_policy(image, tmp_path):
+    policy = make_policy(image=image, critic_observation="environment_state", sigma_init=0.3)
+    policy.save_pretrained(tmp_path)
+    loaded = PocketVLAPolicy.from_pretrained(tmp_path)
+    batch = make_batch(6)
+    tokens = policy.sample_actions(batch)["tokens"]
+    before, after = policy.evaluate_actions(batch, tokens), loaded.evaluate_actions(batch, tokens)
+    for key in before:
+        assert torch.equal(before[key], after[key])
+    assert loaded.config == policy.config

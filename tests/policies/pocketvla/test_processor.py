@@ -1,0 +1,72 @@
+"""The processors: action bounds and normalisation, saved and loaded LeRobot's way."""
+
+import numpy as np
+import pytest
+import torch
+from conftest import make_batch, make_config
+from lerobot.policies import make_pre_post_processors
+from lerobot_policy_pocketvla.action_bounds import ActionBoundsProcessorStep
+
+STATS = {
+    "observation.state": {"mean": np.full(13, 2.0), "std": np.array([0.0] + [4.0] * 12)},
+    "observation.environment_state": {"mean": np.zeros(48), "std": np.ones(48)},
+    "action": {"min": np.full(7, -3.0), "max": np.full(7, 5.0), "mean": np.zeros(7), "std": np.ones(7)},
+}
+
+
+def test_states_are_standardised_and_constant_ones_do_not_explode():
+    preprocessor, _ = make_pre_post_processors(make_config(), dataset_stats=STATS)
+    batch = make_batch(2) | {"observation.state": torch.full((2, 13), 6.0)}
+    batch["observation.state"][:, 0] = 2.0 + 1e-4
+    state = preprocessor(batch)["observation.state"]
+    torch.testing.assert_close(state[:, 1:], torch.ones(2, 12))
+    # 0.1 mm from a constant is a tenth of the smallest deviation, not ten thousand.
+    torch.testing.assert_close(state[:, 0], torch.full((2,), 0.1), atol=1e-3, rtol=0)
+    assert STATS["observation.state"]["std"][0] == 0.0
+
+
+def test_bridge_bounds_map_to_the_ends_of_the_range_and_back():
+    preprocessor, postprocessor = make_pre_post_processors(make_config(), dataset_stats=STATS)
+    low = [-0.0287273, -0.0417035, -0.0260939, -0.0809211, -0.092887, -0.2071828, 0.0]
+    high = [0.0283097, 0.0408553, 0.0401616, 0.0819205, 0.0779285, 0.2038257, 1.0]
+    physical = torch.tensor([low, high])
+    normalised = preprocessor(make_batch(2) | {"action": physical})["action"]
+    torch.testing.assert_close(normalised, torch.tensor([[-1.0] * 7, [1.0] * 7]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(postprocessor(normalised), physical, atol=1e-6, rtol=0)
+
+
+def test_dataset_bounds_come_from_the_statistics_and_survive_saving(tmp_path):
+    config = make_config(action_bounds="dataset")
+    for processor in make_pre_post_processors(config, dataset_stats=STATS):
+        processor.save_pretrained(tmp_path)
+    preprocessor, postprocessor = make_pre_post_processors(config, pretrained_path=str(tmp_path))
+    normalised = preprocessor(make_batch(1) | {"action": torch.full((1, 7), 3.0)})["action"]
+    torch.testing.assert_close(normalised, torch.full((1, 7), 0.5))
+    torch.testing.assert_close(postprocessor(torch.full((1, 7), 0.5)), torch.full((1, 7), 3.0))
+
+
+def test_bytes_pass_through_and_observations_need_no_action():
+    preprocessor, _ = make_pre_post_processors(make_config(), dataset_stats=STATS)
+    batch = make_batch(2)
+    out = preprocessor(batch)
+    assert out["observation.images.front"].dtype == torch.uint8
+    assert out["task"] == batch["task"]
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "stats", "message"),
+    [
+        ({"action_dim": 4}, STATS, "has 7 dimensions, the action has 4"),
+        ({"action_bounds": "dataset"}, None, "statistics"),
+    ],
+)
+def test_bounds_that_do_not_fit_are_refused(kwargs, stats, message):
+    with pytest.raises(ValueError, match=message):
+        make_pre_post_processors(make_config(**kwargs), dataset_stats=stats)
+
+
+def test_the_step_checks_its_bounds():
+    with pytest.raises(ValueError, match="dimension 1"):
+        ActionBoundsProcessorStep([0.0, 1.0], [1.0, 1.0])
+    with pytest.raises(ValueError, match="2 dimensions, the bounds have 1"):
+        ActionBoundsProcessorStep([0.0], [1.0]).convert(torch.zeros(3, 2))
