@@ -1,0 +1,268 @@
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.datasets import LeRobotDataset
+from synthetic import FPS, assert_same_pictures, features, segment
+
+from cronos_lerobot.data import storage
+from cronos_lerobot.data.writer import SegmentWriter
+
+LENGTHS = [12, 1, 25, 7, 18]
+
+
+@pytest.fixture(scope="module")
+def segments():
+    return [(segment(length, seed), f"task {seed % 3}") for seed, length in enumerate(LENGTHS)]
+
+
+def write(root: Path, segments, flush_after=()) -> SegmentWriter:
+    writer = SegmentWriter("me/test", root, features(), FPS, robot_type="widowx")
+    for i, (frames, task) in enumerate(segments):
+        writer.add_segment(frames, task, episode_metadata={"number": i})
+        if i in flush_after:
+            writer.flush()
+    return writer
+
+
+def assert_holds(root: Path, segments) -> LeRobotDataset:
+    """The dataset, in a fresh LeRobotDataset, is exactly the segments in order."""
+    dataset = LeRobotDataset("me/test", root=root)
+    assert dataset.num_episodes == len(segments)
+    assert len(dataset) == len(dataset.hf_dataset) == sum(len(frames["action"]) for frames, _ in segments)
+    index = 0
+    for episode, (frames, task) in enumerate(segments):
+        for t in range(len(frames["action"])):
+            item = dataset[index]
+            assert (item["episode_index"], item["frame_index"], item["index"]) == (episode, t, index)
+            assert item["timestamp"] == pytest.approx(t / FPS)
+            assert item["task"] == task
+            for key in set(frames) - {"observation.images.front"}:
+                np.testing.assert_array_equal(item[key].numpy(), frames[key][t], err_msg=key)
+            assert_same_pictures(item["observation.images.front"], frames["observation.images.front"][t])
+            index += 1
+    return dataset
+
+
+def test_round_trip(tmp_path, segments):
+    write(tmp_path / "d", segments).finalize()
+    dataset = assert_holds(tmp_path / "d", segments)
+    assert dataset.meta.fps == FPS
+    assert dataset.meta.info.robot_type == "widowx"
+    assert list(dataset.meta.tasks.index) == ["task 0", "task 1", "task 2"]
+    assert dataset.meta.episodes["number"] == [0, 1, 2, 3, 4]
+    assert dataset.meta.episodes["tasks"] == [[task] for _, task in segments]
+    assert not (tmp_path / "d" / storage.INCOMPLETE).exists()
+
+
+def test_many_episodes_share_the_files_of_a_flush(tmp_path, segments):
+    write(tmp_path / "d", segments, flush_after=[2]).finalize()
+    assert_holds(tmp_path / "d", segments)
+    for kind, suffix in (("data", "parquet"), ("meta/episodes", "parquet"), ("videos", "mp4")):
+        assert len(list((tmp_path / "d" / kind).rglob(f"*.{suffix}"))) == 2
+
+
+def test_a_file_that_would_grow_too_long_is_followed_by_another(tmp_path, segments, monkeypatch):
+    monkeypatch.setattr("cronos_lerobot.data.writer.MAX_FILE_DURATION_S", 30 / FPS)
+    write(tmp_path / "d", segments).finalize()
+    dataset = assert_holds(tmp_path / "d", segments)
+    assert dataset.meta.episodes["data/file_index"] == [0, 0, 1, 2, 2]
+
+
+def test_delta_timestamps_stay_within_an_episode(tmp_path, segments):
+    write(tmp_path / "d", segments).finalize()
+    deltas = {key: [-1 / FPS, 0, 1 / FPS] for key in ("observation.images.front", "action")}
+    dataset = LeRobotDataset("me/test", root=tmp_path / "d", delta_timestamps=deltas)
+    first, last = LENGTHS[0] + LENGTHS[1], LENGTHS[0] + LENGTHS[1] + LENGTHS[2] - 1
+    frames = segments[2][0]
+    item = dataset[first]
+    assert item["action_is_pad"].tolist() == [True, False, False]
+    np.testing.assert_array_equal(item["action"].numpy(), frames["action"][[0, 0, 1]])
+    assert_same_pictures(item["observation.images.front"], frames["observation.images.front"][[0, 0, 1]])
+    item = dataset[last]
+    assert item["action_is_pad"].tolist() == [False, False, True]
+    assert_same_pictures(item["observation.images.front"], frames["observation.images.front"][[-2, -1, -1]])
+
+
+def test_same_dataset_as_lerobots_own_writer(tmp_path, segments):
+    write(tmp_path / "ours", segments, flush_after=[1, 3]).finalize()
+    theirs = LeRobotDataset.create("me/test", FPS, features(), root=tmp_path / "theirs")
+    for frames, task in segments:
+        for t in range(len(frames["action"])):
+            row = {key: np.atleast_1d(array[t]) for key, array in frames.items()}
+            theirs.add_frame(row | {"task": task})
+        theirs.save_episode()
+    theirs.finalize()
+    ours, theirs = (LeRobotDataset("me/test", root=tmp_path / name) for name in ("ours", "theirs"))
+    assert ours.num_frames == theirs.num_frames
+    assert list(ours.meta.tasks.index) == list(theirs.meta.tasks.index)
+    assert ours.hf_dataset.features == theirs.hf_dataset.features
+    assert set(ours.meta.stats) == set(theirs.meta.stats)
+    for key, stats in theirs.meta.stats.items():
+        for name, value in stats.items():
+            atol = 2e-3 * max(1.0, float(np.ptp(np.concatenate([stats["max"], stats["min"]]))))
+            np.testing.assert_allclose(ours.meta.stats[key][name], value, atol=atol, err_msg=f"{key} {name}")
+    rows = [dataset.hf_dataset.with_format("numpy")[:] for dataset in (ours, theirs)]
+    for key in ("action", "timestamp", "index", "episode_index", "task_index", "next.done"):
+        np.testing.assert_array_equal(rows[0][key], rows[1][key], err_msg=key)
+
+
+KILLED_WRITER = """
+import os, signal, sys
+sys.path.insert(0, {tests!r})
+from test_writer import LENGTHS, write
+from synthetic import segment
+segments = [(segment(length, seed), f"task {{seed % 3}}") for seed, length in enumerate(LENGTHS)]
+writer = write({root!r}, segments[:3], flush_after=[2])
+for frames, task in segments[3:]:
+    writer.add_segment(frames, task, episode_metadata={{"number": 0}})
+while not writer._queue.empty():
+    pass
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory):
+    """A dataset whose process was killed with segments written after the last flush."""
+    root = tmp_path_factory.mktemp("killed") / "d"
+    script = KILLED_WRITER.format(tests=str(Path(__file__).parent), root=str(root))
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert result.returncode == -signal.SIGKILL, result.stderr
+    return root
+
+
+def test_killed_after_a_flush_it_loads_with_exactly_what_was_flushed(killed, segments):
+    assert_holds(killed, segments[:3])
+
+
+def test_resumes_after_a_kill_without_gap_or_duplicate(killed, segments):
+    with SegmentWriter.resume("me/test", killed) as writer:
+        for i, (frames, task) in enumerate(segments[3:], start=3):
+            writer.add_segment(frames, task, episode_metadata={"number": i})
+    dataset = assert_holds(killed, segments)
+    assert dataset.meta.episodes["number"] == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("flush_after", [(1,), (0, 1, 3), (2,), ()], ids=str)
+def test_truncates_to_a_state_and_goes_on(tmp_path, segments, flush_after):
+    """Also where the state's episodes end inside a file."""
+    straight = write(tmp_path / "straight", segments)
+    straight.finalize()
+    write(tmp_path / "d", segments, flush_after=flush_after).finalize()
+    with SegmentWriter.resume("me/test", tmp_path / "d", {"num_episodes": 2}) as writer:
+        assert writer.num_frames == sum(LENGTHS[:2])
+        assert_holds(tmp_path / "d", segments[:2])
+        for i, (frames, task) in enumerate(segments[2:], start=2):
+            writer.add_segment(frames, task, episode_metadata={"number": i})
+    resumed = assert_holds(tmp_path / "d", segments)
+    expected = LeRobotDataset("me/test", root=tmp_path / "straight")
+    for key, stats in expected.meta.stats.items():
+        for name, value in stats.items():
+            np.testing.assert_allclose(resumed.meta.stats[key][name], value, atol=1e-9, err_msg=f"{key} {name}")
+
+
+def test_truncates_to_nothing(tmp_path, segments):
+    write(tmp_path / "d", segments).finalize()
+    with SegmentWriter.resume("me/test", tmp_path / "d", {"num_episodes": 0}) as writer:
+        writer.add_segment(*segments[3], episode_metadata={"number": 0})
+    assert_holds(tmp_path / "d", [segments[3]])
+
+
+@pytest.mark.parametrize("relative", ["data/chunk-000/file-001.parquet", "meta/info.json", "meta/stats.json"])
+def test_killed_while_publishing_it_still_loads_and_resumes(tmp_path, segments, monkeypatch, relative):
+    """The process dies right before one of the files of the second flush is moved into place."""
+    writer = write(tmp_path / "d", segments[:2], flush_after=[1])
+    move = storage.move_into_place
+
+    def die(root, path):
+        if path == relative:
+            raise OSError("killed here")
+        move(root, path)
+
+    monkeypatch.setattr(storage, "move_into_place", die)
+    writer.add_segment(*segments[2], episode_metadata={"number": 2})
+    with pytest.raises(RuntimeError, match="killed here"):
+        writer.flush()
+    monkeypatch.undo()
+    dataset = LeRobotDataset("me/test", root=tmp_path / "d")
+    assert (dataset.num_episodes, len(dataset)) == (2, sum(LENGTHS[:2]))
+    with SegmentWriter.resume("me/test", tmp_path / "d") as writer:
+        for i, (frames, task) in enumerate(segments[2:], start=2):
+            writer.add_segment(frames, task, episode_metadata={"number": i})
+    assert_holds(tmp_path / "d", segments)
+
+
+def test_blocks_instead_of_dropping(tmp_path):
+    frames = [segment(10, seed) for seed in range(12)]
+    size = sum(array.nbytes for array in frames[0].values())
+    writer = SegmentWriter("me/test", tmp_path / "d", features(), FPS, max_pending_bytes=2 * size)
+    pending = []
+    for array in frames:
+        writer.add_segment(array, "task")
+        pending.append(writer._pending)
+    writer.finalize()
+    assert max(pending) <= 2 * size
+    assert_holds(tmp_path / "d", [(array, "task") for array in frames])
+
+
+def test_state_only_datasets_have_no_videos(tmp_path):
+    state_only = {key: feature for key, feature in features().items() if feature["dtype"] != "video"}
+    frames = {key: array for key, array in segment(9).items() if key in state_only}
+    with SegmentWriter("me/test", tmp_path / "d", state_only, FPS) as writer:
+        writer.add_segment(frames, "task")
+    dataset = LeRobotDataset("me/test", root=tmp_path / "d")
+    np.testing.assert_array_equal(dataset[4]["action"].numpy(), frames["action"][4])
+    assert dataset.meta.video_path is None
+
+
+def test_an_exception_keeps_what_was_recorded(tmp_path, segments):
+    def record_and_stop():
+        with SegmentWriter("me/test", tmp_path / "d", features(), FPS) as writer:
+            writer.add_segment(*segments[0])
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        record_and_stop()
+    assert_holds(tmp_path / "d", segments[:1])
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("action", np.zeros((12, 7)), "action must be float32"),
+        ("action", np.zeros((11, 7), np.float32), "action must be float32"),
+        ("observation.images.front", np.zeros((12, 32, 64, 3), np.uint8), "must be uint8"),
+        ("extra", np.zeros(12), "unknown \\['extra'\\]"),
+    ],
+)
+def test_wrong_segments_are_refused(tmp_path, segments, key, value, message):
+    with SegmentWriter("me/test", tmp_path / "d", features(), FPS) as writer:
+        with pytest.raises(ValueError, match=message):
+            writer.add_segment(segments[0][0] | {key: value}, "task")
+        with pytest.raises(ValueError, match="lacks \\['action'\\]"):
+            writer.add_segment({k: v for k, v in segments[0][0].items() if k != "action"}, "task")
+        writer.add_segment(segments[0][0], "task", episode_metadata={"a": 1})
+        with pytest.raises(ValueError, match="episode_metadata"):
+            writer.add_segment(segments[0][0], "task", episode_metadata={"b": 1})
+
+
+def test_nothing_is_overwritten_or_resumed_by_mistake(tmp_path, segments):
+    write(tmp_path / "d", segments[:1]).finalize()
+    with pytest.raises(FileExistsError):
+        SegmentWriter("me/test", tmp_path / "d", features(), FPS)
+    with pytest.raises(ValueError, match="has only 1"):
+        SegmentWriter.resume("me/test", tmp_path / "d", {"num_episodes": 2})
+    with pytest.raises(FileNotFoundError, match="no LeRobotDataset"):
+        SegmentWriter.resume("me/test", tmp_path / "nothing")
+
+
+def test_finalize_twice_then_no_more(tmp_path, segments):
+    writer = write(tmp_path / "d", segments[:1])
+    writer.finalize()
+    writer.finalize()
+    with pytest.raises(RuntimeError, match="finalized"):
+        writer.add_segment(*segments[1])
