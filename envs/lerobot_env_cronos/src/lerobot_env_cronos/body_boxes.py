@@ -1,0 +1,83 @@
+"""Bodies as oriented boxes in numpy: where they are, and how far a point is from them, for many streams at once.
+
+Shapes: n streams, m boxes of all bodies of a scene, leading dimensions of points are free.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from lerobot_env_cronos.kinematics import quaternion_to_matrix
+from lerobot_env_cronos.scenes import Scene
+
+
+@dataclass(frozen=True)
+class SceneBoxes:
+    """The colliding geoms of a scene's free bodies as boxes in the frames of their bodies."""
+
+    body: np.ndarray
+    """(m,) index of the box's body in `scene.bodies`."""
+    centre: np.ndarray
+    """(m, 3) in the body's frame [m]."""
+    rotation: np.ndarray
+    """(m, 3, 3) box to body."""
+    half: np.ndarray
+    """(m, 3) half extents [m]."""
+    centre_of_mass: np.ndarray
+    """(bodies, 3) in the body's frame [m]."""
+
+    @classmethod
+    def from_model(cls, model: mujoco.MjModel, scene: Scene) -> "SceneBoxes":
+        """Read the boxes (a cylinder or mesh counts as its bounding box) from a compiled model."""
+        body_ids = [model.body(name).id for name in scene.bodies]
+        geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in body_ids and model.geom_contype[g] > 0]
+        rotation = quaternion_to_matrix(model.geom_quat[geoms])
+        bounding_boxes = model.geom_aabb[geoms]
+        return cls(
+            body=np.array([body_ids.index(model.geom_bodyid[g]) for g in geoms]),
+            centre=model.geom_pos[geoms] + np.einsum("mij,mj->mi", rotation, bounding_boxes[:, :3]),
+            rotation=rotation,
+            half=bounding_boxes[:, 3:].copy(),
+            centre_of_mass=model.body_ipos[body_ids].copy(),
+        )
+
+    def corners(self, body: int) -> np.ndarray:
+        """The corners (8 k, 3) of one body's k boxes in its own frame."""
+        signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
+        return self.surface(body, signs)
+
+    def surface(self, body: int, grid: np.ndarray) -> np.ndarray:
+        """Points (k * len(grid), 3) of one body's k boxes, from coordinates in [-1, 1]^3."""
+        mine = self.body == body
+        local = grid[None] * self.half[mine][:, None]
+        points = np.einsum("mij,mgj->mgi", self.rotation[mine], local) + self.centre[mine][:, None]
+        return points.reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class WorldBoxes:
+    """The boxes of n streams in the world frame: `centre` (n, m, 3), `rotation` (n, m, 3, 3)."""
+
+    boxes: SceneBoxes
+    centre: np.ndarray
+    rotation: np.ndarray
+
+    @classmethod
+    def at(cls, boxes: SceneBoxes, poses: np.ndarray) -> "WorldBoxes":
+        """Place `boxes` at body poses (n, bodies, 7)."""
+        R = quaternion_to_matrix(poses[:, boxes.body, 3:])
+        centre = poses[:, boxes.body, :3] + np.einsum("nmij,mj->nmi", R, boxes.centre)
+        return cls(boxes, centre, R @ boxes.rotation)
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Signed distance (n, p, m) of points (n, p, 3) from every box, negative inside [m]."""
+        offset = points[:, :, None] - self.centre[:, None]
+        local = np.einsum("nmij,npmi->npmj", self.rotation, offset)
+        q = np.abs(local) - self.boxes.half
+        outside = np.sqrt((np.maximum(q, 0.0) ** 2).sum(-1))
+        return outside + np.minimum(q.max(-1), 0.0)
+
+    def top(self) -> np.ndarray:
+        """Height (n, m) of the highest corner of every box [m]."""
+        return self.centre[..., 2] + (np.abs(self.rotation[..., 2, :]) * self.boxes.half).sum(-1)

@@ -1,0 +1,249 @@
+"""A scripted expert: pick and place from the privileged state, for all streams at once.
+
+It looks at the state at every step and derives what to do from it, so that it retries by itself after a miss, a
+slip or a perturbed action. It remembers only which grasp and which free spot it chose.
+"""
+
+import numpy as np
+
+from lerobot_env_cronos.body_boxes import SceneBoxes, WorldBoxes
+from lerobot_env_cronos.grasping import (
+    PAD_BELOW_EE,
+    TIP_CLEARANCE,
+    choose_grasps,
+    grasp_candidates,
+)
+from lerobot_env_cronos.kinematics import (
+    forward_kinematics,
+    matrix_to_rotation_vector,
+    quaternion_to_matrix,
+)
+from lerobot_env_cronos.placement import Held, choose_places
+from lerobot_env_cronos.robot import FINGERTIP_REACH
+from lerobot_env_cronos.simulation import ACTION_HIGH, ACTION_LOW, NUM_ARM_JOINTS
+from lerobot_env_cronos.vector_env import CronosVectorEnv
+
+OPEN, CLOSE = 1.0, 0.0
+HOVER_HEIGHT = 0.07
+"""Height above the grasp or the place at which the hand travels [m]."""
+FUNNEL_SLOPE = 1.5
+"""Height above the goal per metre of remaining horizontal error."""
+ALIGNED = 0.008
+"""Horizontal error at which the hand is down at the goal [m]."""
+YAW_TO_METRES = 0.04
+"""A yaw error of 1 rad counts like this horizontal error [m]."""
+GRASP_REACHED = 0.008
+"""The fingers close when the hand is this close above the grasp [m]."""
+DROP_HEIGHT = 0.003
+"""Gap under the object when the hand lets go; more than 12 mm topples objects [m]."""
+RETREAT_HEIGHT = 0.13
+"""Height at which the hand waits once the task is complete [m]."""
+STALE_DISTANCE, STALE_ANGLE = 0.015, 0.2
+"""An object or receptacle that moved further than this is looked at again [m, rad]."""
+
+
+class ScriptedExpert:
+    """Expert actions for the current tasks of a `CronosVectorEnv`.
+
+    Args:
+        env: whose state is read; it is never changed.
+        seed: kept for interfaces that pass one; the expert is deterministic and draws nothing.
+    """
+
+    def __init__(self, env: CronosVectorEnv, seed: int = 0):
+        self.env, self.seed = env, seed
+        self.sim, self.scene = env.simulation, env.scene
+        n, bodies = env.num_envs, self.scene.bodies
+        self._boxes = SceneBoxes.from_model(self.sim.model, self.scene)
+        self._candidates = {i: grasp_candidates(self._boxes, i) for i in range(len(self.scene.objects))}
+        self._corners = {i: self._boxes.corners(i) for i in range(len(self.scene.objects))}
+        self._is_support = np.array([name in self.scene.receptacles for name in bodies])
+        self._goal = np.full((n, 2), -2)
+        self._grasp_known, self._place_known = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        self._grasp_point, self._grasp_axis, self._grasp_floor = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
+        self._grasp_pose = np.zeros((n, 7))
+        self._place_xy, self._place_anchor, self._place_closing = (np.zeros((n, 2)) for _ in range(3))
+
+    def reset(self, ids: np.ndarray) -> None:
+        """Forget the chosen grasps and places of streams `ids` (a new segment or episode)."""
+        self._grasp_known[ids] = self._place_known[ids] = False
+
+    def act(self) -> np.ndarray:
+        """Actions (n, 7) in physical units, within the action bounds."""
+        self._look()
+        self._update_goals()
+        self._update_grasps()
+        self._update_places()
+        position, closing, gripper = self._pick()
+        for values in (self._place(), self._finish()):
+            mask = values[0]
+            position = np.where(mask[:, None], values[1], position)
+            closing = np.where(mask[:, None], values[2], closing)
+            gripper = np.where(mask, values[3], gripper)
+        return self._action(position, closing, gripper)
+
+    # Perception -------------------------------------------------------------------------------------------
+
+    def _look(self) -> None:
+        """Read what this step's decisions need from the simulation."""
+        sim = self.sim
+        self._poses = sim.body_poses()
+        self._p, self._R, _ = forward_kinematics(sim.qpos[:, :NUM_ARM_JOINTS])
+        self._target_p, self._target_R, _ = forward_kinematics(sim.arm_target)
+        self._arm = sim.qpos[:, :NUM_ARM_JOINTS]
+        self._yaw = np.arctan2(self._R[:, 1, 1], self._R[:, 0, 1])
+        self._opening = sim.gripper_opening()
+        self._held_objects = np.stack([sim.is_grasped(name) for name in self.scene.objects], 1)
+
+    def _update_goals(self) -> None:
+        """The body to move and where to, (n,) indices; an object held by mistake goes to the table first."""
+        bodies = self.scene.bodies
+        tasks = [
+            (bodies.index(t.object), bodies.index(t.receptacle) if t.receptacle else -1) for t in self.env.tasks
+        ]
+        goal = np.array(tasks)
+        i = np.arange(len(goal))
+        self._success = self.env.is_success & ~self._held_objects[i, goal[:, 0]]
+        other = self._held_objects.copy()
+        other[i, goal[:, 0]] = False
+        wrong = other.any(1)
+        goal[wrong] = np.stack([other.argmax(1), np.full(len(goal), -1)], 1)[wrong]
+        self._success &= ~wrong
+        changed = (goal != self._goal).any(1)
+        self.reset(np.flatnonzero(changed))
+        self._goal = goal
+        self._holding = self._held_objects[i, goal[:, 0]]
+        self._object = self._poses[i, goal[:, 0]]
+        self._object_R = quaternion_to_matrix(self._object[:, 3:])
+
+    def _update_grasps(self) -> None:
+        """Choose a grasp where none is known, or where the object has moved since."""
+        moved = np.linalg.norm(self._object[:, :3] - self._grasp_pose[:, :3], axis=1) > STALE_DISTANCE
+        cosine = np.abs((self._object[:, 3:] * self._grasp_pose[:, 3:]).sum(1))
+        moved |= 2 * np.arccos(np.minimum(cosine, 1.0)) > STALE_ANGLE
+        wanted = ~self._holding & ~self._success & (moved | ~self._grasp_known)
+        for obj in np.unique(self._goal[wanted, 0]):
+            ids = np.flatnonzero(wanted & (self._goal[:, 0] == obj))
+            grasps = choose_grasps(
+                self._candidates[obj], obj, WorldBoxes.at(self._boxes, self._poses[ids]),
+                (self._object[ids, :3], self._object_R[ids]), self._yaw[ids], self._arm[ids], self._is_support,
+            )  # fmt: skip
+            self._grasp_point[ids], self._grasp_axis[ids] = grasps.point, grasps.axis
+            self._grasp_floor[ids] = grasps.floor
+            self._grasp_pose[ids] = self._object[ids]
+            self._grasp_known[ids] = True
+
+    def _update_places(self) -> None:
+        """Choose a free spot for what is newly held, or where the receptacle has moved since."""
+        self._place_known &= self._holding
+        receptacle = self._goal[:, 1]
+        xy = self._poses[np.arange(len(xy_ids := receptacle)), np.maximum(xy_ids, 0), :2]
+        moved = (receptacle >= 0) & (np.linalg.norm(xy - self._place_anchor, axis=1) > STALE_DISTANCE)
+        wanted = self._holding & (moved | ~self._place_known)
+        for obj, target in np.unique(self._goal[wanted], axis=0):
+            ids = np.flatnonzero(wanted & (self._goal == (obj, target)).all(1))
+            held = Held(
+                self._object[ids, :3], self._object_R[ids], self._p[ids] - [0, 0, PAD_BELOW_EE],
+                self._yaw[ids], self._arm[ids],
+            )  # fmt: skip
+            places = choose_places(
+                self.scene, obj, target, WorldBoxes.at(self._boxes, self._poses[ids]), xy[ids], held
+            )
+            self._place_xy[ids], self._place_anchor[ids] = places.xy, places.anchor
+            self._place_closing[ids] = places.closing
+            self._place_known[ids] = True
+
+    # Decisions --------------------------------------------------------------------------------------------
+
+    def _pick(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Hover, align, descend and close: goal position, closing axis and gripper command."""
+        point = self._object[:, :3] + np.einsum("nij,nj->ni", self._object_R, self._grasp_point)
+        closing = _horizontal(np.einsum("nij,nj->ni", self._object_R, self._grasp_axis))
+        grasp = point + [0, 0, PAD_BELOW_EE]
+        lowest = self._grasp_floor + TIP_CLEARANCE + FINGERTIP_REACH - 0.002
+        grasp[:, 2] = np.maximum(grasp[:, 2], lowest)
+        error = self._misalignment(grasp, closing)
+        low = self._p[:, 2] - grasp[:, 2]
+        there = (error < ALIGNED + 0.004) & (low < GRASP_REACHED)
+        missed = there & (self._opening < 0.06)
+        gripper = np.where(there & ~missed, CLOSE, OPEN)
+        # Fingers that are still opening do not go down on the object.
+        opening = np.where(there & ~missed, 0.0, 0.05 * np.clip(0.9 - self._opening, 0.0, 0.5) / 0.5)
+        position = self._funnel(grasp, error, opening)
+        return position, closing, gripper
+
+    def _place(self) -> tuple[np.ndarray, ...]:
+        """Lift, carry above the free spot, lower and let go."""
+        i = np.arange(len(self._p))
+        receptacle = self._goal[:, 1]
+        goal_xy = self._place_xy + self._place_anchor
+        closing = np.concatenate([self._place_closing, np.zeros((len(i), 1))], 1)
+        turn = np.arctan2(closing[:, 1], closing[:, 0]) - self._yaw
+        offset = self._object[:, :3] - self._p
+        c, s = np.cos(turn), np.sin(turn)
+        position = np.empty_like(self._p)
+        position[:, 0] = goal_xy[:, 0] - (c * offset[:, 0] - s * offset[:, 1])
+        position[:, 1] = goal_xy[:, 1] - (s * offset[:, 0] + c * offset[:, 1])
+        top = np.where(receptacle >= 0, self._receptacle_top(receptacle), 0.0)
+        position[:, 2] = self._p[:, 2] + top - self._bottom() + DROP_HEIGHT
+        tips = top + TIP_CLEARANCE + FINGERTIP_REACH - 0.002
+        position[:, 2] = np.maximum(position[:, 2], tips)
+        error = self._misalignment(position, closing)
+        low = self._p[:, 2] - position[:, 2]
+        # The target has been pushed below the hand: the object rests on something.
+        rests = self._p[:, 2] - self._target_p[:, 2] > 0.012
+        release = (error < ALIGNED + 0.006) & ((low < 0.006) | rests)
+        gripper = np.where(release, OPEN, CLOSE)
+        return self._holding, self._funnel(position, error, np.zeros(len(i))), closing, gripper
+
+    def _finish(self) -> tuple[np.ndarray, ...]:
+        """The task is complete: open, go straight up and wait."""
+        position = self._target_p.copy()
+        opened = self._opening > 0.5
+        height = np.maximum(self._target_p[:, 2], RETREAT_HEIGHT)
+        position[:, 2] = np.where(opened, height, position[:, 2])
+        return self._success, position, self._target_R[:, :, 1], np.full(len(position), OPEN)
+
+    def _misalignment(self, goal: np.ndarray, closing: np.ndarray) -> np.ndarray:
+        """Horizontal error (n,) of the hand, a yaw error counting as metres [m]."""
+        yaw = np.arctan2(closing[:, 1], closing[:, 0]) - self._yaw
+        yaw = np.abs(np.arctan2(np.sin(yaw), np.cos(yaw)))
+        return np.linalg.norm((goal - self._p)[:, :2], axis=1) + YAW_TO_METRES * yaw
+
+    def _funnel(self, goal: np.ndarray, error: np.ndarray, extra: np.ndarray) -> np.ndarray:
+        """Come to `goal` from above: the height follows the remaining error, and below it the hand rises first."""
+        rise = np.clip(FUNNEL_SLOPE * (error - ALIGNED), 0.0, HOVER_HEIGHT)
+        height = goal[:, 2] + np.maximum(rise, extra)
+        too_low = height - self._target_p[:, 2]
+        advance = np.clip(1.0 - (too_low - 0.02) / 0.03, 0.0, 1.0)
+        position = self._target_p + advance[:, None] * (goal - self._target_p)
+        position[:, 2] = height
+        return position
+
+    def _receptacle_top(self, receptacle: np.ndarray) -> np.ndarray:
+        top = WorldBoxes.at(self._boxes, self._poses).top()
+        masked = np.where(self._boxes.body == receptacle[:, None], top, -np.inf)
+        return masked.max(1)
+
+    def _bottom(self) -> np.ndarray:
+        """Height (n,) of the lowest point of the object to move [m]."""
+        bottom = np.empty(len(self._p))
+        for obj, corners in self._corners.items():
+            mine = self._goal[:, 0] == obj
+            bottom[mine] = np.einsum("ni,pi->np", self._object_R[mine, 2], corners).min(1)
+        return bottom + self._object[:, 2]
+
+    def _action(self, position: np.ndarray, closing: np.ndarray, gripper: np.ndarray) -> np.ndarray:
+        closing = _horizontal(closing)
+        zeros = np.zeros(len(closing))
+        down = np.stack([zeros, zeros, zeros - 1], 1)
+        across = np.stack([closing[:, 1], -closing[:, 0], zeros], 1)
+        goal_R = np.stack([down, closing, across], 2)
+        turn = matrix_to_rotation_vector(goal_R @ self._target_R.transpose(0, 2, 1))
+        action = np.concatenate([position - self._target_p, turn, gripper[:, None]], 1)
+        return np.clip(action, ACTION_LOW, ACTION_HIGH)
+
+
+def _horizontal(v: np.ndarray) -> np.ndarray:
+    v = v * [1, 1, 0]
+    return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-6)
