@@ -159,7 +159,7 @@ class ScriptedExpert:
         """Hover, align, descend and close: goal position, closing axis and gripper command."""
         point = self._object[:, :3] + np.einsum("nij,nj->ni", self._object_R, self._grasp_point)
         closing = _horizontal(np.einsum("nij,nj->ni", self._object_R, self._grasp_axis))
-        grasp = point + [0, 0, PAD_BELOW_EE]
+        grasp = point + np.array([0, 0, PAD_BELOW_EE])
         lowest = self._grasp_floor + TIP_CLEARANCE + FINGERTIP_REACH - 0.002
         grasp[:, 2] = np.maximum(grasp[:, 2], lowest)
         error = self._misalignment(grasp, closing)

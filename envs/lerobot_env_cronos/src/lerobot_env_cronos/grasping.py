@@ -127,7 +127,11 @@ def choose_grasps(
     axis = np.einsum("nij,cj->nci", R, candidates.axis)
     closing = axis * [1, 1, 0]
     closing /= np.maximum(np.linalg.norm(closing, axis=-1, keepdims=True), 1e-6)
-    cost = 3.0 * np.abs(axis[..., 2]) + 10.0 * (_width(world, candidates, R, closing) > MAX_WIDTH)
+    cost = (
+        2.0 * np.abs(axis[..., 2])
+        + 50.0 * (np.abs(axis[..., 2]) > 0.7)
+        + 10.0 * (_width(world, candidates, R, closing) > MAX_WIDTH)
+    )
     floor = _floor(world, point, closing, is_support)
     centre = point.copy()
     centre[..., 2] = np.maximum(point[..., 2], floor + TIP_CLEARANCE + PAD_HALF_SIZE[0])
