@@ -1,0 +1,50 @@
+# `make demo` and `make test` set everything up by themselves; `make help` lists the rest.
+# They need Python 3.12 with pip, make, and on Debian or Ubuntu root (or sudo) for three OpenGL packages.
+
+PYTHON ?= $(shell command -v python3.12 || command -v python3)
+UV := .uv/bin/uv
+RUN := $(UV) run --frozen
+
+.PHONY: help setup system demo test check format type lint bench wheels clean
+
+help: ## List the targets
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
+
+$(UV):
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))' || \
+	  { echo "Python 3.12 is needed; found $$($(PYTHON) --version). Try: make PYTHON=/path/to/python3.12"; exit 1; }
+	$(PYTHON) -m pip install --quiet --disable-pip-version-check --target .uv 'uv>=0.8,<1'
+
+setup: system $(UV) ## Install the system packages and the locked Python environment
+	$(UV) sync --frozen --python $(PYTHON)
+
+system: ## Install what headless rendering needs (EGL and software OpenGL)
+	@sh .ci/system-packages
+
+demo: setup ## Record, clone, fine-tune without resets, evaluate, report: about 15 minutes on 2 cores
+	$(RUN) cronos-demo
+
+test: setup ## Run the whole test suite
+	$(RUN) pytest
+
+check: lint type ## What CI checks besides the tests
+
+lint:
+	$(RUN) ruff check .
+	$(RUN) ruff format --check .
+
+type:
+	$(RUN) ty check cronos_lerobot envs policies
+
+format: ## Format and fix
+	$(RUN) ruff format .
+	$(RUN) ruff check --fix .
+
+bench: setup ## Steps per second: physics, pixels, training
+	$(RUN) python -m cronos_lerobot.benchmark
+
+wheels: $(UV) ## Build the three wheels into dist/
+	$(UV) build --all-packages --wheel
+
+clean: ## Remove the environment and build outputs
+	rm -rf .venv .uv dist
