@@ -1,0 +1,177 @@
+"""A tiny environment and a tiny policy with the interfaces of the real ones, for exact tests of the loop."""
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import torch
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.processor import make_policy_processor_pipelines
+
+NUM_BINS = 3
+
+
+@dataclass(frozen=True)
+class DummyTask:
+    goal: float
+
+    @property
+    def instruction(self) -> str:
+        return f"go to {self.goal}"
+
+
+TASKS = (DummyTask(1.0), DummyTask(-1.0), DummyTask(2.0), DummyTask(-2.0))
+
+
+class DummyEnv:
+    """Points on a line: action 0 moves stream i, and a task is complete within 0.3 of its goal.
+
+    `calls` is the tape of everything that was asked of it; `diverge_at` are the (step, stream) that break down.
+    """
+
+    metadata = {"render_fps": 5}  # noqa: RUF012
+    single_observation_space = gym.spaces.Dict({"agent_pos": gym.spaces.Box(-9, 9, (2,), np.float32)})
+
+    def __init__(self, num_envs: int, diverge_at: set[tuple[int, int]] | None = None):
+        self.num_envs = num_envs
+        self.scene = SimpleNamespace(tasks=TASKS)
+        self.tasks = [TASKS[0]] * num_envs
+        self.x = np.zeros(num_envs)
+        self.t = 0
+        self.diverge_at = diverge_at or set()
+        self.calls: list = []
+
+    def step(self, actions):
+        assert actions.shape == (self.num_envs, 7)
+        self.calls.append("step")
+        self.x = np.clip(self.x + 0.2 * actions[:, 0], -3, 3)
+        success = np.abs(self.x - [task.goal for task in self.tasks]) < 0.3
+        diverged = np.array([(self.t, i) in self.diverge_at for i in range(self.num_envs)])
+        self.t += 1
+        never = np.zeros(self.num_envs, bool)
+        info = {"is_success": success, "is_grasped": never, "diverged": diverged}
+        return self._observation(), success.astype(np.float32), never, never, info
+
+    def observe(self):
+        self.calls.append("observe")
+        return self._observation()
+
+    def _observation(self):
+        return {"agent_pos": np.stack([self.x, np.ones(self.num_envs)], axis=1).astype(np.float32)}
+
+    def set_task(self, ids, tasks):
+        self.calls.append("set_task")
+        for i, task in zip(ids, tasks, strict=True):
+            self.tasks[i] = task
+
+    def scene_reset(self, ids, configurations, split="train"):
+        self.calls.append(("scene_reset", list(ids)))
+        self.x[ids] = (np.asarray(configurations) % 8) / 8 - 0.5 + (0.01 if split == "held_out" else 0.0)
+
+    def end_effector_reset(self, ids):
+        self.calls.append(("end_effector_reset", list(ids)))
+
+    def get_state(self):
+        return {"x": self.x.copy(), "t": np.array(self.t), "task": np.array([TASKS.index(t) for t in self.tasks])}
+
+    def set_state(self, state):
+        self.x, self.t = state["x"].copy(), int(state["t"])
+        self.tasks = [TASKS[i] for i in state["task"]]
+
+    def close(self):
+        pass
+
+
+@PreTrainedConfig.register_subclass("dummy_linear")
+@dataclass
+class DummyPolicyConfig(PreTrainedConfig):
+    device: str | None = "cpu"
+    push_to_hub: bool = False
+
+    def __post_init__(self):
+        super().__post_init__()
+        self.input_features = {"observation.state": PolicyFeature(FeatureType.STATE, (2,))}
+        self.output_features = {"action": PolicyFeature(FeatureType.ACTION, (7,))}
+
+    observation_delta_indices = action_delta_indices = reward_delta_indices = None
+
+    def get_optimizer_preset(self):
+        raise NotImplementedError
+
+    def get_scheduler_preset(self):
+        return None
+
+    def validate_features(self):
+        pass
+
+
+class DummyPolicy(PreTrainedPolicy):
+    """Linear logits over three bins (-1, 0, 1) for each of 7 dimensions, and a linear value."""
+
+    config_class = DummyPolicyConfig
+    name = "dummy_linear"
+
+    def __init__(self, config=None, seed=0, **kwargs):
+        super().__init__(config or DummyPolicyConfig())
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            self.actor = torch.nn.Linear(3, 7 * NUM_BINS)
+            self.critic = torch.nn.Linear(3, 1)
+
+    def _inputs(self, batch):
+        goals = torch.tensor([[float(text.removeprefix("go to "))] for text in batch["task"]])
+        return torch.cat([batch["observation.state"], goals], dim=1)
+
+    def _distribution(self, batch, temperature):
+        logits = self.actor(self._inputs(batch)).reshape(-1, 7, NUM_BINS)
+        return torch.distributions.Categorical(logits=logits / temperature)
+
+    def sample_actions(self, batch, *, temperature=1.0, generator=None):
+        distribution = self._distribution(batch, temperature or 1.0)
+        probabilities = distribution.probs.reshape(-1, NUM_BINS)
+        if temperature == 0:
+            tokens = probabilities.argmax(dim=1)
+        else:
+            tokens = torch.multinomial(probabilities, 1, generator=generator)
+        tokens = tokens.reshape(-1, 7)
+        log_prob = distribution.log_prob(tokens).sum(dim=1)
+        action = tokens.float() - 1
+        return {"action": action, "tokens": tokens, "log_prob": log_prob, "value": self.predict_values(batch)}
+
+    def evaluate_actions(self, batch, tokens, *, temperature=1.0):
+        distribution = self._distribution(batch, temperature)
+        return {
+            "log_prob": distribution.log_prob(tokens).sum(dim=1),
+            "entropy": distribution.entropy().mean(dim=1),
+            "value": self.predict_values(batch),
+        }
+
+    def predict_values(self, batch):
+        return self.critic(self._inputs(batch)).squeeze(1)
+
+    def rl_parameter_groups(self):
+        return [
+            {"name": "policy", "params": list(self.actor.parameters())},
+            {"name": "value", "params": list(self.critic.parameters())},
+        ]
+
+    def forward(self, batch):
+        raise NotImplementedError
+
+    def get_optim_params(self):
+        raise NotImplementedError
+
+    def predict_action_chunk(self, batch, **kwargs):
+        raise NotImplementedError
+
+    def select_action(self, batch, **kwargs):
+        return self.sample_actions(batch, temperature=0)["action"]
+
+    def reset(self):
+        pass
+
+
+def identity_processors():
+    return make_policy_processor_pipelines(input_steps=[], output_steps=[])
