@@ -90,7 +90,7 @@ def record_demos(cfg: RecordDemosConfig) -> None:
                 def show(length: int) -> None:
                     nonlocal frames
                     frames += length
-                    bar.set_postfix_str(f"{frames / (time.perf_counter() - start):.0f} frames/s")
+                    bar.set_postfix_str(f"{frames / (time.perf_counter() - start):.0f} frames/s", refresh=False)
                     bar.update()
 
                 try:
