@@ -70,13 +70,23 @@ class WorldBoxes:
         centre = poses[:, boxes.body, :3] + np.einsum("nmij,mj->nmi", R, boxes.centre)
         return cls(boxes, centre, R @ boxes.rotation)
 
-    def distance(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance (n, p, m) of points (n, p, 3) from every box, negative inside [m]."""
-        offset = points[:, :, None] - self.centre[:, None]
-        local = np.einsum("nmij,npmi->npmj", self.rotation, offset)
-        q = np.abs(local) - self.boxes.half
-        outside = np.sqrt((np.maximum(q, 0.0) ** 2).sum(-1))
-        return outside + np.minimum(q.max(-1), 0.0)
+    def distance(self, points: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
+        """Signed distance (n, p, k) of points (n, p, 3) from the boxes `which` (k,), negative inside [m]."""
+        which = np.arange(len(self.boxes.body)) if which is None else which
+        if not len(which):
+            return np.full((*points.shape[:2], 1), np.inf)
+        rotation, centre = self.rotation[:, which], self.centre[:, which]
+        local = points[:, None] @ rotation - centre[:, :, None] @ rotation
+        q = np.abs(local) - self.boxes.half[which, None]
+        x, y, z = np.moveaxis(q, -1, 0)
+        inside = np.minimum(np.maximum(np.maximum(x, y), z), 0.0)
+        np.maximum(q, 0.0, out=q)
+        return (np.sqrt(x * x + y * y + z * z) + inside).transpose(0, 2, 1)
+
+    def near(self, xy: np.ndarray, radius: float) -> np.ndarray:
+        """Boxes (m,) that come within `radius` of the points xy (n, 2) in the plane in any of the streams."""
+        gap = np.linalg.norm(self.centre[..., :2] - xy[:, None], axis=-1)
+        return (gap - np.linalg.norm(self.boxes.half, axis=-1) < radius).any(0)
 
     def top(self) -> np.ndarray:
         """Height (n, m) of the highest corner of every box [m]."""

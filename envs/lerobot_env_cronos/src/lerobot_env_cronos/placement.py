@@ -21,7 +21,7 @@ ROOM = 0.010
 """Wanted distance from other things [m]."""
 PREFERRED_OFFSET = 0.03
 """Distance beside the middle at which an empty receptacle still holds a second object [m]."""
-FOOTPRINT_GRID = np.array([[x, y, z] for x in (-1, 0, 1) for y in np.linspace(-1, 1, 9) for z in (-1, 1)])
+FOOTPRINT_GRID = np.array([[x, y, z] for x in (-1, 1) for y in np.linspace(-1, 1, 8) for z in (-1, 1)])
 
 
 @dataclass(frozen=True)
@@ -120,11 +120,14 @@ def _clearance(
     height = (top - lowest + 0.002)[:, None, None]
     gaps = []
     others = (world.boxes.body != obj) & (world.boxes.body != receptacle)
+    if receptacle >= 0:
+        reach = np.linalg.norm(np.abs(surface).max(0)) + np.sqrt(2) * REACH + ROOM
+        others &= world.near(goal.mean(1), reach)
     for points, thickness in ((body, 0.0), (fingers, PAD_HALF_SIZE[1])):
         moved = _turned(points[:, None], turn)
         moved = np.concatenate([moved[..., :2] + goal[:, :, None], moved[..., 2:] + height[..., None]], -1)
-        distance = world.distance(moved.reshape(n, -1, 3)).reshape(n, s, -1, len(others))
-        gaps.append(distance[..., others].min((2, 3)) - thickness)
+        distance = world.distance(moved.reshape(n, -1, 3), np.flatnonzero(others))
+        gaps.append(distance.reshape(n, s, -1).min(2) - thickness)
     return np.minimum(*gaps)
 
 
