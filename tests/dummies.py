@@ -32,11 +32,11 @@ class DummyEnv:
     """
 
     metadata = {"render_fps": 5}  # noqa: RUF012
-    single_observation_space = gym.spaces.Dict({"agent_pos": gym.spaces.Box(-9, 9, (2,), np.float32)})
+    single_observation_space = gym.spaces.Dict({"agent_pos": gym.spaces.Box(-9, 9, (13,), np.float32)})
 
     def __init__(self, num_envs: int, diverge_at: set[tuple[int, int]] | None = None):
         self.num_envs = num_envs
-        self.scene = SimpleNamespace(tasks=TASKS)
+        self.scene = SimpleNamespace(tasks=TASKS, bodies=())
         self.tasks = [TASKS[0]] * num_envs
         self.x = np.zeros(num_envs)
         self.t = 0
@@ -59,7 +59,9 @@ class DummyEnv:
         return self._observation()
 
     def _observation(self):
-        return {"agent_pos": np.stack([self.x, np.ones(self.num_envs)], axis=1).astype(np.float32)}
+        agent_pos = np.zeros((self.num_envs, 13), np.float32)
+        agent_pos[:, 0], agent_pos[:, 1] = self.x, 1
+        return {"agent_pos": agent_pos}
 
     def set_task(self, ids, tasks):
         self.calls.append("set_task")
@@ -122,7 +124,7 @@ class DummyPolicy(PreTrainedPolicy):
 
     def _inputs(self, batch):
         goals = torch.tensor([[float(text.removeprefix("go to "))] for text in batch["task"]])
-        return torch.cat([batch["observation.state"], goals], dim=1)
+        return torch.cat([batch["observation.state"][:, :2], goals], dim=1)
 
     def _distribution(self, batch, temperature):
         logits = self.actor(self._inputs(batch)).reshape(-1, 7, NUM_BINS)

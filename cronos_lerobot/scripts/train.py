@@ -9,6 +9,7 @@ import sys
 from typing import Any
 
 import torch
+from draccus.utils import ParsingError
 from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
@@ -22,7 +23,10 @@ from cronos_lerobot.training.trainer import Trainer
 @parser.wrap()
 def train(config: CronosTrainConfig) -> None:
     """Train as `config` says, from the start or from a checkpoint."""
-    config.validate()
+    try:
+        config.validate()
+    except (ValueError, FileExistsError) as error:
+        sys.exit(f"error: {error}")
     init_logging()
     if config.torch_threads is not None:
         torch.set_num_threads(config.torch_threads)
@@ -52,7 +56,10 @@ def main() -> None:
     given = [argument.split("=")[0] for argument in sys.argv[1:]]
     if "--algorithm.type" not in given and "--config_path" not in given:
         sys.argv.append("--algorithm.type=ppo")
-    train()
+    try:
+        train()
+    except ParsingError as error:
+        sys.exit(f"error: {error.__cause__ or error}")
 
 
 if __name__ == "__main__":

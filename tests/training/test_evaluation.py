@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+import torch
+from dummies import TASKS, DummyEnv, DummyPolicy, identity_processors
+
+from cronos_lerobot.rl.processing import PolicyProcessors
+from cronos_lerobot.training.evaluation import SuccessRate, evaluate_independent, wilson_interval
+
+PROCESSORS = PolicyProcessors(*identity_processors(), "cpu")
+
+
+class ScriptedPolicy(DummyPolicy):
+    """Walks towards positive goals, never towards negative ones; counts its calls."""
+
+    calls = 0
+
+    def sample_actions(self, batch, *, temperature=1.0, generator=None):
+        self.calls += 1
+        actions = torch.zeros(len(batch["task"]), 7)
+        goals = torch.tensor([float(text.removeprefix("go to ")) for text in batch["task"]])
+        actions[:, 0] = (goals > 0) * torch.sign(goals - batch["observation.state"][:, 0])
+        return {"action": actions}
+
+
+def evaluate(policy, num_envs=8, **options):
+    return evaluate_independent(DummyEnv(num_envs), TASKS, policy, PROCESSORS, **options)
+
+
+def test_wilson_interval_of_known_counts():
+    # Published values: 0/10 -> (0, .2775), 9/10 -> (.5958, .9821), 5/10 -> (.2366, .7634).
+    assert wilson_interval(0, 10) == pytest.approx((0, 0.2775), abs=1e-4)
+    assert wilson_interval(9, 10) == pytest.approx((0.5958, 0.9821), abs=1e-4)
+    assert wilson_interval(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-4)
+    with pytest.raises(ValueError, match="n=0"):
+        wilson_interval(0, 0)
+
+
+@pytest.mark.parametrize("num_envs", [1, 5, 16])
+def test_every_task_from_every_configuration(num_envs):
+    result = evaluate(ScriptedPolicy(), num_envs, configurations=range(6))
+    by_task = {task: sum(flags) for task, flags in result.successes.items()}
+    assert by_task == {"go to 1.0": 6, "go to -1.0": 0, "go to 2.0": 6, "go to -2.0": 0}
+    assert result.overall == SuccessRate(12, 24)
+    record = result.to_dict()
+    assert (record["success"], record["n"]) == (0.5, 24)
+    assert record["per_task"]["go to 1.0"]["success"] == 1
+
+
+def test_a_success_counts_at_any_step_and_80_steps_are_all():
+    policy = ScriptedPolicy()
+    evaluate_independent(DummyEnv(2), [TASKS[0]], policy, PROCESSORS, configurations=range(2))
+    assert policy.calls < 10  # both have been there
+    policy = ScriptedPolicy()
+    evaluate_independent(DummyEnv(2), [TASKS[1]], policy, PROCESSORS, configurations=range(2))
+    assert policy.calls == 80
+
+
+def test_split_and_configurations_reach_the_environment():
+    seen = []
+
+    class Env(DummyEnv):
+        def scene_reset(self, ids, configurations, split="train"):
+            seen.append((configurations.tolist(), split))
+            super().scene_reset(ids, configurations, split)
+
+    evaluate_independent(Env(4), TASKS[:1], ScriptedPolicy(), PROCESSORS, configurations=[3, 9], split="held_out")
+    assert seen == [([3, 9, 9, 9], "held_out")]
+
+
+def test_sampling_is_seeded_and_leaves_the_global_generators_alone():
+    policy = DummyPolicy(seed=1)
+    torch.manual_seed(0)
+    state = torch.get_rng_state()
+    first = evaluate(policy, seed=3, configurations=range(6))
+    np.random.rand()
+    torch.rand(5)
+    second = evaluate(policy, seed=3, configurations=range(6))
+    third = evaluate(policy, seed=4, configurations=range(6))
+    assert first == second
+    assert first.successes != third.successes
+    torch.manual_seed(0)
+    evaluate(policy, seed=3, configurations=range(6))
+    assert torch.equal(state, torch.get_rng_state())
+
+
+def test_a_broken_simulation_is_no_success():
+    env = DummyEnv(1, diverge_at={(t, 0) for t in range(80)})
+    result = evaluate_independent(env, [TASKS[0]], ScriptedPolicy(), PROCESSORS, configurations=[0])
+    assert result.overall == SuccessRate(0, 1)

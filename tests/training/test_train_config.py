@@ -1,0 +1,99 @@
+import sys
+
+import draccus
+import pytest
+from dummies import DummyPolicyConfig
+from lerobot_env_cronos import CronosEnvConfig
+
+from cronos_lerobot.rl.ppo_config import PaperPPOConfig, PPOConfig
+from cronos_lerobot.scripts import train as script
+from cronos_lerobot.training.config import CronosTrainConfig
+
+
+def parse(*arguments):
+    return draccus.parse(CronosTrainConfig, args=list(arguments))
+
+
+def test_flags_of_the_protocol_and_the_algorithm():
+    cfg = parse(
+        "--env.type=cronos",
+        "--protocol.scene_reset_interval=null",
+        "--protocol.curriculum=[[650000,320]]",
+        "--protocol.reset_budget=2000",
+        "--algorithm.type=ppo_paper",
+        "--algorithm.policy_lr=0.5",
+        "--record.streams=all",
+    )
+    assert cfg.protocol.scene_reset_interval is None
+    assert cfg.protocol.scene_reset_interval_at(650_000) == 320
+    assert cfg.protocol.scene_reset_interval_at(650_001) is None
+    assert isinstance(cfg.algorithm, PaperPPOConfig)
+    assert (cfg.algorithm.policy_lr, cfg.algorithm.minibatch_size) == (0.5, 8)
+    assert cfg.record.num_streams == "all"
+    assert isinstance(cfg.env, CronosEnvConfig)
+
+
+def test_saved_config_reads_back_and_takes_overrides(tmp_path):
+    cfg = CronosTrainConfig(
+        env=CronosEnvConfig(),
+        policy=DummyPolicyConfig(),
+        output_dir=tmp_path / "run",
+        algorithm=PPOConfig(epochs=7),
+    )
+    cfg.save_pretrained(tmp_path)
+    for path in (tmp_path, tmp_path / "train_config.json"):
+        copy = CronosTrainConfig.from_pretrained(path, cli_args=["--steps=77"])
+        assert copy.to_dict() == cfg.to_dict() | {"steps": 77}
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        CronosTrainConfig.from_pretrained(tmp_path / "nowhere.json")
+
+
+def test_steps_are_rounded_up_to_whole_updates():
+    assert CronosTrainConfig(steps=1).total_steps == 64 * 160
+    assert CronosTrainConfig(steps=1_300_000).total_steps == 127 * 64 * 160
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--steps=0"], "steps must be >= 1"),
+        (["--eval.n_episodes=65"], "1 to 64"),
+        (["--eval.split=test"], "held_out"),
+        (["--protocol.update_interval=100"], "multiple of protocol.task_switch_interval=80"),
+        (["--protocol.heuristic_reset=true"], "not available in this version"),
+        (["--protocol.task_order=sorted"], "heuristic"),
+        (["--record.streams=some"], "number or 'all'"),
+        (["--keep_checkpoints=0"], "keep_checkpoints"),
+        (["--steps=80"], "Choose an environment"),
+        (["--env.type=cronos", "--algorithm.type=sac"], "ppo or ppo_paper"),
+    ],
+)
+def test_bad_values_are_named_on_the_command_line(arguments, message, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["cronos-train", *arguments])
+    with pytest.raises(SystemExit, match=message):
+        script.main()
+
+
+def test_what_is_missing_is_asked_for(tmp_path):
+    with pytest.raises(ValueError, match="--env"):
+        CronosTrainConfig().validate()
+    with pytest.raises(ValueError, match="--policy"):
+        CronosTrainConfig(env=CronosEnvConfig()).validate()
+    with pytest.raises(ValueError, match="--config_path"):
+        CronosTrainConfig(env=CronosEnvConfig(), resume=True).validate()
+    with pytest.raises(FileExistsError, match="--resume=true"):
+        CronosTrainConfig(env=CronosEnvConfig(), policy=DummyPolicyConfig(), output_dir=tmp_path).validate()
+
+
+def test_help_teaches(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["cronos-train", "--help"])
+    with pytest.raises(SystemExit):
+        script.main()
+    text = " ".join(capsys.readouterr().out.split())
+    for taught in (
+        "--protocol.scene_reset_interval [int]",
+        "control steps of one stream between two scene resets",
+        "--algorithm.policy_lr float",
+        "Interaction steps between two evaluations",
+    ):
+        assert taught in text

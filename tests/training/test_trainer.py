@@ -1,0 +1,202 @@
+"""Whole runs with a dummy environment and policy: resuming, seeds, logs, recordings."""
+
+import json
+from importlib.metadata import version
+
+import numpy as np
+import pytest
+import torch
+from dummies import DummyEnv, DummyPolicy, DummyPolicyConfig, identity_processors
+from lerobot.utils.random_utils import set_seed
+from safetensors.torch import load_file
+
+from cronos_lerobot.protocol import ProtocolConfig
+from cronos_lerobot.rl.ppo_config import PPOConfig
+from cronos_lerobot.training.config import CronosTrainConfig, PeriodicEvaluationConfig, RecordConfig
+from cronos_lerobot.training.trainer import Trainer
+
+VOLATILE = ("time", "time_share", "steps_per_s")
+STREAMS = 4
+STEPS_PER_UPDATE = 4 * 8
+
+
+def config(folder, steps=4 * STEPS_PER_UPDATE, **options):
+    defaults = {
+        "policy": DummyPolicyConfig(),
+        "output_dir": folder,
+        "num_envs": STREAMS,
+        "steps": steps,
+        "seed": 5,
+        "protocol": ProtocolConfig(
+            task_switch_interval=4, update_interval=8, scene_reset_interval=16, task_order="random"
+        ),
+        "algorithm": PPOConfig(minibatch_size=16, policy_lr=1e-2, kl_base_coef=0.1),
+        "eval": PeriodicEvaluationConfig(n_episodes=3, batch_size=5),
+        "eval_freq": 2 * STEPS_PER_UPDATE,
+        "save_freq": STEPS_PER_UPDATE,
+        "tensorboard": False,
+    }
+    return CronosTrainConfig(**(defaults | options))
+
+
+def make_trainer(cfg, env=None, policy_seed=0):
+    set_seed(cfg.seed)
+    preprocessor, postprocessor = identity_processors()
+    env = env or DummyEnv(STREAMS, diverge_at={(5, 1), (21, 2)})
+    return Trainer(cfg, env, DummyEnv, DummyPolicy(seed=policy_seed), preprocessor, postprocessor)
+
+
+def train(cfg, **options):
+    trainer = make_trainer(cfg, **options)
+    trainer.train()
+    return trainer
+
+
+def metrics(folder):
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in line.items() if k not in VOLATILE} for line in lines]
+
+
+def weights(folder):
+    return load_file(folder / "checkpoints/last/pretrained_model/model.safetensors")
+
+
+def assert_same_run(a, b):
+    assert metrics(a) == metrics(b)
+    for name, tensor in weights(a).items():
+        assert torch.equal(tensor, weights(b)[name]), name
+    state = "checkpoints/last/training_state"
+    assert json.loads((a / state / "loop.json").read_text()) == json.loads((b / state / "loop.json").read_text())
+    for name, tensor in load_file(a / state / "optimizer_state.safetensors").items():
+        assert torch.equal(tensor, load_file(b / state / "optimizer_state.safetensors")[name]), name
+    with np.load(a / state / "env_state.npz") as first, np.load(b / state / "env_state.npz") as second:
+        assert all(np.array_equal(first[name], second[name]) for name in first)
+
+
+class KilledError(Exception):
+    pass
+
+
+class MortalEnv(DummyEnv):
+    """Dies in the middle of a segment."""
+
+    def step(self, actions):
+        if self.t == 21:
+            raise KilledError
+        return super().step(actions)
+
+
+def test_resumed_run_equals_the_unbroken_one(tmp_path):
+    unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
+    train(config(unbroken))
+    with pytest.raises(KilledError):
+        train(config(broken), env=MortalEnv(STREAMS, diverge_at={(5, 1), (21, 2)}))
+    checkpoint = (broken / "checkpoints/last").resolve()
+    assert checkpoint.name == f"{2 * STEPS_PER_UPDATE:06d}"
+    # Lines after the checkpoint, also half a line, are what a kill may leave.
+    with (broken / "metrics.jsonl").open("a") as file:
+        file.write('{"kind": "update", "interaction_steps": 96}\n{"kind": "upd')
+    resumed = config(broken)
+    resumed.checkpoint_path = checkpoint
+    # Another policy and another seed of torch: everything must come from the checkpoint.
+    torch.manual_seed(999)
+    train(resumed, policy_seed=8)
+    assert_same_run(unbroken, broken)
+    assert len(json.loads((broken / "manifest.json").read_text())["starts"]) == 2
+
+
+def test_same_seed_same_run_other_seed_other_run(tmp_path):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        train(config(tmp_path / name, seed=seed, steps=2 * STEPS_PER_UPDATE))
+    assert_same_run(tmp_path / "a", tmp_path / "b")
+    assert metrics(tmp_path / "a") != metrics(tmp_path / "c")
+
+
+def test_run_does_not_depend_on_saving_evaluating_and_recording(tmp_path):
+    train(config(tmp_path / "busy", record=RecordConfig(repo_id="me/stream", streams="2")))
+    train(config(tmp_path / "quiet", eval_freq=0, save_freq=0))
+    for name, tensor in weights(tmp_path / "busy").items():
+        assert torch.equal(tensor, weights(tmp_path / "quiet")[name]), name
+    updates = [line for line in metrics(tmp_path / "busy") if line["kind"] == "update"]
+    assert updates == metrics(tmp_path / "quiet")
+    assert [p.name for p in sorted((tmp_path / "quiet/checkpoints").iterdir())] == ["000128", "last"]
+
+
+def test_metrics_hold_both_axes_and_the_rollouts_success(tmp_path):
+    trainer = train(config(tmp_path / "run"))
+    lines = metrics(tmp_path / "run")
+    kinds = ["evaluation", "update", "update", "evaluation", "update", "update", "evaluation"]
+    assert [line["kind"] for line in lines] == kinds
+    updates = [line for line in lines if line["kind"] == "update"]
+    assert [line["interaction_steps"] for line in updates] == [32, 64, 96, 128]
+    # T = 16 resets four streams in updates 2 and 4; streams 1 and 2 diverge once each.
+    assert [line["interventions"] for line in updates] == [1, 5, 6, 10]
+    assert updates[-1]["interventions_by_kind"]["divergence"] == 2
+    assert [line["rollout"]["segments"] for line in updates] == [8, 8, 8, 8]
+    first = updates[0]["rollout"]
+    # Stream 1 diverges in its second segment, which so becomes its first one since a scene reset.
+    assert {position: n for position, (_, n) in first["success_by_segment"].items()} == {"0": 5, "1": 3}
+    assert sum(n for _, n in first["success_by_task"].values()) == 8
+    successes = sum(line["rollout"]["success"] * 8 for line in updates)
+    assert successes == trainer.loop.successes.sum()
+    evaluation = lines[-1]
+    assert evaluation["n"] == 12
+    assert set(evaluation["per_task"]) == set(trainer.statistics.instructions)
+
+
+def test_manifest_tells_the_run(tmp_path):
+    train(config(tmp_path / "run", steps=1))
+    (start,) = json.loads((tmp_path / "run/manifest.json").read_text())["starts"]
+    assert start["seed"] == 5
+    assert start["versions"]["torch"] == version("torch")
+    assert start["config"]["protocol"]["task_switch_interval"] == 4
+
+
+def test_old_checkpoints_are_dropped(tmp_path):
+    train(config(tmp_path / "run", keep_checkpoints=2))
+    names = sorted(p.name for p in (tmp_path / "run/checkpoints").iterdir())
+    assert names == ["000096", "000128", "last"]
+    assert (tmp_path / "run/checkpoints/last").resolve().name == "000128"
+
+
+def test_kill_while_saving_leaves_the_last_checkpoint_whole(tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    train(config(folder, steps=STEPS_PER_UPDATE))
+
+    def die(*args, **kwargs):
+        raise KilledError
+
+    trainer = make_trainer(config(folder, steps=2 * STEPS_PER_UPDATE))
+    trainer.config.checkpoint_path = folder / "checkpoints/last"
+    monkeypatch.setattr("cronos_lerobot.training.checkpoint.np.savez", die)
+    with pytest.raises(KilledError):
+        trainer.train()
+    assert (folder / "checkpoints/last").resolve().name == "000032"
+    assert sorted(p.name for p in (folder / "checkpoints").iterdir()) == ["000032", "last"]
+
+
+def test_checkpoint_of_another_run_is_refused(tmp_path):
+    train(config(tmp_path / "run", steps=STEPS_PER_UPDATE))
+    other = config(tmp_path / "other", num_envs=6)
+    other.checkpoint_path = tmp_path / "run/checkpoints/last"
+    with pytest.raises(ValueError, match="num_streams=4, this run 6"):
+        make_trainer(other, env=DummyEnv(6)).train()
+
+
+def test_recorded_streams_are_whole_and_survive_a_kill(tmp_path):
+    from lerobot.datasets import LeRobotDataset
+
+    record = RecordConfig(repo_id="me/stream", streams="2")
+    with pytest.raises(KilledError):
+        train(config(tmp_path / "run", record=record), env=MortalEnv(STREAMS, diverge_at={(5, 1), (21, 2)}))
+    resumed = config(tmp_path / "run", record=record)
+    resumed.checkpoint_path = (tmp_path / "run/checkpoints/last").resolve()
+    train(resumed)
+    data = LeRobotDataset("me/stream", root=tmp_path / "run/streams").hf_dataset.with_format("numpy")
+    for stream, interventions in ((0, [6, 0, 0, 0, 2, 0, 0, 0]), (1, [6, 0, 0, 0, 2, 0, 5, 0])):
+        mine = data["cronos.stream_id"][:] == stream
+        assert data["cronos.step"][:][mine].tolist() == list(range(32))
+        assert data["cronos.intervention"][:][mine][:8].tolist() == interventions
+        segments = data["cronos.segment_index"][:][mine]
+        assert set(np.diff(segments)) <= {0, 1}
+        assert data["cronos.policy_version"][:][mine].tolist() == [i // 8 for i in range(32)]
