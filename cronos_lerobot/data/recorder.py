@@ -106,7 +106,7 @@ class StreamRecorder:
             writer = SegmentWriter.resume(repo_id, root, state["writer"], **writer_options)
         recorder = cls(writer, num_envs=env.num_envs, segment_length=segment_length, streams=streams)
         if state is not None:
-            recorder._load_partial_segments(state["partial_segments"])
+            recorder.load_partial_segments(state)
         return recorder
 
     def on_step(
@@ -143,7 +143,7 @@ class StreamRecorder:
             stream_interventions: (n,) interventions that count, so far, per stream.
             total_interventions: the same over all streams.
             steps: (n,) control steps of each stream before this one.
-            segments: (n,) task switches of each stream before this step.
+            segments: (n,) pieces of each stream before this one: task switches and divergences end one.
             segment_ends: (n,) bool, this is the segment's last step (a switch or a reset follows).
 
         Raises:
@@ -177,11 +177,19 @@ class StreamRecorder:
     def state_dict(self) -> dict[str, Any]:
         """Flush, and return what `open(state=...)` needs to go on from here (numbers and numpy arrays)."""
         self.writer.flush()
-        partial = [
-            {"task": self._tasks[i], "frames": {k: v[: self._lengths[i]].copy() for k, v in buffer.items()}}
-            for i, buffer in enumerate(self._buffers)
-        ]
-        return {"writer": self.writer.state_dict(), "partial_segments": partial}
+        partial = {
+            str(stream): {
+                "task": self._tasks[stream],
+                "frames": {key: frames[:length].copy() for key, frames in self._buffers[stream].items()},
+            }
+            for stream, length in enumerate(self._lengths)
+            if length
+        }
+        return {
+            "writer": self.writer.state_dict(),
+            "num_streams": self.num_streams,
+            "partial_segments": partial,
+        }
 
     def close(self) -> None:
         """Write the unfinished segments too (their last `next.done` is False) and finalize the dataset."""
@@ -189,6 +197,19 @@ class StreamRecorder:
             if self._lengths[stream]:
                 self._write_segment(stream)
         self.writer.finalize()
+
+    def load_partial_segments(self, state: Mapping[str, Any]) -> None:
+        """Take over the unfinished segments of `state_dict()`, for a writer that was resumed from it."""
+        if state["num_streams"] != self.num_streams:
+            raise ValueError(
+                f"the state is of {state['num_streams']} recorded streams, this run records {self.num_streams}"
+            )
+        for name, segment in state["partial_segments"].items():
+            stream = int(name)
+            for key, frames in segment["frames"].items():
+                self._buffers[stream][key][: len(frames)] = frames
+                self._lengths[stream] = len(frames)
+            self._tasks[stream] = segment["task"]
 
     def _append(self, stream: int, columns: Mapping[str, np.ndarray], task: str) -> None:
         length = self._lengths[stream]
@@ -233,14 +254,3 @@ class StreamRecorder:
             dtype = np.uint8 if feature["dtype"] == "video" else feature["dtype"]
             buffer[key] = np.empty((self.segment_length, *shape), dtype=dtype)
         return buffer
-
-    def _load_partial_segments(self, partial: Sequence[Mapping[str, Any]]) -> None:
-        if len(partial) != self.num_streams:
-            raise ValueError(f"the state holds {len(partial)} streams, this run records {self.num_streams}")
-        for stream, segment in enumerate(partial):
-            lengths = {len(frames) for frames in segment["frames"].values()}
-            (length,) = lengths
-            for key, frames in segment["frames"].items():
-                self._buffers[stream][key][:length] = frames
-            self._tasks[stream] = segment["task"]
-            self._lengths[stream] = length

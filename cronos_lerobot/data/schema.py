@@ -112,13 +112,16 @@ def demonstration_features(
 def stream_features(observation_space: gymnasium.Space, **names: Sequence[str] | None) -> Features:
     """Features of a recorded training stream: those of `demonstration_features` and `STREAM_COLUMNS`.
 
-    `cronos.stream_id`: which of the parallel streams. `cronos.step`: control steps of this stream before
-    this one, from 0, without a gap. `cronos.segment_index`: task switches of this stream before this frame.
-    `cronos.intervention`: an `Intervention`. `cronos.stream_interventions`, `cronos.total_interventions`:
-    interventions that count (scene and heuristic resets) so far, those right before this frame included, of
-    this stream and of all streams together. `cronos.policy_version`: policy updates before this action.
-    `cronos.log_prob`: log-probability (nats, summed over the action's dimensions) of the action under the
-    policy that chose it. `cronos.value`: that policy's value estimate of the observation.
+    - `cronos.stream_id`: which of the parallel streams.
+    - `cronos.step`: control steps of this stream before this one, from 0, without a gap.
+    - `cronos.segment_index`: pieces of this stream before this one; a task switch or a divergence ends one.
+    - `cronos.intervention`: an `Intervention`, what happened between the frame before and this one.
+    - `cronos.stream_interventions`, `cronos.total_interventions`: interventions that count (scene and
+      heuristic resets) so far, those right before this frame included, of this stream and of all together.
+    - `cronos.policy_version`: policy updates before this action.
+    - `cronos.log_prob`: log-probability of the action under the policy that chose it, summed over the
+      action's dimensions [nats].
+    - `cronos.value`: that policy's value of the observation.
     """
     columns = {key: _scalar_feature(dtype) for key, dtype in _STREAM_COLUMNS.items()}
     return demonstration_features(observation_space, **names) | columns

@@ -149,6 +149,8 @@ def move_into_place(root: Path, relative: str) -> None:
     """Replace `<root>/<relative>` by its staged version in one step."""
     target = root / relative
     target.parent.mkdir(parents=True, exist_ok=True)
+    with open(root / INCOMPLETE / relative, "rb") as staged:
+        os.fsync(staged.fileno())
     os.replace(root / INCOMPLETE / relative, target)
 
 

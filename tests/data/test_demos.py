@@ -1,0 +1,232 @@
+import logging
+
+import numpy as np
+import pytest
+from lerobot.datasets import LeRobotDataset
+from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos.config import CronosEnvConfig
+from lerobot_env_cronos.expert import ScriptedExpert
+from lerobot_env_cronos.robot import HOME_QPOS
+
+from cronos_lerobot.data.demos import DemoCollector, DemoConfig, StartConfig
+from cronos_lerobot.data.perturbations import ActionNoise, MissConfig, NoiseConfig
+from cronos_lerobot.data.schema import demonstration_features, feature_names
+from cronos_lerobot.data.writer import SegmentWriter
+from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig, record_demos
+
+NUM_ENVS = 4
+
+
+@pytest.fixture(scope="module")
+def env():
+    return CronosVectorEnv(NUM_ENVS, obs_type="environment_state_agent_pos")
+
+
+def collect(env, root, config: DemoConfig, num_episodes=4, *, seed=0, tasks=None, expert=None):
+    features = demonstration_features(env.single_observation_space, **feature_names(env))
+    with SegmentWriter("me/demos", root, features, 5) as writer:
+        collector = DemoCollector(env, expert or ScriptedExpert(env), writer, config, seed=seed, tasks=tasks)
+        collector.collect(num_episodes)
+    return LeRobotDataset("me/demos", root=root), collector
+
+
+def episodes_of(dataset):
+    rows = dataset.hf_dataset.with_format("numpy")[:]
+    for episode in range(dataset.num_episodes):
+        mine = rows["episode_index"] == episode
+        yield {key: column[mine] for key, column in rows.items()}
+
+
+class Spy:
+    """An expert whose actions, and the actions executed, are kept."""
+
+    def __init__(self, env, monkeypatch):
+        self.env, self.expert = env, ScriptedExpert(env)
+        self.labels, self.seen, self.executed = [], [], []
+        step = env.step
+
+        def spy(actions):
+            self.executed.append(np.array(actions))
+            return step(actions)
+
+        monkeypatch.setattr(env, "step", spy)
+
+    def reset(self, ids):
+        self.expert.reset(ids)
+
+    def act(self):
+        self.seen.append(self.env.observe()["agent_pos"])
+        self.labels.append(self.expert.act().astype(np.float32))
+        return self.labels[-1]
+
+
+def test_successful_episodes_of_every_task_in_balance(env, tmp_path):
+    dataset, collector = collect(env, tmp_path / "d", DemoConfig(steps_after_release=2), 8)
+    assert dataset.num_episodes == collector.successes == 8
+    tasks = [task for tasks in dataset.meta.episodes["tasks"] for task in tasks]
+    assert {task: tasks.count(task) for task in tasks} == {task.instruction: 2 for task in env.scene.tasks}
+    for episode in episodes_of(dataset):
+        assert episode["next.success"][-3:].all()
+        assert not episode["next.success"][0]
+        assert episode["next.done"].tolist() == [False] * (len(episode["index"]) - 1) + [True]
+        assert episode["next.reward"].sum() == pytest.approx(1.0)  # "difference": the level reached
+
+
+def test_starts_at_home_in_training_configurations(env, tmp_path):
+    dataset, _ = collect(env, tmp_path / "d", DemoConfig())
+    home = home_position(env)
+    for episode in episodes_of(dataset):
+        np.testing.assert_allclose(episode["observation.state"][0, :3], home, atol=2e-3)
+    assert dataset.meta.episodes["cronos.configuration"] == [0, 0, 0, 0]
+
+
+def home_position(env):
+    env.scene_reset(np.array([0]), np.array([0]))
+    np.testing.assert_array_equal(env.simulation.qpos[0, :6], HOME_QPOS)
+    return env.simulation.end_effector()[0][0]
+
+
+def test_the_first_frame_is_of_the_new_episode(env, tmp_path):
+    """The observation beside an action is the one the expert acted on, also right after a reset."""
+    dataset, _ = collect(env, tmp_path / "d", DemoConfig(), 8)
+    positions = slice(0, 3)
+    for episode in episodes_of(dataset):
+        steps = np.abs(np.diff(episode["observation.state"][:, positions], axis=0))
+        assert steps.max() < 0.06  # no teleport: at most one action per frame
+
+
+def test_same_seed_same_demonstrations(env, tmp_path):
+    config = DemoConfig(noise=NoiseConfig(share=0.5), start=StartConfig(layouts="random"))
+    first, second, other = (
+        collect(env, tmp_path / name, config, seed=seed)[0].hf_dataset.with_format("numpy")[:]
+        for name, seed in (("a", 0), ("b", 0), ("c", 1))
+    )
+    for key in first:
+        np.testing.assert_array_equal(first[key], second[key])
+    assert not np.array_equal(first["observation.state"][:4], other["observation.state"][:4])
+
+
+def test_noise_is_executed_but_not_recorded(env, tmp_path, monkeypatch):
+    spy = Spy(env, monkeypatch)
+    dataset, _ = collect(env, tmp_path / "d", DemoConfig(noise=NoiseConfig(share=1.0, rate=0.5)), expert=spy)
+    labels, executed = np.stack(spy.labels), np.stack(spy.executed)
+    assert (np.abs(labels - executed)[..., :6].max(axis=-1) > 1e-4).mean() > 0.2
+    # Every recorded frame is a state that the expert saw, beside what it wanted to do there.
+    known = {(a.tobytes(), s.tobytes()) for a, s in zip(labels.reshape(-1, 7), np.concatenate(spy.seen))}
+    rows = dataset.hf_dataset.with_format("numpy")[:]
+    assert all((a.tobytes(), s.tobytes()) in known for a, s in zip(rows["action"], rows["observation.state"]))
+
+
+def test_noise_leaves_the_gripper_and_the_bounds_alone():
+    noise = ActionNoise(NoiseConfig(share=1.0, rate=1.0, scale=5.0), 2)
+    for stream in range(2):
+        noise.reset(stream, np.random.default_rng(stream))
+    actions = np.tile(np.array([0, 0, 0, 0, 0, 0, 1], np.float32), (2, 1))
+    noisy = noise.apply(actions, np.array([True, False]))
+    assert (noisy[0, :6] != 0).all()
+    assert (np.abs(noisy[0, :6]) <= 0.21).all()
+    assert noisy[:, 6].tolist() == [1, 1]
+    np.testing.assert_array_equal(noisy[1], actions[1])
+
+
+def test_a_miss_closes_beside_the_object_and_shows_the_recovery(env, tmp_path, monkeypatch):
+    spy = Spy(env, monkeypatch)
+    dataset, collector = collect(env, tmp_path / "d", DemoConfig(misses=MissConfig(share=1.0)), expert=spy)
+    assert collector.successes == 4
+    labels, executed = np.stack(spy.labels), np.stack(spy.executed)
+    # Closed on purpose where the expert would keep the gripper open: that is never what is recorded.
+    assert ((executed[..., 6] < 0.5) & (labels[..., 6] > 0.5)).sum() >= 4
+    for episode in episodes_of(dataset):
+        opening, command = episode["observation.state"][:, 9], episode["action"][:, 6]
+        recovers = (opening < 0.5) & (command > 0.5) & ~episode["next.success"]
+        assert recovers.any()
+
+
+@pytest.mark.parametrize("arm_pose", ["random", "after_task"])
+def test_starts_elsewhere(env, tmp_path, arm_pose):
+    start = StartConfig(arm_pose=arm_pose, layouts="random")
+    dataset, _ = collect(env, tmp_path / "d", DemoConfig(start=start))
+    starts = np.stack([episode["observation.state"][0, :3] for episode in episodes_of(dataset)])
+    assert (np.linalg.norm(starts - home_position(env), axis=1) > 0.02).all()
+    assert np.linalg.norm(starts[0] - starts[1]) > 0.02
+    assert dataset.meta.episodes["cronos.configuration"] == [-1] * 4
+
+
+def test_occupied_receptacles_hold_the_other_object(env, tmp_path):
+    start = StartConfig(occupied_receptacles=True)
+    dataset, _ = collect(env, tmp_path / "d", DemoConfig(start=start))
+    bodies = env.scene.bodies
+    home = home_position(env)
+    for episode, (task,) in zip(episodes_of(dataset), dataset.meta.episodes["tasks"], strict=True):
+        (task,) = [t for t in env.scene.tasks if t.instruction == task]
+        (other,) = [name for name in env.scene.objects if name != task.object]
+        state = episode["observation.environment_state"][0].reshape(len(bodies), -1)
+        distance = state[bodies.index(other), :2] - state[bodies.index(task.receptacle), :2]
+        assert np.linalg.norm(distance) < 0.07
+        np.testing.assert_allclose(episode["observation.state"][0, :3], home, atol=2e-3)
+
+
+def test_failures_are_dropped_unless_asked_for(env, tmp_path):
+    """An expert that does nothing fails every episode."""
+
+    class Idle:
+        def reset(self, ids):
+            pass
+
+        def act(self):
+            return np.tile(np.array([0, 0, 0, 0, 0, 0, 1.0]), (NUM_ENVS, 1))
+
+    dataset, collector = collect(
+        env, tmp_path / "d", DemoConfig(max_steps=3, keep_failures=True), 4, expert=Idle()
+    )
+    assert dataset.meta.episodes["length"] == [3] * 4
+    assert (collector.successes, collector.finished) == (0, 4)
+    with pytest.raises(RuntimeError, match="failed 200 times in a row"):
+        collect(env, tmp_path / "e", DemoConfig(max_steps=1), 1, expert=Idle())
+
+
+def test_one_task_only(env, tmp_path):
+    dataset, _ = collect(env, tmp_path / "d", DemoConfig(), 2, tasks=[env.scene.tasks[3]])
+    assert dataset.meta.episodes["tasks"] == [[env.scene.tasks[3].instruction]] * 2
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: StartConfig(arm_pose="up"), "unknown start.arm_pose 'up'; valid: \\['home'"),
+        (lambda: StartConfig(layouts="held_out"), "unknown start.layouts 'held_out'"),
+        (lambda: NoiseConfig(share=2), "noise.share"),
+        (lambda: MissConfig(min_offset_m=0.1), "misses.min_offset_m"),
+        (lambda: RecordDemosConfig(), "--dataset.repo_id is required"),
+    ],
+)
+def test_wrong_options_are_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def command(root, num_episodes, **options) -> RecordDemosConfig:
+    overwrite = options.pop("overwrite", False)
+    dataset = DemoDatasetConfig("me/demos", root, num_episodes, overwrite)
+    environment = CronosEnvConfig(observation_height=64, observation_width=64)
+    return RecordDemosConfig(env=environment, dataset=dataset, num_envs=2, **options)
+
+
+def test_the_command_records_resumes_and_overwrites(tmp_path, caplog):
+    root = tmp_path / "d"
+    record_demos(command(root, 2))
+    with pytest.raises(FileExistsError, match="--resume=true goes on with it"):
+        record_demos(command(root, 3))
+    with caplog.at_level(logging.INFO):
+        record_demos(command(root, 3, resume=True))
+    assert "3 episodes" in caplog.text
+    dataset = LeRobotDataset("me/demos", root=root)
+    assert dataset.num_episodes == 3
+    assert dataset[0]["observation.images.front"].shape == (3, 64, 64)
+    assert dataset.meta.fps == 5
+    record_demos(command(root, 1, overwrite=True))
+    assert LeRobotDataset("me/demos", root=root).num_episodes == 1
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "thesis.tex").write_text("...")
+    with pytest.raises(FileExistsError, match="is not a LeRobotDataset"):
+        record_demos(command(tmp_path / "precious", 1, overwrite=True))

@@ -1,0 +1,203 @@
+import numpy as np
+import pytest
+from lerobot.datasets import LeRobotDataset
+from synthetic import FPS, STATE_DIM, images, observation_space
+
+from cronos_lerobot.data.recorder import StreamRecorder
+from cronos_lerobot.data.schema import Intervention, stream_features
+from cronos_lerobot.data.writer import SegmentWriter
+
+K = 4
+SWITCH = [Intervention.TASK_SWITCH, Intervention.END_EFFECTOR_RESET, Intervention.SCENE_RESET]
+
+
+class Loop:
+    """Feeds a recorder as a training loop would: every number says which stream and step it belongs to."""
+
+    def __init__(self, num_envs: int):
+        self.n = num_envs
+        self.space = observation_space(environment_state=None)
+        self.pictures = images(7)
+        self.t = 0
+
+    def writer(self, root, **options):
+        return SegmentWriter("me/stream", root, stream_features(self.space), FPS, **options)
+
+    def step(self, recorder: StreamRecorder, **overrides):
+        t, streams = self.t, np.arange(self.n)
+        code = 1000 * streams + t
+        preceded = SWITCH[(t // K) % 3] if t else Intervention.INITIAL
+        arguments = {
+            "obs": {
+                "pixels": {"front": self.pictures[(streams + t) % 7]},
+                "agent_pos": np.repeat(code[:, None], STATE_DIM, axis=1).astype(np.float32),
+            },
+            "instructions": [f"task {(i + t // K) % 3}" for i in streams],
+            "actions": np.repeat(code[:, None], 7, axis=1).astype(np.float32) / 2,
+            "rewards": code / 4,
+            "success": (streams + t) % 5 == 0,
+            "log_prob": -code / 8,
+            "value": code / 16,
+            "policy_version": t // (2 * K),
+            "interventions": np.full(self.n, preceded if t % K == 0 else Intervention.NONE),
+            "stream_interventions": streams + t // K,
+            "total_interventions": 7 * t,
+            "steps": np.full(self.n, t),
+            "segments": np.full(self.n, t // K),
+            "segment_ends": np.full(self.n, t % K == K - 1),
+        }
+        recorder.on_step(**(arguments | overrides))
+        self.t += 1
+
+
+def streams_of(dataset: LeRobotDataset) -> dict[int, dict[str, np.ndarray]]:
+    """Every stream put back together, by its id, from the order of the steps."""
+    columns = dataset.hf_dataset.with_format("numpy")[:]
+    streams = {}
+    for stream in np.unique(columns["cronos.stream_id"]):
+        mine = np.flatnonzero(columns["cronos.stream_id"] == stream)
+        order = mine[np.argsort(columns["cronos.step"][mine])]
+        streams[int(stream)] = {key: column[order] for key, column in columns.items()}
+    return streams
+
+
+def assert_whole(dataset: LeRobotDataset, num_streams: int, steps: int):
+    streams = streams_of(dataset)
+    assert list(streams) == list(range(num_streams))
+    t = np.arange(steps)
+    for i, stream in streams.items():
+        code = 1000 * i + t
+        np.testing.assert_array_equal(stream["cronos.step"], t)
+        np.testing.assert_array_equal(stream["cronos.segment_index"], t // K)
+        np.testing.assert_array_equal(stream["observation.state"][:, 0], code)
+        np.testing.assert_array_equal(stream["action"][:, 6], code / 2)
+        np.testing.assert_array_equal(stream["next.reward"], code / 4)
+        np.testing.assert_array_equal(stream["next.success"], (i + t) % 5 == 0)
+        np.testing.assert_array_equal(stream["cronos.log_prob"], -code / 8)
+        np.testing.assert_array_equal(stream["cronos.value"], code / 16)
+        np.testing.assert_array_equal(stream["cronos.policy_version"], t // (2 * K))
+        np.testing.assert_array_equal(stream["cronos.stream_interventions"], i + t // K)
+        np.testing.assert_array_equal(stream["cronos.total_interventions"], 7 * t)
+        np.testing.assert_array_equal(stream["next.done"], t % K == K - 1)
+        kinds = np.where(t % K == 0, [SWITCH[k % 3] for k in t // K], 0)
+        kinds[0] = Intervention.INITIAL
+        np.testing.assert_array_equal(stream["cronos.intervention"], kinds)
+
+
+def test_64_interleaved_streams_come_apart_again(tmp_path):
+    loop = Loop(64)
+    recorder = StreamRecorder(loop.writer(tmp_path / "d"), num_envs=64, segment_length=K)
+    for _ in range(3 * K):
+        loop.step(recorder)
+    recorder.close()
+    dataset = LeRobotDataset("me/stream", root=tmp_path / "d")
+    assert dataset.num_episodes == 64 * 3
+    assert_whole(dataset, 64, 3 * K)
+    for index in (0, 100, 767):
+        item = dataset[index]
+        stream, t = int(item["cronos.stream_id"]), int(item["cronos.step"])
+        assert item["task"] == f"task {(stream + t // K) % 3}"
+        assert np.abs(item["observation.images.front"].numpy().transpose(1, 2, 0) * 255
+                      - loop.pictures[(stream + t) % 7]).mean() < 2.5  # fmt: skip
+
+
+def test_one_episode_is_one_segment_of_one_stream(tmp_path):
+    loop = Loop(3)
+    recorder = StreamRecorder(loop.writer(tmp_path / "d"), num_envs=3, segment_length=K)
+    for _ in range(2 * K):
+        loop.step(recorder)
+    recorder.close()
+    episodes = LeRobotDataset("me/stream", root=tmp_path / "d").meta.episodes
+    found = [(e["cronos.stream_id"], e["cronos.segment_index"], e["cronos.step"], e["length"]) for e in episodes]
+    assert found == [(i, k, k * K, K) for k in range(2) for i in range(3)]
+    assert episodes["cronos.intervention"] == [Intervention.INITIAL] * 3 + [Intervention.END_EFFECTOR_RESET] * 3
+    assert episodes["next.success"] == [any((i + t) % 5 == 0 for t in range(k * K, k * K + K))
+                                        for k in range(2) for i in range(3)]  # fmt: skip
+
+
+def test_records_only_the_first_streams(tmp_path):
+    loop = Loop(5)
+    recorder = StreamRecorder(loop.writer(tmp_path / "d"), num_envs=5, segment_length=K, streams=2)
+    for _ in range(K):
+        loop.step(recorder)
+    recorder.close()
+    assert_whole(LeRobotDataset("me/stream", root=tmp_path / "d"), 2, K)
+
+
+@pytest.mark.parametrize("checkpoint_at", [2 * K, 2 * K + 3], ids=["between segments", "inside one"])
+def test_resumes_at_a_checkpoint_without_gap_or_duplicate(tmp_path, checkpoint_at):
+    loop = Loop(3)
+    recorder = StreamRecorder(loop.writer(tmp_path / "d"), num_envs=3, segment_length=K)
+    for _ in range(checkpoint_at):
+        loop.step(recorder)
+    state = recorder.state_dict()
+    for _ in range(K + 1):  # goes on past the checkpoint, then stops
+        loop.step(recorder)
+    recorder.close()
+
+    loop.t = checkpoint_at
+    writer = SegmentWriter.resume("me/stream", tmp_path / "d", state["writer"])
+    recorder = StreamRecorder(writer, num_envs=3, segment_length=K)
+    recorder.load_partial_segments(state)
+    while loop.t < 5 * K:
+        loop.step(recorder)
+    recorder.close()
+    dataset = LeRobotDataset("me/stream", root=tmp_path / "d")
+    assert_whole(dataset, 3, 5 * K)
+    assert dataset.num_episodes == 3 * 5
+
+
+def test_a_run_that_ends_inside_a_segment_keeps_its_frames(tmp_path):
+    loop = Loop(2)
+    recorder = StreamRecorder(loop.writer(tmp_path / "d"), num_envs=2, segment_length=K)
+    for _ in range(K + 2):
+        loop.step(recorder)
+    recorder.close()
+    assert_whole(LeRobotDataset("me/stream", root=tmp_path / "d"), 2, K + 2)
+
+
+def test_buffers_are_copies(tmp_path):
+    loop = Loop(1)
+    recorder = StreamRecorder(loop.writer(tmp_path / "d"), num_envs=1, segment_length=K)
+    state = np.zeros((1, STATE_DIM), np.float32)
+    pictures = loop.pictures[:1].copy()
+    for t in range(K):
+        state[:] = t
+        loop.step(recorder, obs={"pixels": {"front": pictures}, "agent_pos": state})
+    recorder.close()
+    rows = LeRobotDataset("me/stream", root=tmp_path / "d").hf_dataset.with_format("numpy")[:]
+    np.testing.assert_array_equal(rows["observation.state"][:, 0], np.arange(K))
+
+
+@pytest.mark.parametrize(
+    ("at", "overrides", "message"),
+    [
+        (0, {"interventions": np.array([0, 0])}, "intervention NONE on frame 0"),
+        (2, {"interventions": np.array([0, 4])}, "stream 1, step 2: intervention SCENE_RESET on frame 2"),
+        (2, {"instructions": ["task 0", "other"]}, "instruction changed"),
+        (3, {"segment_ends": np.array([False, False])}, None),
+        (1, {"rewards": np.zeros(3)}, "next.reward has leading dimension 3"),
+    ],
+)
+def test_a_loop_that_breaks_the_contract_is_told(tmp_path, at, overrides, message):
+    loop = Loop(2)
+    recorder = StreamRecorder(loop.writer(tmp_path / "d"), num_envs=2, segment_length=K)
+    for _ in range(at):
+        loop.step(recorder)
+    if message is None:
+        loop.step(recorder, **overrides)
+        message, overrides = (
+            "longer than 4",
+            {"interventions": np.zeros(2, int), "instructions": ["task 0", "task 1"]},
+        )
+    with pytest.raises(ValueError, match=message):
+        loop.step(recorder, **overrides)
+    recorder.writer.finalize()
+
+
+@pytest.mark.parametrize("streams", [0, 3, "some"])
+def test_unknown_number_of_streams(tmp_path, streams):
+    writer = Loop(2).writer(tmp_path / "d")
+    with pytest.raises(ValueError, match="streams must be 'all' or from 1 to num_envs=2"):
+        StreamRecorder(writer, num_envs=2, segment_length=K, streams=streams)
+    writer.finalize()
