@@ -3,12 +3,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset
 from synthetic import FPS, assert_same_pictures, features, segment
 
 from cronos_lerobot.data import storage
+from cronos_lerobot.data.schema import demonstration_features
 from cronos_lerobot.data.writer import SegmentWriter
 
 LENGTHS = [12, 1, 25, 7, 18]
@@ -266,3 +268,22 @@ def test_finalize_twice_then_no_more(tmp_path, segments):
     writer.finalize()
     with pytest.raises(RuntimeError, match="finalized"):
         writer.add_segment(*segments[1])
+
+
+def test_frames_at_the_end_of_the_longest_file_are_found(tmp_path):
+    """LeRobot matches timestamps in float32 to 1e-4 s, which fails in longer files."""
+    space = gymnasium.spaces.Dict(
+        {"pixels": gymnasium.spaces.Dict({"front": gymnasium.spaces.Box(0, 255, (16, 16, 3), np.uint8)})}
+    )
+    length, count = 200, 26
+    shades = np.broadcast_to(np.arange(length, dtype=np.uint8)[:, None, None, None], (length, 16, 16, 3))
+    frames = {key: array for key, array in segment(length).items() if not key.startswith("observation")}
+    frames["observation.images.front"] = shades
+    with SegmentWriter("me/test", tmp_path / "d", demonstration_features(space), FPS) as writer:
+        for _ in range(count):
+            writer.add_segment(frames, "task")
+    dataset = LeRobotDataset("me/test", root=tmp_path / "d")
+    assert dataset.meta.episodes["data/file_index"] == [0] * 25 + [1]
+    for index in [*range(4800, 5000, 7), 4999, 5000, 5199]:
+        shade = dataset[index]["observation.images.front"].numpy() * 255
+        assert abs(shade.mean() - index % length) < 3
