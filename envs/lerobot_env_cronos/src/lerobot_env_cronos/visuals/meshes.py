@@ -19,19 +19,30 @@ _AXES = {"x": (1, 2, 0), "y": (0, 2, 1), "z": (0, 1, 2)}
 """Extrusion axis -> columns of the outline's first and second coordinate and of the height."""
 
 
-def loft(rings: np.ndarray) -> Surface:
-    """Closed surface through `rings` (r, k, 3), capped by fans; every ring is star-shaped about its mean."""
+def loft(rings: np.ndarray, caps: str = "both") -> Surface:
+    """Surface through `rings` (r, k, 3) of convex outlines, closed by `caps`: both, first, last or none.
+
+    Ends that nobody sees are left open: a frame's cost grows with the triangles.
+    """
+    if caps not in ("both", "first", "last", "none"):
+        raise ValueError(f"unknown caps {caps!r}; valid: both, first, last, none")
     rings = np.asarray(rings, dtype=float)
     r, k, _ = rings.shape
-    vertices = np.concatenate([rings.reshape(-1, 3), rings[0].mean(0)[None], rings[-1].mean(0)[None]])
+    vertices = rings.reshape(-1, 3)
     a = np.arange(r * k).reshape(r, k)
     b = np.roll(a, -1, axis=1)
     sides = [np.stack(t, -1).reshape(-1, 3) for t in ((a[:-1], b[:-1], b[1:]), (a[:-1], b[1:], a[1:]))]
-    first, last = np.full(k, r * k), np.full(k, r * k + 1)
-    caps = [np.stack([first, b[0], a[0]], -1), np.stack([last, a[-1], b[-1]], -1)]
-    faces = np.concatenate(sides + caps)
+    i = np.arange(1, k - 1)
+    first = np.stack([a[0, 0] + 0 * i, a[0, i + 1], a[0, i]], -1)
+    last = np.stack([a[-1, 0] + 0 * i, a[-1, i], a[-1, i + 1]], -1)
+    closed = vertices[np.concatenate([*sides, first, last])]
+    volume = (closed[:, 0] * np.cross(closed[:, 1], closed[:, 2])).sum()
+    ends = [end for end, name in ((first, "first"), (last, "last")) if caps in ("both", name)]
+    faces = np.concatenate(sides + ends)
+    # Collapsed rings (a profile that ends in a point) leave triangles without area.
     corners = vertices[faces]
-    volume = (corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum()
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    faces = faces[area > 1e-12]
     return vertices, faces if volume > 0 else faces[:, ::-1]
 
 
@@ -44,36 +55,28 @@ def merge(*surfaces: Surface) -> Surface:
     )
 
 
-def prism(outline, low: float, high: float, axis: str = "z", bevel: float = 0.0, pos=(0, 0, 0)) -> Surface:
-    """Extrude a convex `outline` (k, 2) from `low` to `high` along `axis`, its end edges bevelled [m].
+def prism(outline, low: float, high: float, axis: str = "z", caps: str = "both", pos=(0, 0, 0)) -> Surface:
+    """Extrude a convex `outline` (k, 2) from `low` to `high` along `axis` [m].
 
     The outline's coordinates are the other two axes in alphabetical order.
     """
-    outline = np.asarray(outline, dtype=float)
-    levels = [(low, bevel), (low + bevel, 0.0), (high - bevel, 0.0), (high, bevel)] if bevel else None
-    centre = outline.mean(0)
-    reach = np.abs(outline - centre).max(0)
-    rings = []
-    for height, inset in levels or [(low, 0.0), (high, 0.0)]:
-        ring = np.empty((len(outline), 3))
-        ring[:, _AXES[axis][:2]] = centre + (outline - centre) * (1 - inset / reach)
-        ring[:, _AXES[axis][2]] = height
-        rings.append(ring)
-    return loft(np.array(rings) + np.asarray(pos))
+    return stack(np.asarray(outline, dtype=float), [(low, 1.0), (high, 1.0)], axis, caps, pos)
 
 
-def box(low, high, bevel: float = 0.0) -> Surface:
-    """Box between two corners, the edges of its z faces bevelled [m]."""
-    outline = rectangle((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, bevel)
-    return prism(outline, low[2], high[2], bevel=bevel, pos=((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, 0))
+def box(low, high, chamfer: float = 0.0, caps: str = "both") -> Surface:
+    """Box between two corners, its vertical edges cut off by `chamfer` [m]."""
+    outline = rectangle((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, chamfer)
+    return prism(outline, low[2], high[2], "z", caps, ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, 0))
 
 
-def cylinder(radius: float, low: float, high: float, axis: str = "z", pos=(0, 0, 0), sides=14, bevel=0.0) -> Surface:
+def cylinder(
+    radius: float, low: float, high: float, axis: str = "z", pos=(0, 0, 0), sides: int = 10, caps: str = "both"
+) -> Surface:
     """Cylinder about `axis` through `pos` [m]."""
-    return prism(circle(radius, sides), low, high, axis, bevel, pos)
+    return prism(circle(radius, sides), low, high, axis, caps, pos)
 
 
-def circle(radius: float, sides: int = 14) -> np.ndarray:
+def circle(radius: float, sides: int = 12) -> np.ndarray:
     """Outline (sides, 2) of a regular polygon that touches +-radius on both axes if 4 divides `sides`."""
     angles = 2 * np.pi * np.arange(sides) / sides
     return radius * np.stack([np.cos(angles), np.sin(angles)], -1)
@@ -87,7 +90,15 @@ def rectangle(hx: float, hy: float, chamfer: float = 0.0) -> np.ndarray:
     return np.array([(x, -hy), (hx, -y), (hx, y), (x, hy), (-x, hy), (-hx, y), (-hx, -y), (-x, -hy)])
 
 
-def superellipse(hx: float, hy: float, exponent: float = 4.0, sides: int = 16) -> np.ndarray:
+def rounded_rectangle(hx: float, hy: float, radius: float, corner_points: int = 3) -> np.ndarray:
+    """Outline of a rectangle of half sizes `hx`, `hy` with corners of a `radius`."""
+    angles = np.concatenate([np.linspace(0, np.pi / 2, corner_points) + q * np.pi / 2 for q in range(4)])
+    sign = np.repeat([(1, 1), (-1, 1), (-1, -1), (1, -1)], corner_points, axis=0)
+    centres = sign * (np.array([hx, hy]) - radius)
+    return centres + radius * np.stack([np.cos(angles), np.sin(angles)], -1)
+
+
+def superellipse(hx: float, hy: float, exponent: float = 4.0, sides: int = 12) -> np.ndarray:
     """Outline of a rounded rectangle |x/hx|^n + |y/hy|^n = 1."""
     angles = 2 * np.pi * (np.arange(sides) + 0.5) / sides
     c, s = np.cos(angles), np.sin(angles)
@@ -95,11 +106,11 @@ def superellipse(hx: float, hy: float, exponent: float = 4.0, sides: int = 16) -
     return np.stack([hx * radius * c, hy * radius * s], -1)
 
 
-def stadium(start, end, radius_start: float, radius_end: float, sides: int = 16) -> np.ndarray:
+def stadium(start, end, radius_start: float, radius_end: float, sides: int = 8) -> np.ndarray:
     """Convex outline around two discs: the side view of a lever between two pivots."""
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     direction = np.arctan2(*(end - start)[::-1])
-    half = np.linspace(-np.pi / 2, np.pi / 2, sides // 2)
+    half = (np.arange(sides // 2) - (sides // 2 - 1) / 2) * np.pi / (sides // 2 - 1)
     far, near = direction + half, direction + np.pi + half
     return np.concatenate(
         [
@@ -109,13 +120,19 @@ def stadium(start, end, radius_start: float, radius_end: float, sides: int = 16)
     )
 
 
-def stack(outline: np.ndarray, profile: Sequence[tuple[float, float]], axis: str = "z", pos=(0, 0, 0)) -> Surface:
-    """Loft of one outline scaled along a profile of (height [m], scale)."""
+def stack(
+    outline: np.ndarray,
+    profile: Sequence[tuple[float, float]],
+    axis: str = "z",
+    caps: str = "both",
+    pos=(0, 0, 0),
+) -> Surface:
+    """Loft of one convex outline scaled along a profile of (height [m], scale)."""
     rings = np.zeros((len(profile), len(outline), 3))
     for ring, (height, scale) in zip(rings, profile):
         ring[:, _AXES[axis][:2]] = scale * outline
         ring[:, _AXES[axis][2]] = height
-    return loft(rings + np.asarray(pos))
+    return loft(rings + np.asarray(pos), caps)
 
 
 def add_visual(

@@ -42,9 +42,10 @@ def dress_robot(spec: mujoco.MjSpec) -> None:
 
 def _horns(x: float, z: float, y: float, radius: float = 0.011) -> Surface:
     """Metal servo horns about the y axis, on both outer faces at +-y."""
-    return merge(*(
-        cylinder(radius, low, high, "y", (x, 0, z), sides=12) for low, high in ((y, y + 0.002), (-y - 0.002, -y))
-    ))  # fmt: skip
+    return merge(
+        cylinder(radius, y, y + 0.002, "y", (x, 0, z), 8, "last"),
+        cylinder(radius, -y - 0.002, -y, "y", (x, 0, z), 8, "first"),
+    )
 
 
 def _plates(outline, y: float, thickness: float) -> Surface:
@@ -54,21 +55,17 @@ def _plates(outline, y: float, thickness: float) -> Surface:
 
 def _base() -> dict[str, Surface]:
     plate = prism([(-0.115, -0.045), (-0.095, -0.066), (0.03, -0.066), (0.062, -0.04), (0.062, 0.04),
-                   (0.03, 0.066), (-0.095, 0.066), (-0.115, 0.045)], 0.0, 0.010)  # fmt: skip
-    housing = box((-0.105, -0.045, 0.010), (-0.028, 0.045, 0.046), 0.006)
-    servo = box((-0.030, -0.034, 0.010), (0.040, 0.034, 0.052), 0.005)
-    turntable = cylinder(0.045, 0.050, 0.066, sides=20, bevel=0.003)
-    return {
-        "arm": merge(housing, servo, turntable),
-        "arm edge": plate,
-        "metal": cylinder(0.040, 0.066, 0.0715, sides=20),
-    }
+                   (0.03, 0.066), (-0.095, 0.066), (-0.115, 0.045)], 0.0, 0.010, caps="last")  # fmt: skip
+    housing = box((-0.105, -0.045, 0.010), (-0.028, 0.045, 0.046), 0.006, "last")
+    servo = box((-0.030, -0.034, 0.010), (0.040, 0.034, 0.052), 0.005, "last")
+    turntable = cylinder(0.045, 0.052, 0.066, sides=16, caps="last")
+    return {"arm": merge(housing, servo, turntable), "arm edge": plate}
 
 
 def _shoulder() -> dict[str, Surface]:
     axis = 0.03865
-    disc = cylinder(0.042, 0.0, 0.008, sides=20, bevel=0.002)
-    servos = [box((-0.024, y - 0.017, 0.008), (0.024, y + 0.017, 0.060), 0.004) for y in (-0.020, 0.020)]
+    disc = cylinder(0.042, -0.006, 0.008, sides=16, caps="last")
+    servos = [box((-0.024, y - 0.017, 0.008), (0.024, y + 0.017, 0.060), 0.004, "last") for y in (-0.020, 0.020)]
     return {"arm": merge(disc, *servos), "metal": _horns(0.0, axis, 0.044, 0.012)}
 
 
@@ -76,41 +73,41 @@ def _upper_arm() -> dict[str, Surface]:
     lever = stadium((0.0, 0.0), (0.0, 0.245), 0.024, 0.021)
     elbow = stadium((0.0, 0.247), (0.04975, 0.25), 0.019, 0.021)
     spine = box((-0.014, -0.030, 0.05), (0.012, 0.030, 0.185), 0.004)
-    head = box((-0.016, -0.030, 0.215), (0.022, 0.030, 0.262), 0.003)
+    head = box((-0.016, -0.038, 0.215), (0.022, 0.038, 0.262))
     return {
         "arm edge": merge(_plates(lever, 0.0435, 0.006), _plates(elbow, 0.0435, 0.006)),
         "arm": merge(spine, head),
-        "metal": merge(_horns(0.04975, 0.25, 0.0435), _horns(0.0, 0.21, 0.0425, 0.005)),
+        "metal": _horns(0.04975, 0.25, 0.0435),
     }
 
 
 def _upper_forearm() -> dict[str, Surface]:
-    servo = box((-0.020, -0.030, -0.0185), (0.040, 0.030, 0.0185), SERVO_BEVEL)
-    tube = prism(rectangle(0.017, 0.0155, 0.005), 0.038, 0.138, "x")
-    roll_servo = prism(rectangle(0.024, 0.019, 0.004), 0.128, 0.175, "x", bevel=0.003)
-    collar = prism(circle(0.023, 14), 0.110, 0.129, "x", bevel=0.002)
-    return {"arm": merge(servo, tube, roll_servo), "arm edge": collar}
+    servo = box((-0.020, -0.030, -0.0185), (0.040, 0.030, 0.0185), 0.003)
+    tube = prism(rectangle(0.017, 0.0155, 0.005), 0.038, 0.138, "x", "none")
+    roll_servo = prism(rectangle(0.024, 0.019, 0.004), 0.128, 0.175, "x")
+    collar = prism(circle(0.023, 12), 0.110, 0.127, "x")
+    return {"arm": merge(servo, tube, roll_servo, collar)}
 
 
 def _lower_forearm() -> dict[str, Surface]:
-    disc = prism(circle(0.021, 16), 0.0, 0.010, "x")
+    disc = prism(circle(0.021, 12), 0.0, 0.010, "x", "none")
     yoke = prism(rectangle(0.0285, 0.018, 0.004), 0.010, 0.030, "x")
     cheeks = _plates(stadium((0.024, 0.0), (0.075, 0.0), 0.017, 0.0165), 0.0285, 0.005)
     return {"metal": merge(disc, _horns(0.075, 0.0, 0.0285, 0.010)), "arm edge": merge(yoke, cheeks)}
 
 
 def _wrist() -> dict[str, Surface]:
-    servo = box((-0.016, -0.023, -0.017), (0.036, 0.023, 0.017), SERVO_BEVEL)
-    rotate = prism(rectangle(0.018, 0.022, 0.004), 0.030, 0.056, "x", bevel=0.002, pos=(0, 0, 0.006))
-    return {"arm": merge(servo, rotate), "metal": prism(circle(0.016, 14), 0.056, 0.0645, "x")}
+    servo = box((-0.016, -0.023, -0.017), (0.036, 0.023, 0.017), 0.003)
+    rotate = prism(rectangle(0.018, 0.022, 0.004), 0.030, 0.056, "x", pos=(0, 0, 0.006))
+    return {"arm": merge(servo, rotate), "metal": prism(circle(0.016, 10), 0.056, 0.0645, "x", "none")}
 
 
 def _gripper() -> dict[str, Surface]:
-    horn = prism(circle(0.019, 14), 0.0, 0.010, "x")
-    servo = prism(rectangle(0.030, 0.022, 0.004), 0.008, 0.050, "x", bevel=0.003)
+    horn = prism(circle(0.019, 10), 0.0, 0.010, "x", "first")
+    servo = prism(rectangle(0.030, 0.022, 0.004), 0.008, 0.050, "x")
     # The rail that both finger carriages slide on.
-    rail = prism(rectangle(0.066, 0.013, 0.004), 0.046, 0.060, "x", bevel=0.002)
-    ends = [cylinder(0.006, 0.0460, 0.0615, "x", (0, y, 0), sides=8) for y in (-0.057, 0.057)]
+    rail = prism(rectangle(0.066, 0.013, 0.004), 0.046, 0.060, "x")
+    ends = [cylinder(0.006, 0.0445, 0.0460, "x", (0, y, 0), 6, "first") for y in (-0.057, 0.057)]
     return {"arm": merge(horn, servo), "arm edge": rail, "metal": merge(*ends)}
 
 
@@ -126,8 +123,8 @@ def _finger(side: float) -> dict[str, Surface]:
 
     carriage = prism(mirrored([(base, -0.010), (base + 0.014, -0.010), (base + 0.014, 0.016), (base, 0.016)]),
                      -0.016, 0.016)  # fmt: skip
-    shank = prism(mirrored([(base + 0.013, -0.008), (base + 0.013, 0.012), (pad_start, 0.008), (pad_start, outer - 0.004)]),
-                  -0.012, 0.012)  # fmt: skip
+    shank = prism(mirrored([(base + 0.013, -0.008), (base + 0.013, 0.012), (pad_start, 0.008),
+                            (pad_start, outer - 0.004)]), -0.012, 0.012)  # fmt: skip
     tip = prism(mirrored([(pad_start, outer - 0.004), (pad_start, 0.008), (FINGER_END, outer + 0.002),
                           (FINGER_END, outer - 0.002)]), -hz + 0.001, hz - 0.001)  # fmt: skip
     pad = prism(mirrored([(pad_start, inner), (FINGER_END, inner), (FINGER_END, outer - 0.002),

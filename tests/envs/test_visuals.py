@@ -1,0 +1,119 @@
+"""The looks of the scene: inside the bounding boxes, in the picture, cheap, and without any effect on physics."""
+
+import mujoco
+import numpy as np
+import pytest
+from lerobot_env_cronos import model as model_module
+from lerobot_env_cronos.model import CAMERAS, build_model
+from lerobot_env_cronos.robot import HOME_QPOS, PAD_HALF_SIZE, PAD_POS
+from lerobot_env_cronos.scenes import BODIES, SCENES
+from lerobot_env_cronos.visuals.meshes import VISUAL_GROUP, loft, prism, rectangle
+from lerobot_env_cronos.visuals.objects import LOOKS
+
+SCENE = SCENES["kitchen_2x2"]
+DYNAMIC_FIELDS = (
+    "body_mass",
+    "body_inertia",
+    "body_ipos",
+    "body_iquat",
+    "body_subtreemass",
+    "dof_armature",
+    "qpos0",
+)
+
+
+@pytest.fixture(scope="module")
+def dressed() -> mujoco.MjModel:
+    return build_model(SCENE)
+
+
+def visual_vertices(model: mujoco.MjModel, body: str) -> np.ndarray:
+    """Vertices of all visual meshes of a body, in the body's frame (n, 3)."""
+    parts = []
+    for g in np.flatnonzero((model.geom_bodyid == model.body(body).id) & (model.geom_group == VISUAL_GROUP)):
+        assert model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH
+        mesh, rotation = model.geom_dataid[g], np.empty(9)
+        start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        mujoco.mju_quat2Mat(rotation, model.geom_quat[g])
+        parts.append(model.mesh_vert[start : start + count] @ rotation.reshape(3, 3).T + model.geom_pos[g])
+    return np.concatenate(parts)
+
+
+def test_changes_no_dynamics(dressed, monkeypatch):
+    monkeypatch.setattr(model_module.visuals, "dress", lambda spec, bodies: None)
+    bare = build_model(SCENE)
+    for field in DYNAMIC_FIELDS:
+        np.testing.assert_array_equal(getattr(dressed, field), getattr(bare, field), err_msg=field)
+    collides = dressed.geom_contype != 0
+    assert collides.sum() == (bare.geom_contype != 0).sum() == bare.ngeom
+    for field in ("geom_type", "geom_size", "geom_pos", "geom_friction", "geom_condim"):
+        np.testing.assert_array_equal(getattr(dressed, field)[collides], getattr(bare, field), err_msg=field)
+    assert (dressed.geom_conaffinity[~collides] == 0).all()
+    assert (dressed.geom_group[~collides] == VISUAL_GROUP).all()
+
+
+@pytest.mark.parametrize("name", SCENE.bodies)
+def test_body_fills_its_bounding_box_and_stays_inside(dressed, name):
+    vertices, half = visual_vertices(dressed, name), np.array(BODIES[name].size) / 2
+    assert (np.abs(vertices) <= half + 1e-4).all()
+    # At least 90 % of the published extent is visible in every direction.
+    assert (np.ptp(vertices, axis=0) >= 0.9 * 2 * half).all()
+
+
+def test_every_shape_of_the_vocabulary_has_a_look():
+    assert {body.shape for body in BODIES.values()} <= set(LOOKS)
+
+
+@pytest.mark.parametrize(("side", "sign"), [("left", 1.0), ("right", -1.0)])
+def test_fingers_end_where_the_pads_end(dressed, side, sign):
+    vertices = visual_vertices(dressed, f"{side}_finger_link")
+    assert vertices[:, 0].max() == pytest.approx(PAD_POS[0] + PAD_HALF_SIZE[0], abs=1e-4)
+    # No part reaches beyond the gripping surface towards the other finger.
+    assert (sign * vertices[:, 1]).min() == pytest.approx(PAD_POS[1] - PAD_HALF_SIZE[1], abs=1e-4)
+
+
+def test_few_geoms_and_triangles(dressed):
+    visual = dressed.geom_group == VISUAL_GROUP
+    robot = visual & np.array(["link" in dressed.geom(g).name for g in range(dressed.ngeom)])
+    assert robot.sum() <= 35
+    assert dressed.nmeshface <= 2000
+
+
+def project(model: mujoco.MjModel, camera: str, points: np.ndarray) -> np.ndarray:
+    """Image coordinates (n, 2) of world points, +-1 at the edges of a square picture."""
+    data = mujoco.MjData(model)
+    data.qpos[:6] = HOME_QPOS
+    mujoco.mj_forward(model, data)
+    local = (points - data.camera(camera).xpos) @ data.camera(camera).xmat.reshape(3, 3)
+    return local[:, :2] / -local[:, 2:] / np.tan(np.deg2rad(CAMERAS[camera]["fovy"]) / 2)
+
+
+def test_front_camera_sees_every_body_at_the_edge_of_the_spawn_area(dressed):
+    (x0, y0), (x1, y1) = SCENE.spawn_low, SCENE.spawn_high
+    # Any yaw: the largest footprint is a circle around the corner of the square.
+    reach = max(np.hypot(*BODIES[n].size[:2]) if BODIES[n].shape == "cloth" else max(BODIES[n].size)
+                for n in SCENE.bodies) / 2  # fmt: skip
+    angles = np.linspace(0, 2 * np.pi, 36)
+    ring = reach * np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1)
+    points = np.concatenate([ring + np.array([x, y, z]) for x in (x0, x1) for y in (y0, y1) for z in (0.0, 0.02)])
+    image = project(dressed, "front", points)
+    assert np.abs(image).max() < 0.95
+    # Tight framing: the bodies use at least nine tenths of the picture's width.
+    assert np.abs(image[:, 0]).max() > 0.9
+
+
+def test_front_camera_sees_the_gripper_at_home(dressed):
+    data = mujoco.MjData(dressed)
+    data.qpos[:6] = HOME_QPOS
+    mujoco.mj_forward(dressed, data)
+    points = np.stack([data.body(n).xpos for n in ("gripper_link", "left_finger_link", "right_finger_link")])
+    assert np.abs(project(dressed, "front", points)).max() < 0.95
+
+
+def test_loft_faces_outwards_and_names_wrong_caps():
+    vertices, faces = prism(rectangle(0.5, 1.0), 0.0, 3.0)
+    corners = vertices[faces]
+    volume = (corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    assert volume == pytest.approx(1.0 * 2.0 * 3.0)
+    with pytest.raises(ValueError, match=r"'top'.*both"):
+        loft(np.zeros((2, 4, 3)), caps="top")
