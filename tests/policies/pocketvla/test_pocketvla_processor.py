@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from conftest import make_batch, make_config
 from lerobot.policies import make_pre_post_processors
 from lerobot_policy_pocketvla.action_bounds import ActionBoundsProcessorStep
+from pocketvla_samples import make_batch, make_config
 
 STATS = {
     "observation.state": {"mean": np.full(13, 2.0), "std": np.array([0.0] + [4.0] * 12)},

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import CAMERA, TASKS
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot_policy_pocketvla import PocketVLAPolicy
+from pocketvla_samples import CAMERA, TASKS
 
 
 def lerobot_train(dataset_root: Path, output: Path, *flags: str) -> subprocess.CompletedProcess:

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from conftest import make_batch, make_config, make_policy
 from lerobot_policy_pocketvla import PocketVLAPolicy
+from pocketvla_samples import make_batch, make_config, make_policy
 
 
 def test_the_loss_of_a_fresh_categorical_head_is_that_of_a_uniform_guess():

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from conftest import CAMERA, TASKS, make_batch, make_config, make_policy, take
 from lerobot_policy_pocketvla import PocketVLAPolicy
+from pocketvla_samples import CAMERA, TASKS, make_batch, make_config, make_policy, take
 
 HEADS = ["gaussian", "categorical"]
 
