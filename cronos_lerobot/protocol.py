@@ -14,11 +14,7 @@ COUNTED_INTERVENTIONS = (Intervention.SCENE_RESET, Intervention.HEURISTIC_RESET,
 
 @dataclass
 class ProtocolConfig:
-    """When a stream switches task, when the policy learns, and what help a stream gets.
-
-    Raises:
-        ValueError: an interval does not fit the others, a name is unknown, or an option is not available yet.
-    """
+    """When a stream switches task, when the policy learns, what help a stream gets. Misfits are a ValueError."""
 
     task_switch_interval: int = 80
     """K: control steps of one stream between two task switches, the length of a segment."""

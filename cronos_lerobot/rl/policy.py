@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 Batch = dict[str, Any]
-"""A batch by LeRobot's names, after the policy's preprocessor: `observation.*` (B, ...), `task`: B strings."""
+"""A batch by LeRobot's names, after the policy's preprocessor: `observation.*` (B, ...), `task`: B strings.
+Images are (B, 3, H, W), floats in [0, 1] or, if the policy does not normalise images, uint8 in 0..255."""
 
 POLICY_METHODS = ("sample_actions", "evaluate_actions", "predict_values", "rl_parameter_groups")
 

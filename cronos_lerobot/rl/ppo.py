@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -173,6 +173,8 @@ class PPO:
         for minibatch in group:
             weight = len(minibatch.indices) / size
             loss, metrics = self._loss(minibatch)
+            if not torch.isfinite(loss):
+                raise FloatingPointError(f"The loss of update {self.num_updates} is {loss.item()}: {metrics}.")
             (loss * weight).backward()
             means.add(metrics, len(minibatch.indices))
             kl += metrics["approx_kl"] * weight
@@ -265,7 +267,7 @@ def _frozen_copy(policy: Any) -> Any:
 
 
 @contextmanager
-def _frozen(params: list[Tensor]) -> Iterator[None]:
+def _frozen(params: list[Tensor]) -> Generator[None]:
     """No gradient reaches `params` inside, so the optimizer leaves them alone."""
     for param in params:
         param.requires_grad_(False)

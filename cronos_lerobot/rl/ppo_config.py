@@ -14,11 +14,7 @@ VALUE_LOSSES = ("huber", "mse")
 @RLAlgorithmConfig.register_subclass("ppo")
 @dataclass
 class PPOConfig(RLAlgorithmConfig):
-    """PPO with settings for PocketVLA, a small network trained on a laptop CPU.
-
-    Raises:
-        ValueError: a value is out of its range.
-    """
+    """PPO with settings for PocketVLA, a small network trained on a laptop CPU. Bad values are a ValueError."""
 
     epochs: int = 2
     """Passes over the rollout that train the policy and the value."""

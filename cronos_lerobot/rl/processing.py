@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from lerobot.configs import FeatureType, NormalizationMode
 from lerobot.utils.constants import OBS_IMAGES
 
 from cronos_lerobot.rl.policy import Batch
@@ -19,26 +20,47 @@ class PolicyProcessors:
     Args:
         preprocessor: a LeRobot batch -> what the policy takes (normalised, on its device).
         postprocessor: a normalised action (B, A) -> physical units.
-        device: where images are converted to floats.
+        device: the policy's.
+        uint8_images: leave images in 0..255 for the policy to scale; only where its preprocessor does not
+            normalise images. A third of the inference time of a small network on a CPU.
     """
 
     def __init__(
-        self, preprocessor: Callable[[Batch], Batch], postprocessor: Callable[[Any], Any], device: str | None
+        self,
+        preprocessor: Callable[[Batch], Batch],
+        postprocessor: Callable[[Any], Any],
+        device: str | torch.device = "cpu",
+        *,
+        uint8_images: bool = False,
     ) -> None:
         self.preprocessor = preprocessor
         self.postprocessor = postprocessor
-        self.device = torch.device(device or "cpu")
+        self.device = torch.device(device)
+        self.uint8_images = uint8_images
 
     def batch(self, columns: Columns, instructions: list[str]) -> Batch:
-        """Return the policy's batch: images float (B, 3, H, W) in [0, 1], states normalised, `task` strings."""
+        """Return the policy's batch: images (B, 3, H, W), states normalised, `task` strings."""
         batch: Batch = {"task": list(instructions)}
         for name, column in columns.items():
             tensor = torch.from_numpy(np.ascontiguousarray(column)).to(self.device)
-            # The same conversion as lerobot.envs.preprocess_observation, but after the move to the device.
-            is_image = name.startswith(OBS_IMAGES)
-            batch[name] = tensor.permute(0, 3, 1, 2).float().div_(255) if is_image else tensor.float()
+            if name.startswith(OBS_IMAGES):
+                batch[name] = self._images(tensor.permute(0, 3, 1, 2))
+            else:
+                batch[name] = tensor.float()
         return self.preprocessor(batch)
 
     def physical_actions(self, action: torch.Tensor) -> np.ndarray:
         """Return normalised actions (B, A) in the environment's units, float32."""
         return self.postprocessor(action).to("cpu", torch.float32).numpy()
+
+    def _images(self, images: torch.Tensor) -> torch.Tensor:
+        # The same conversion as lerobot.envs.preprocess_observation, but on the policy's device.
+        return images if self.uint8_images else images.float().div_(255)
+
+
+def make_processors(policy: Any, preprocessor: Any, postprocessor: Any) -> PolicyProcessors:
+    """Return the processors of a LeRobot policy that is on its device."""
+    device = next(policy.parameters()).device
+    mode = getattr(policy.config, "normalization_mapping", {}).get(FeatureType.VISUAL.value)
+    is_untouched = mode == NormalizationMode.IDENTITY
+    return PolicyProcessors(preprocessor, postprocessor, device, uint8_images=is_untouched)

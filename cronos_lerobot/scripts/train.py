@@ -57,7 +57,7 @@ def main() -> None:
     if "--algorithm.type" not in given and "--config_path" not in given:
         sys.argv.append("--algorithm.type=ppo")
     try:
-        train()
+        train()  # ty: ignore[missing-argument]  (parser.wrap reads it from the command line)
     except ParsingError as error:
         sys.exit(f"error: {error.__cause__ or error}")
 

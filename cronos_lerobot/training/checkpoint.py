@@ -145,7 +145,7 @@ def _write_training_state(
     save_training_step(run.loop.n, folder)
     if run.ppo.base_policy is not None:
         save_model(run.ppo.base_policy, str(folder / BASE_POLICY))
-    np.savez(folder / ENV_STATE, **env_state)
+    np.savez(folder / ENV_STATE, allow_pickle=False, **env_state)
     # As tensors, which torch reads back without executing anything.
     torch.save(_map_leaves(observers, np.ndarray, torch.from_numpy), folder / OBSERVERS)
     state = {

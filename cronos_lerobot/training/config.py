@@ -75,11 +75,7 @@ class PeriodicEvaluationConfig:
 
 @dataclass
 class CronosTrainConfig:
-    """Reset-free reinforcement learning of a LeRobot policy.
-
-    Raises:
-        ValueError: a value is out of its range.
-    """
+    """Reset-free reinforcement learning of a LeRobot policy. Values out of range are a ValueError."""
 
     env: EnvConfig | None = None
     """The scene: --env.type=cronos --env.scene=kitchen_2x2 ..."""

@@ -47,10 +47,8 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
     policy = make_policy(policy_config, env_cfg=env_config)
     check_trainable(policy)
     path = policy_config.pretrained_path
-    overrides = {"device_processor": {"device": policy_config.device}}
-    preprocessor, postprocessor = make_pre_post_processors(
-        policy_config,
-        pretrained_path=str(path) if path else None,
-        **({"preprocessor_overrides": overrides} if path else {}),
-    )
-    return policy, preprocessor, postprocessor
+    if path is None:
+        return policy, *make_pre_post_processors(policy_config)
+    # Like lerobot-train: the checkpoint's processors, on the device of this run.
+    device = {"device_processor": {"device": policy_config.device}}
+    return policy, *make_pre_post_processors(policy_config, str(path), preprocessor_overrides=device)

@@ -23,13 +23,13 @@ class NamedGenerators:
         self._numpy: dict[str, np.random.Generator] = {}
         self._torch: dict[str, torch.Generator] = {}
 
-    def numpy(self, name: str) -> np.random.Generator:
+    def for_numpy(self, name: str) -> np.random.Generator:
         """Return the NumPy generator `name`."""
         if name not in self._numpy:
             self._numpy[name] = np.random.default_rng(self._sequence(name))
         return self._numpy[name]
 
-    def torch(self, name: str) -> torch.Generator:
+    def for_torch(self, name: str) -> torch.Generator:
         """Return the torch generator `name`."""
         if name not in self._torch:
             generator = torch.Generator(device=self.device)
@@ -47,9 +47,9 @@ class NamedGenerators:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue every generator where `state_dict` left it."""
         for name, bits in state["numpy"].items():
-            self.numpy(name).bit_generator.state = bits
+            self.for_numpy(name).bit_generator.state = bits
         for name, bits in state["torch"].items():
-            self.torch(name).set_state(torch.tensor(bits, dtype=torch.uint8))
+            self.for_torch(name).set_state(torch.tensor(bits, dtype=torch.uint8))
 
     def _sequence(self, name: str) -> np.random.SeedSequence:
         return np.random.SeedSequence([self.seed, zlib.crc32(name.encode())])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from cronos_lerobot.rf_mtrl import rf_mtrl
 from cronos_lerobot.rl.agent import PPOAgent
 from cronos_lerobot.rl.ppo import PPO
 from cronos_lerobot.rl.ppo_config import PPOConfig
-from cronos_lerobot.rl.processing import PolicyProcessors
+from cronos_lerobot.rl.processing import make_processors
 from cronos_lerobot.rl.rollout_buffer import RolloutBuffer
 from cronos_lerobot.stopwatch import Stopwatch
 from cronos_lerobot.task_orders import make_task_order
@@ -95,16 +94,16 @@ class Trainer:
         self._eval_env: Any = None
         device = str(next(policy.parameters()).device)
         self.generators = NamedGenerators(config.seed, device)
-        self.processors = PolicyProcessors(preprocessor, postprocessor, device)
-        ppo = PPO(policy, self.processors, config.algorithm, self.generators.numpy("minibatches"))
+        self.processors = make_processors(policy, preprocessor, postprocessor)
+        ppo = PPO(policy, self.processors, config.algorithm, self.generators.for_numpy("minibatches"))
         buffer = RolloutBuffer(config.protocol.update_interval, config.num_envs)
-        self.agent = PPOAgent(ppo, buffer, self.generators.torch("actions"), self.stopwatch)
+        self.agent = PPOAgent(ppo, buffer, self.generators.for_torch("actions"), self.stopwatch)
         self.loop = LoopState(config.num_envs, len(self.tasks))
         self.run_state = RunState(ppo, self.loop, self.generators, env, preprocessor, postprocessor)
         self.statistics = RolloutStatistics([task.instruction for task in self.tasks])
         # Every named generator exists before a checkpoint is loaded into them.
-        self._resets = make_resets(config.protocol, self.generators.numpy("configurations"))
-        self._task_order = make_task_order(config.protocol.task_order, self.generators.numpy("task_order"))
+        self._resets = make_resets(config.protocol, self.generators.for_numpy("configurations"))
+        self._task_order = make_task_order(config.protocol.task_order, self.generators.for_numpy("task_order"))
 
     def train(self) -> None:
         """Run to the last step or the end of the budget, from the start or from the config's checkpoint."""
@@ -209,9 +208,3 @@ class Trainer:
 def _due(n: int, last: int, frequency: int) -> bool:
     """Whether a multiple of `frequency` lies in (last, n]; 0 is never."""
     return frequency > 0 and n // frequency > last // frequency
-
-
-def output_dir(config: CronosTrainConfig) -> Path:
-    """Return the run's folder of a validated config."""
-    assert config.output_dir is not None
-    return Path(config.output_dir)

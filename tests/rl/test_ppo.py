@@ -19,7 +19,7 @@ from cronos_lerobot.rl.rollout_buffer import RolloutBuffer
 
 def make_ppo(seed=0, **options):
     options = {"minibatch_size": 64, "value_warmup_updates": 0} | options
-    processors = PolicyProcessors(*identity_processors(), "cpu")
+    processors = PolicyProcessors(*identity_processors())
     return PPO(DummyPolicy(seed=seed), processors, PPOConfig(**options), np.random.default_rng(seed))
 
 
@@ -169,6 +169,14 @@ def test_kl_to_the_base_policy_holds_back():
     assert moved[1] < 0.5 * moved[0]
 
 
+def test_a_loss_that_is_not_finite_stops_the_run_before_it_spoils_the_policy():
+    ppo = make_ppo(normalize_advantage=False)
+    policy = flat(ppo.policy.parameters())
+    with pytest.raises(FloatingPointError, match="update 0"):
+        ppo.update(rollout(ppo, lambda sample: np.full(len(sample.value), np.nan)))
+    assert torch.equal(policy, flat(ppo.policy.parameters()))
+
+
 def test_paper_settings():
     config = PaperPPOConfig()
     assert (config.epochs, config.clip, config.gamma, config.gae_lambda) == (1, 0.2, 0.99, 0.95)
@@ -178,7 +186,7 @@ def test_paper_settings():
 
 
 def test_untrainable_policy_is_named():
-    processors = PolicyProcessors(*identity_processors(), "cpu")
+    processors = PolicyProcessors(*identity_processors())
     with pytest.raises(TypeError, match="sample_actions"):
         PPO(torch.nn.Linear(1, 1), processors, PPOConfig(), np.random.default_rng(0))
 

@@ -6,7 +6,7 @@ from dummies import TASKS, DummyEnv, DummyPolicy, identity_processors
 from cronos_lerobot.rl.processing import PolicyProcessors
 from cronos_lerobot.training.evaluation import SuccessRate, evaluate_independent, wilson_interval
 
-PROCESSORS = PolicyProcessors(*identity_processors(), "cpu")
+PROCESSORS = PolicyProcessors(*identity_processors())
 
 
 class ScriptedPolicy(DummyPolicy):

@@ -1,0 +1,69 @@
+"""`cronos-train` on the real scene with the real policy, far too short to learn anything."""
+
+import sys
+
+import pytest
+import torch
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot_env_cronos import CronosEnvConfig
+from safetensors.torch import load_file
+
+from cronos_lerobot.scripts import train as script
+
+SMALL = (
+    "--policy.type=pocketvla", "--policy.device=cpu", "--policy.hidden_width=16", "--policy.hidden_depth=1",
+    "--env.type=cronos", "--num_envs=2", "--protocol.task_switch_interval=4", "--protocol.update_interval=8",
+    "--protocol.scene_reset_interval=8", "--steps=32", "--save_freq=16", "--eval_freq=0", "--tensorboard=false",
+    "--algorithm.minibatch_size=8", "--algorithm.value_warmup_updates=0", "--algorithm.entropy_coef=0.1",
+)  # fmt: skip
+OBSERVATIONS = {
+    "state": ("--env.obs_type=environment_state_agent_pos",),
+    "pixels": ("--env.observation_height=64", "--env.observation_width=64"),
+}
+
+
+def cronos_train(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["cronos-train", *map(str, arguments)])
+    script.main()
+
+
+def weights(folder):
+    return load_file(folder / "checkpoints/last/pretrained_model/model.safetensors")
+
+
+@pytest.mark.parametrize("observation", OBSERVATIONS)
+def test_train_kill_resume(observation, tmp_path, monkeypatch):
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    cronos_train(monkeypatch, *SMALL, *OBSERVATIONS[observation], f"--output_dir={whole}")
+    cronos_train(monkeypatch, *SMALL, *OBSERVATIONS[observation], f"--output_dir={broken}", "--steps=16")
+    last = broken / "checkpoints/last/pretrained_model"
+    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=32")
+    before, after = load_file(broken / "checkpoints/000016/pretrained_model/model.safetensors"), weights(broken)
+    assert any(not torch.equal(before[name], after[name]) for name in before)
+    for name, tensor in weights(whole).items():
+        assert torch.equal(tensor, after[name]), name
+
+
+def test_checkpoint_is_a_lerobot_policy(tmp_path, monkeypatch):
+    cronos_train(monkeypatch, *SMALL, *OBSERVATIONS["state"], f"--output_dir={tmp_path / 'run'}", "--steps=16")
+    register_third_party_plugins()
+    from lerobot.configs import PreTrainedConfig
+
+    folder = tmp_path / "run/checkpoints/last/pretrained_model"
+    config = PreTrainedConfig.from_pretrained(folder)
+    config.pretrained_path = folder
+    env_config = CronosEnvConfig(obs_type="environment_state_agent_pos")
+    policy = make_policy(config, env_cfg=env_config)
+    preprocessor, postprocessor = make_pre_post_processors(config, str(folder))
+    observation = {"observation.state": torch.zeros(3, 13), "observation.environment_state": torch.zeros(3, 48)}
+    action = postprocessor(policy.select_action(preprocessor(observation | {"task": ["put it there"] * 3})))
+    assert action.shape == (3, 7)
+
+
+def test_policy_of_another_kind_is_refused(tmp_path, monkeypatch):
+    with pytest.raises(TypeError, match="sample_actions"):
+        cronos_train(
+            monkeypatch, "--policy.type=act", "--policy.device=cpu", "--policy.pretrained_backbone_weights=null",
+            "--env.type=cronos", "--num_envs=2", f"--output_dir={tmp_path / 'run'}",
+        )  # fmt: skip
