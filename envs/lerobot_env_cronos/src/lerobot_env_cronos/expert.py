@@ -38,6 +38,8 @@ DROP_HEIGHT = 0.003
 """Gap under the object when the hand lets go; more than 12 mm topples objects [m]."""
 RETREAT_HEIGHT = 0.13
 """Height at which the hand waits once the task is complete [m]."""
+NUM_FAILED, MAX_VAIN_STEPS = 3, 5
+"""Failed grasps that are remembered, and steps at a grasp after which it has failed."""
 STALE_DISTANCE, STALE_ANGLE = 0.015, 0.2
 """An object or receptacle that moved further than this is looked at again [m, rad]."""
 
@@ -62,11 +64,15 @@ class ScriptedExpert:
         self._grasp_known, self._place_known = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         self._grasp_point, self._grasp_axis, self._grasp_floor = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
         self._grasp_pose = np.zeros((n, 7))
+        # The last grasp points that failed, and for how long the hand has been at the current one in vain.
+        self._failed, self._vain = np.full((n, NUM_FAILED, 3), np.inf), np.zeros(n, dtype=int)
+        self._was_holding = np.zeros(n, dtype=bool)
         self._place_xy, self._place_anchor, self._place_closing = (np.zeros((n, 2)) for _ in range(3))
 
     def reset(self, ids: np.ndarray) -> None:
         """Forget the chosen grasps and places of streams `ids` (a new segment or episode)."""
-        self._grasp_known[ids] = self._place_known[ids] = False
+        self._grasp_known[ids] = self._place_known[ids] = self._was_holding[ids] = False
+        self._failed[ids], self._vain[ids] = np.inf, 0
 
     def act(self) -> np.ndarray:
         """Actions (n, 7) in physical units, within the action bounds."""
@@ -93,7 +99,9 @@ class ScriptedExpert:
         self._arm = sim.qpos[:, :NUM_ARM_JOINTS]
         self._yaw = np.arctan2(self._R[:, 1, 1], self._R[:, 0, 1])
         self._opening = sim.gripper_opening()
-        self._held_objects = np.stack([sim.is_grasped(name) for name in self.scene.objects], 1)
+        # Fingers that cannot close press on a side too wide for them: that is not a grasp.
+        closed = (self._opening < 0.95)[:, None]
+        self._held_objects = closed & np.stack([sim.is_grasped(name) for name in self.scene.objects], 1)
 
     def _update_goals(self) -> None:
         """The body to move and where to, (n,) indices; an object held by mistake goes to the table first."""
@@ -126,12 +134,18 @@ class ScriptedExpert:
             ids = np.flatnonzero(wanted & (self._goal[:, 0] == obj))
             grasps = choose_grasps(
                 self._candidates[obj], obj, WorldBoxes.at(self._boxes, self._poses[ids]),
-                (self._object[ids, :3], self._object_R[ids]), self._yaw[ids], self._arm[ids], self._is_support,
+                (self._object[ids, :3], self._object_R[ids]), self._arm[ids], self._failed[ids], self._is_support,
             )  # fmt: skip
             self._grasp_point[ids], self._grasp_axis[ids] = grasps.point, grasps.axis
             self._grasp_floor[ids] = grasps.floor
             self._grasp_pose[ids] = self._object[ids]
             self._grasp_known[ids] = True
+
+    def _give_up(self, failed: np.ndarray) -> None:
+        """Remember the grasps that failed (n,) bool, so that the next choice is another one."""
+        self._failed[failed, 1:] = self._failed[failed, :-1]
+        self._failed[failed, 0] = self._grasp_point[failed]
+        self._grasp_known[failed], self._vain[failed] = False, 0
 
     def _update_places(self) -> None:
         """Choose a free spot for what is newly held, or where the receptacle has moved since."""
@@ -166,6 +180,12 @@ class ScriptedExpert:
         low = self._p[:, 2] - grasp[:, 2]
         there = (error < ALIGNED + 0.004) & (low < GRASP_REACHED)
         missed = there & (self._opening < 0.06)
+        # Nothing between the fingers, or the hand is kept from getting there, or what it holds stays put.
+        vain = (error < ALIGNED + 0.004) & (self._target_p[:, 2] - grasp[:, 2] < GRASP_REACHED)
+        self._vain = np.where(vain & ~self._holding & ~self._success, self._vain + 1, 0)
+        slipped = self._was_holding & ~self._holding & ~self._success & (self._opening < 0.06)
+        self._was_holding = self._holding.copy()
+        self._give_up(missed & ~self._holding | slipped | (self._vain > MAX_VAIN_STEPS))
         gripper = np.where(there & ~missed, CLOSE, OPEN)
         # Fingers that are still opening do not go down on the object.
         opening = np.where(there & ~missed, 0.0, 0.05 * np.clip(0.9 - self._opening, 0.0, 0.5) / 0.5)
@@ -190,8 +210,8 @@ class ScriptedExpert:
         position[:, 2] = np.maximum(position[:, 2], tips)
         error = self._misalignment(position, closing)
         low = self._p[:, 2] - position[:, 2]
-        # The target has been pushed below the hand: the object rests on something.
-        rests = self._p[:, 2] - self._target_p[:, 2] > 0.012
+        # The target is down but the hand is not: the object rests on something.
+        rests = (self._target_p[:, 2] - position[:, 2] < 0.004) & (self._p[:, 2] - self._target_p[:, 2] > 0.005)
         release = (error < ALIGNED + 0.006) & ((low < 0.006) | rests)
         gripper = np.where(release, OPEN, CLOSE)
         return self._holding, self._funnel(position, error, np.zeros(len(i))), closing, gripper
@@ -240,8 +260,14 @@ class ScriptedExpert:
         across = np.stack([closing[:, 1], -closing[:, 0], zeros], 1)
         goal_R = np.stack([down, closing, across], 2)
         turn = matrix_to_rotation_vector(goal_R @ self._target_R.transpose(0, 2, 1))
+        turn[:, 2] = self._away_from_wrist_limit(turn[:, 2])
         action = np.concatenate([position - self._target_p, turn, gripper[:, None]], 1)
         return np.clip(action, ACTION_LOW, ACTION_HIGH)
+
+    def _away_from_wrist_limit(self, turn: np.ndarray) -> np.ndarray:
+        """Turn (n,) the long way round where the short one would hit the wrist's limit."""
+        blocked = (self._target_R[:, 2, 0] < -0.7) & (np.abs(self.sim.arm_target[:, 5] - turn) > 3.1)
+        return np.where(blocked, turn - 2 * np.pi * np.sign(turn), turn)
 
 
 def _horizontal(v: np.ndarray) -> np.ndarray:

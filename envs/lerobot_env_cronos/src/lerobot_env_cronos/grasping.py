@@ -21,6 +21,8 @@ TIP_CLEARANCE = 0.002
 FINGER_ROOM, PALM_ROOM = 0.006, 0.004
 """Wanted distance from other things [m]."""
 PALM_HALF_Y, PALM_HALF_Z = 0.045, 0.022
+WRIST_LIMIT = 2.6
+"""Wrist rotation beyond which a grasp or a place is not chosen [rad]."""
 SLOTS = np.array([-0.75, -0.4, 0.0, 0.4, 0.75])
 
 
@@ -76,6 +78,19 @@ def wrap(angle: np.ndarray) -> np.ndarray:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
+def wrist_cost(arm: np.ndarray, point: np.ndarray, hand_yaw: np.ndarray) -> np.ndarray:
+    """Cost of turning a hand that points down to a yaw of its closing axis, far from the wrist's limits.
+
+    Args:
+        arm: (..., 6) joint positions [rad].
+        point: (..., 2 or 3) where [m].
+        hand_yaw: (...,) [rad].
+    """
+    wrist = wrap(np.arctan2(point[..., 1], point[..., 0]) + np.pi / 2 - hand_yaw)
+    turn = wrist - arm[..., 5]
+    return 0.25 * np.abs(turn) + 0.15 * np.abs(wrist) + 10.0 * (np.abs(wrist) > WRIST_LIMIT)
+
+
 def finger_points(centre: np.ndarray, closing: np.ndarray, half_gap: tuple[float, ...] = (FINGER_Y,)):
     """Points (..., p, 3) on the pads of a hand that points down.
 
@@ -90,7 +105,7 @@ def finger_points(centre: np.ndarray, closing: np.ndarray, half_gap: tuple[float
         for gap in half_gap
         for side in (-1, 1)
         for lateral in (-1, 0, 1)
-        for level in (-1, 1)
+        for level in (-1, 0, 1)
     ]
     return np.stack(points, -2)
 
@@ -108,8 +123,8 @@ def choose_grasps(
     obj: int,
     world: WorldBoxes,
     pose: tuple[np.ndarray, np.ndarray],
-    hand_yaw: np.ndarray,
     arm: np.ndarray,
+    avoid: np.ndarray,
     is_support: np.ndarray,
 ) -> Grasps:
     """Pick the cheapest grasp of an object in each of n streams.
@@ -118,8 +133,8 @@ def choose_grasps(
         candidates: of the object; `obj` is its index.
         world: all boxes.
         pose: of the object, position (n, 3) and rotation (n, 3, 3).
-        hand_yaw: (n,) yaw of the hand's closing axis [rad].
         arm: (n, 6) joint positions [rad].
+        avoid: (n, a, 3) grasp points that failed, in the object's frame; inf where there was none [m].
         is_support: (bodies,) True for receptacles, which the fingers may come close to from above.
     """
     p, R = pose
@@ -138,10 +153,9 @@ def choose_grasps(
     # Pads that pass over the grasp point by more than their half length do not hold it.
     cost += 200 * np.maximum(centre[..., 2] - point[..., 2] - 0.010, 0.0)
     cost += _collision_cost(world, candidates, centre, closing, obj, is_support)
-    turn = wrap(np.arctan2(closing[..., 1], closing[..., 0]) - hand_yaw[:, None])
-    waist = np.arctan2(point[..., 1], point[..., 0])
-    wrist = arm[:, None, 5] + wrap(waist - arm[:, None, 0]) - turn
-    cost += 0.25 * np.abs(turn) + 0.15 * np.abs(wrist) + 10.0 * (np.abs(wrist) > 2.6)
+    cost += wrist_cost(arm[:, None], point, np.arctan2(closing[..., 1], closing[..., 0]))
+    failed = np.linalg.norm(candidates.point[None, :, None] - avoid[:, None], axis=-1) < 0.012
+    cost += 1.5 * failed.sum(-1)
     com = p + np.einsum("nij,j->ni", R, world.boxes.centre_of_mass[obj])
     cost += 8.0 * np.linalg.norm((point - com[:, None])[..., :2], axis=-1)
     best, n = cost.argmin(1), np.arange(len(p))
@@ -164,10 +178,15 @@ def _floor(world: WorldBoxes, point: np.ndarray, closing: np.ndarray, is_support
     floor = np.zeros((n, c))
     for m in np.flatnonzero(is_support[world.boxes.body]):
         offset = feet.reshape(n, -1, 3) - world.centre[:, None, m]
+        normal = world.rotation[:, m, :, 2]
+        up = np.where(np.abs(normal[:, 2]) < 0.3, 0.3, np.abs(normal[:, 2]))
+        slope = normal[:, :2] / (up * np.sign(normal[:, 2]))[:, None]
+        surface = world.centre[:, m, 2, None] + (world.boxes.half[m, 2] / up)[:, None]
+        surface = surface - np.einsum("ni,npi->np", slope, offset[..., :2])
         local = np.einsum("nij,npi->npj", world.rotation[:, m], offset)
-        q = np.abs(local[..., :2]) - world.boxes.half[m, :2]
-        over = (q.max(-1) < 0.004).reshape(n, c, -1).any(-1)
-        floor = np.maximum(floor, np.where(over, world.top()[:, None, m], 0.0))
+        over = np.abs(local[..., :2]) - world.boxes.half[m, :2]
+        height = np.where(over.max(-1) < 0.004, np.minimum(surface, world.top()[:, m, None]), 0.0)
+        floor = np.maximum(floor, height.reshape(n, c, -1).max(-1))
     return floor
 
 

@@ -12,6 +12,10 @@ _AXES = np.array([link.axis for link in LINKS], dtype=float)  # (6, 3)
 _AXIS_INDEX = _AXES.argmax(axis=1)
 JOINT_LOW = np.array([link.range[0] for link in LINKS])
 JOINT_HIGH = np.array([link.range[1] for link in LINKS])
+TARGET_LOW = np.maximum(JOINT_LOW, [-1.6, -np.inf, -1.2, -1.6, 0.1, -np.inf])
+TARGET_HIGH = np.minimum(JOINT_HIGH, [1.6, np.inf, np.inf, 1.6, np.inf, np.inf])
+"""Range of the joint targets [rad]. It keeps the arm on the branch of its home pose: facing the table, elbow up,
+wrist down. On another branch small motions of the hand lead nowhere but into the joint limits, for good."""
 
 
 def forward_kinematics(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -98,7 +102,7 @@ def inverse_kinematics(
         R_target: (n, 3, 3).
 
     Returns:
-        (n, 6) joint positions inside their limits; the closest that `iterations` steps found.
+        (n, 6) joint positions between TARGET_LOW and TARGET_HIGH; the closest that `iterations` steps found.
     """
     for _ in range(iterations):
         p, R, jacobian = forward_kinematics(q)
@@ -108,5 +112,5 @@ def inverse_kinematics(
         Jw, ew = jacobian * weight[:, None], error * weight
         JJt = Jw @ Jw.transpose(0, 2, 1) + damping**2 * np.eye(6)
         step = (Jw.transpose(0, 2, 1) @ np.linalg.solve(JJt, ew[..., None]))[..., 0]
-        q = np.clip(q + np.clip(step, -0.4, 0.4), JOINT_LOW, JOINT_HIGH)
+        q = np.clip(q + np.clip(step, -0.4, 0.4), TARGET_LOW, TARGET_HIGH)
     return q

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_env_cronos.body_boxes import WorldBoxes
-from lerobot_env_cronos.grasping import finger_points, wrap
+from lerobot_env_cronos.grasping import finger_points, wrist_cost
 from lerobot_env_cronos.robot import PAD_HALF_SIZE
 from lerobot_env_cronos.scenes import Scene
 
@@ -75,8 +75,8 @@ def choose_places(
     spots = np.tile(spots, (1, len(TURNS), 1))
     goal = anchor[:, None] + spots
     gap = _clearance(world, obj, receptacle, goal, turn, top, held)
-    cost = 150 * np.maximum(ROOM - gap, 0.0) + 0.2 * np.abs(turn)
-    cost += _wrist_cost(held, goal, turn)
+    cost = 150 * np.maximum(ROOM - gap, 0.0)
+    cost += wrist_cost(held.arm[:, None], goal, held.hand_yaw[:, None] + turn)
     distance = np.linalg.norm(spots, axis=-1)
     if on_table:
         cost += 2.0 * np.linalg.norm(goal - held.position[:, None, :2], axis=-1)
@@ -129,12 +129,6 @@ def _clearance(
         distance = world.distance(moved.reshape(n, -1, 3), np.flatnonzero(others))
         gaps.append(distance.reshape(n, s, -1).min(2) - thickness)
     return np.minimum(*gaps)
-
-
-def _wrist_cost(held: Held, goal: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    waist = np.arctan2(goal[..., 1], goal[..., 0])
-    wrist = held.arm[:, None, 5] + wrap(waist - held.arm[:, None, 0]) - turn
-    return 0.05 * np.abs(wrist) + 10.0 * (np.abs(wrist) > 2.6)
 
 
 def _along(held: Held, spots: np.ndarray, turn: np.ndarray, world: WorldBoxes, obj: int) -> np.ndarray:
