@@ -54,12 +54,17 @@ def success_rate(group: str, task: str, success: np.ndarray) -> SuccessRate:
     return SuccessRate(group, task, k, n, k / n, *wilson_interval(k, n))
 
 
-def run_segment(env: CronosVectorEnv, act: Callable[[], np.ndarray], steps: int = STEPS_PER_TASK) -> np.ndarray:
-    """Act for one segment; (n,) bool, the streams whose task was complete at any step."""
+def run_segment(env: CronosVectorEnv, act: Callable[[], np.ndarray], *, stop_early: bool = False) -> np.ndarray:
+    """Act for 80 steps; (n,) bool, the streams whose task was complete at any step.
+
+    With `stop_early` it ends as soon as that is true of all.
+    """
     success = np.zeros(env.num_envs, dtype=bool)
-    for _ in range(steps):
+    for _ in range(STEPS_PER_TASK):
         *_, info = env.step(act())
         success |= info["is_success"]
+        if stop_early and success.all():
+            break
     return success
 
 
@@ -69,7 +74,7 @@ def measure_independent(scene: str, split: str, task: Task, env: CronosVectorEnv
     everyone = np.arange(env.num_envs)
     env.scene_reset(everyone, everyone % NUM_CONFIGURATIONS, split)
     env.set_task(everyone, [task] * env.num_envs)
-    return run_segment(env, ScriptedExpert(env).act)
+    return run_segment(env, ScriptedExpert(env).act, stop_early=True)
 
 
 def measure_reset_free(
