@@ -1,0 +1,157 @@
+"""The figures of a report, each a matplotlib Figure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from cronos_lerobot.report.runs import Group
+from cronos_lerobot.report.series import (
+    Curve,
+    evaluation_curve,
+    segment_history,
+    segment_rates,
+    update_curve,
+)
+
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")
+"""Okabe and Ito's palette: told apart by the colour-blind too."""
+INK, GRID = "#333333", "#e4e4e4"
+PPO_PANELS = (
+    ("KL divergence per update [nats]", "approx_kl"),
+    ("entropy [nats]", "entropy"),
+    ("explained variance of the value", "explained_variance"),
+    ("clip fraction", "clip_fraction"),
+    ("learning rate of the policy", "policy_lr"),
+)
+
+
+def evaluation_figure(groups: list[Group]) -> Figure | None:
+    """Evaluation success against interaction steps and against interventions."""
+    if not any(run.evaluations for group in groups for run in group.runs):
+        return None
+    figure = Figure(figsize=(10, 3.8), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    for ax, axis in zip(axes, ("interaction_steps", "interventions"), strict=True):
+        for i, group in enumerate(groups):
+            _draw(ax, evaluation_curve(group, axis), i, _label(group), marker="o")
+        _style(ax, f"{axis.replace('_', ' ')}, all streams")
+        ax.set_ylim(0, 1.02)
+    axes[0].set_ylabel("evaluation success")
+    _legend(axes[0], groups)
+    return figure
+
+
+def training_figure(groups: list[Group]) -> Figure | None:
+    """Success of the streams' segments, by policy update."""
+    figure = Figure(figsize=(10, 3.2), layout="constrained")
+    ax = figure.subplots()
+    for i, group in enumerate(groups):
+        _draw(ax, update_curve(group, lambda update: update["rollout"]["success"]), i, _label(group))
+    _style(ax, "interaction steps, all streams")
+    ax.set(ylabel="success of training segments", ylim=(0, 1.02))
+    _legend(ax, groups)
+    return figure if ax.lines else None
+
+
+def segments_figure(groups: list[Group]) -> Figure | None:
+    """Success by segment since the last scene reset, at the end of the runs."""
+    figure = Figure(figsize=(10, 3.2), layout="constrained")
+    ax = figure.subplots()
+    for i, group in enumerate(groups):
+        rates = segment_rates(group)
+        if not rates:
+            continue
+        intervals = np.array([rate.interval for rate in rates.values()])
+        y = np.array([rate.value for rate in rates.values()])
+        curve = Curve(np.array(list(rates)) + 1, y, intervals[:, 0], intervals[:, 1], is_band_over_seeds=False)
+        _draw(ax, curve, i, _label(group), marker="o")
+    _style(ax, "segment since the last scene reset (1 is the first after it)")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set(ylabel="success of training segments", ylim=(0, 1.02))
+    _legend(ax, groups)
+    return figure if ax.lines else None
+
+
+def segment_history_figure(groups: list[Group]) -> Figure | None:
+    """Success by segment since the last scene reset, over the run: one heat map for each group."""
+    groups = [group for group in groups if segment_rates(group, 1.0)]
+    if not groups:
+        return None
+    rows = -(-len(groups) // 2)
+    columns = min(2, len(groups))
+    figure = Figure(figsize=(10, 3.2 * rows), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for unused in axes[len(groups) :]:
+        unused.remove()
+    axes = axes[: len(groups)]
+    mesh: Any = None
+    for ax, group in zip(axes, groups, strict=True):
+        edges, rates = segment_history(group)
+        mesh = ax.pcolormesh(edges, np.arange(len(rates) + 1) + 0.5, rates, vmin=0, vmax=1, cmap="viridis")
+        _style(ax, "interaction steps, all streams", grid=False)
+        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+        ax.set_ylabel("segment since the reset")
+        ax.set_title(_label(group), fontsize=9, color=INK, loc="left")
+    figure.colorbar(mesh, ax=axes, label="success", shrink=0.9)
+    return figure
+
+
+def ppo_figure(groups: list[Group]) -> Figure | None:
+    """PPO's diagnostics, one panel each, by policy update."""
+    figure = Figure(figsize=(10, 4.6), layout="constrained")
+    axes = list(figure.subplots(2, 3).flat)
+    panels = [*((title, _metric(name)) for title, name in PPO_PANELS), ("reward per segment", _reward)]
+    for ax, (title, value) in zip(axes, panels, strict=True):
+        for i, group in enumerate(groups):
+            _draw(ax, update_curve(group, value), i, _label(group), width=1.2)
+        _style(ax, "")
+        ax.set_title(title, fontsize=9, color=INK, loc="left")
+    _legend(axes[0], groups)
+    return figure if any(ax.lines for ax in axes) else None
+
+
+def _metric(name: str) -> Callable[[dict[str, Any]], float | None]:
+    return lambda update: update["ppo"].get(name)
+
+
+def _reward(update: dict[str, Any]) -> float | None:
+    return update["rollout"].get("reward_per_segment")
+
+
+def _label(group: Group) -> str:
+    return group.label if len(group.runs) == 1 else f"{group.label} ({len(group.runs)} seeds)"
+
+
+def _draw(ax: Axes, curve: Curve | None, i: int, label: str, marker: str = "", width: float = 1.6) -> None:
+    if curve is None:
+        return
+    color = COLORS[i % len(COLORS)]
+    ax.plot(curve.x, curve.y, color=color, lw=width, marker=marker, ms=4, label=label)
+    ax.fill_between(curve.x, curve.low, curve.high, color=color, alpha=0.18, lw=0)
+
+
+def _style(ax: Axes, xlabel: str, *, grid: bool = True) -> None:
+    ax.set_xlabel(xlabel)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.tick_params(labelsize=8, colors=INK)
+    ax.xaxis.set_major_formatter(FuncFormatter(_thousands))
+    if grid:
+        ax.grid(color=GRID, lw=0.8)
+        ax.set_axisbelow(True)
+
+
+def _thousands(x: float, _: Any) -> str:
+    if abs(x) >= 1e6:
+        return f"{x / 1e6:g}M"
+    return f"{x / 1e3:g}k" if abs(x) >= 1e4 else f"{x:g}"
+
+
+def _legend(ax: Axes, groups: list[Group]) -> None:
+    if len(groups) > 1 or any(len(group.runs) > 1 for group in groups):
+        ax.legend(fontsize=8, frameon=False, loc="best")

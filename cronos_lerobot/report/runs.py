@@ -1,0 +1,257 @@
+"""Reads the folders of `cronos-train` and `lerobot-eval`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from lerobot_env_cronos.scenes import SCENES
+
+from cronos_lerobot.report.statistics import Gain, Rate
+from cronos_lerobot.training.logging import MANIFEST, METRICS
+
+EVAL_INFO = "eval_info.json"
+
+NOT_THE_EXPERIMENT = (
+    "seed", "output_dir", "job_name", "resume", "record", "wandb", "tensorboard", "torch_threads", "log_freq",
+    "save_freq", "save_checkpoint", "keep_checkpoints",
+)  # fmt: skip
+"""Top-level fields of a training config in which two runs of one experiment may differ."""
+
+Evaluation = dict[str, Any]
+Update = dict[str, Any]
+
+
+@dataclass
+class TrainingRun:
+    """A run folder of `cronos-train`."""
+
+    folder: Path
+    config: dict[str, Any]
+    starts: list[dict[str, Any]]
+    """One for each time the run was started, from manifest.json."""
+    evaluations: list[Evaluation]
+    updates: list[Update]
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self.folder.resolve().name
+
+    @property
+    def seed(self) -> int | None:
+        """The run's seed."""
+        return self.config.get("seed")
+
+    @property
+    def last(self) -> dict[str, Any]:
+        """The latest record, for its counters."""
+        return max([*self.updates, *self.evaluations], key=lambda record: record["interaction_steps"])
+
+
+@dataclass
+class EvaluationRun:
+    """An output folder of `lerobot-eval`."""
+
+    folder: Path
+    suite: str
+    """LeRobot's task group, e.g. `independent_held_out`."""
+    successes: dict[str, list[bool]]
+    """By instruction: one flag for each episode."""
+    videos: dict[str, list[Path]]
+    """By instruction: the videos of the first episodes, in their order."""
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self.folder.resolve().name
+
+    @property
+    def tasks(self) -> dict[str, Rate]:
+        """Success by instruction."""
+        return {task: Rate(sum(flags), len(flags)) for task, flags in self.successes.items()}
+
+    @property
+    def overall(self) -> Rate:
+        """Success of all tasks together."""
+        return sum_rates(self.tasks.values())
+
+
+@dataclass
+class Group:
+    """Runs with the same config but for the seed."""
+
+    label: str
+    runs: list[TrainingRun] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What a training came to: success before and after, by task."""
+
+    label: str
+    suite: str
+    tasks: dict[str, Gain]
+
+    @property
+    def overall(self) -> Gain:
+        """All tasks together."""
+        gains = self.tasks.values()
+        return Gain(sum_rates(gain.before for gain in gains), sum_rates(gain.after for gain in gains))
+
+
+def sum_rates(rates: Iterable[Rate]) -> Rate:
+    """All episodes together."""
+    total = Rate(0, 0)
+    for rate in rates:
+        total += rate
+    return total
+
+
+def find_runs(folders: Iterable[Path]) -> tuple[list[TrainingRun], list[EvaluationRun]]:
+    """Read the runs in `folders` and below them, each once.
+
+    Raises:
+        FileNotFoundError: a folder is missing or holds no run.
+    """
+    training: dict[Path, TrainingRun] = {}
+    evaluation: dict[Path, list[EvaluationRun]] = {}
+    for folder in folders:
+        found = False
+        for path in _files(folder, METRICS):
+            training.setdefault(path.resolve(), read_training_run(path.parent))
+            found = True
+        for path in _files(folder, EVAL_INFO):
+            evaluation.setdefault(path.resolve(), read_evaluation_runs(path.parent))
+            found = True
+        if not found:
+            raise FileNotFoundError(
+                f"{folder} has no {METRICS} of cronos-train and no {EVAL_INFO} of lerobot-eval."
+            )
+    return list(training.values()), [run for runs in evaluation.values() for run in runs]
+
+
+def _files(folder: Path, name: str) -> Iterator[Path]:
+    own = folder / name
+    return iter([own] if own.is_file() else sorted(folder.rglob(name)))
+
+
+def read_training_run(folder: Path) -> TrainingRun:
+    """Read a run folder; a line that a kill left unfinished is skipped."""
+    records = []
+    for line in (folder / METRICS).read_text().splitlines():
+        try:
+            records.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    if not records:
+        raise ValueError(f"{folder / METRICS} has no record yet: the run has not come to its first evaluation.")
+    manifest = folder / MANIFEST
+    starts = json.loads(manifest.read_text())["starts"] if manifest.is_file() else []
+    return TrainingRun(
+        folder,
+        _read_config(folder, starts),
+        starts,
+        [record for record in records if record["kind"] == "evaluation"],
+        [record for record in records if record["kind"] == "update"],
+    )
+
+
+def _read_config(folder: Path, starts: list[dict[str, Any]]) -> dict[str, Any]:
+    if starts:
+        return starts[-1]["config"]
+    path = folder / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME
+    return json.loads(path.read_text()) if path.is_file() else {}
+
+
+def read_evaluation_runs(folder: Path, scene: str = "kitchen_2x2") -> list[EvaluationRun]:
+    """Read an output folder of `lerobot-eval`: one EvaluationRun for each suite in it.
+
+    Args:
+        folder: holds eval_info.json.
+        scene: the scene, which the file does not name; its tasks are numbered in the file.
+    """
+    instructions = [task.instruction for task in SCENES[scene].tasks]
+    runs: dict[str, EvaluationRun] = {}
+    for entry in json.loads((folder / EVAL_INFO).read_text())["per_task"]:
+        suite, number = entry["task_group"], entry["task_id"]
+        run = runs.setdefault(suite, EvaluationRun(folder, suite, {}, {}))
+        task = instructions[number] if number < len(instructions) else f"task {number}"
+        run.successes[task] = [bool(flag) for flag in entry["metrics"]["successes"]]
+        paths = [Path(path) for path in entry["metrics"].get("video_paths", [])]
+        # The paths are as seen when the evaluation ran; the folder may have moved since.
+        moved = [folder / "videos" / path.parent.name / path.name for path in paths]
+        run.videos[task] = [path for path in moved if path.is_file()]
+    return list(runs.values())
+
+
+def group_runs(runs: list[TrainingRun]) -> list[Group]:
+    """Group runs by their config but for the seed, labelled by what tells the groups apart."""
+    groups: dict[str, Group] = {}
+    flat = {}
+    for run in runs:
+        experiment = {key: value for key, value in run.config.items() if key not in NOT_THE_EXPERIMENT}
+        key = json.dumps(experiment, sort_keys=True) if experiment else str(run.folder)
+        groups.setdefault(key, Group(run.name)).runs.append(run)
+        flat[key] = _flatten(experiment)
+    names = sorted({name for config in flat.values() for name in config})
+    differing = [name for name in names if len({config.get(name) for config in flat.values()}) > 1]
+    if len(groups) > 1 and 0 < len(differing) <= 3:
+        for key, group in groups.items():
+            group.label = ", ".join(f"{name.split('.')[-1]}={flat[key].get(name)}" for name in differing)
+    return list(groups.values())
+
+
+def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, str]:
+    flat: dict[str, str] = {}
+    for name, value in config.items():
+        if isinstance(value, dict):
+            flat |= _flatten(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = json.dumps(value).strip('"')
+    return flat
+
+
+def evaluation_rates(evaluation: Evaluation) -> dict[str, Rate]:
+    """Success by instruction, of an evaluation that `cronos-train` logged."""
+    return {task: Rate(round(r["success"] * r["n"]), r["n"]) for task, r in evaluation["per_task"].items()}
+
+
+def compare_training(groups: list[Group]) -> list[Comparison]:
+    """First and last periodic evaluation of every group, its seeds together."""
+    comparisons = []
+    for group in groups:
+        runs = [run for run in group.runs if len(run.evaluations) > 1]
+        if not runs:
+            continue
+        before = _pool([evaluation_rates(run.evaluations[0]) for run in runs])
+        after = _pool([evaluation_rates(run.evaluations[-1]) for run in runs])
+        gains = {task: Gain(before[task], after[task]) for task in before if task in after}
+        suite = f"periodic evaluation, {runs[0].evaluations[-1]['split']}"
+        comparisons.append(Comparison(group.label, suite, gains))
+    return comparisons
+
+
+def compare_evaluations(before: list[EvaluationRun], after: list[EvaluationRun]) -> list[Comparison]:
+    """Evaluations of `lerobot-eval` of the same suite, before and after."""
+    comparisons = []
+    for suite in dict.fromkeys(run.suite for run in after):
+        old = _pool([run.tasks for run in before if run.suite == suite])
+        new = _pool([run.tasks for run in after if run.suite == suite])
+        gains = {task: Gain(old[task], rate) for task, rate in new.items() if task in old}
+        if gains:
+            comparisons.append(Comparison("lerobot-eval", suite, gains))
+    return comparisons
+
+
+def _pool(tables: list[dict[str, Rate]]) -> dict[str, Rate]:
+    pooled: dict[str, Rate] = {}
+    for table in tables:
+        for task, rate in table.items():
+            pooled[task] = pooled.get(task, Rate(0, 0)) + rate
+    return pooled

@@ -1,0 +1,151 @@
+"""The tables of a report: what its page shows, and the CSV files beside it."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from cronos_lerobot.report.runs import Comparison, EvaluationRun, Group, TrainingRun, evaluation_rates
+from cronos_lerobot.report.statistics import Gain, Rate
+
+Row = dict[str, Any]
+ALL = "all tasks"
+COUNTED = ("scene_reset", "heuristic_reset", "divergence")
+"""Kinds of intervention that count against the budget."""
+
+
+def rate_columns(rate: Rate, prefix: str = "") -> Row:
+    """Columns of a success rate: successes, n, rate and the ends of its 95 % interval."""
+    low, high = rate.interval
+    columns = {"successes": rate.successes, "n": rate.n, "success": rate.value, "ci95_low": low, "ci95_high": high}
+    return {prefix + name: value for name, value in columns.items()}
+
+
+def gain_rows(comparisons: Iterable[Comparison]) -> list[Row]:
+    """Before, after and gain, one row for all tasks and one for each."""
+    rows = []
+    for comparison in comparisons:
+        for task, gain in {ALL: comparison.overall, **comparison.tasks}.items():
+            rows.append({"runs": comparison.label, "suite": comparison.suite, "task": task} | _gain_columns(gain))
+    return rows
+
+
+def _gain_columns(gain: Gain) -> Row:
+    low, high = gain.interval
+    ends = {"gain": gain.value, "gain_ci95_low": low, "gain_ci95_high": high}
+    return rate_columns(gain.before, "before_") | rate_columns(gain.after, "after_") | ends
+
+
+def lerobot_eval_rows(runs: Iterable[EvaluationRun]) -> list[Row]:
+    """Success of every `lerobot-eval` folder, for all tasks and for each."""
+    return [
+        {"folder": run.name, "suite": run.suite, "task": task} | rate_columns(rate)
+        for run in runs
+        for task, rate in {ALL: run.overall, **run.tasks}.items()
+    ]
+
+
+def evaluation_rows(groups: Iterable[Group]) -> list[Row]:
+    """The periodic evaluations of the training runs."""
+    rows = []
+    for group in groups:
+        for run in group.runs:
+            for evaluation in run.evaluations:
+                counters = {name: evaluation[name] for name in ("interaction_steps", "interventions", "split")}
+                rates = evaluation_rates(evaluation)
+                overall = Rate(round(evaluation["success"] * evaluation["n"]), evaluation["n"])
+                for task, rate in {ALL: overall, **rates}.items():
+                    rows.append(_identity(group, run) | counters | {"task": task} | rate_columns(rate))
+    return rows
+
+
+def update_rows(groups: Iterable[Group]) -> list[Row]:
+    """Every policy update: training success, PPO's diagnostics, speed."""
+    rows = []
+    for group in groups:
+        for run in group.runs:
+            for update in run.updates:
+                rollout = update["rollout"]
+                row = _identity(group, run) | {
+                    name: update[name] for name in ("interaction_steps", "interventions", "updates")
+                }
+                row |= {name: rollout[name] for name in ("success", "segments", "reward_per_segment", "diverged")}
+                row |= {f"ppo/{name}": value for name, value in update["ppo"].items()}
+                row |= {"steps_per_s": update["steps_per_s"]}
+                rows.append(row | {f"time/{name}": value for name, value in update["time_share"].items()})
+    return rows
+
+
+def segment_rows(groups: Iterable[Group]) -> list[Row]:
+    """Training success by segment since the last scene reset (0 is the first), for every update."""
+    rows = []
+    for group in groups:
+        for run in group.runs:
+            for update in run.updates:
+                for position, (successes, n) in update["rollout"]["success_by_segment"].items():
+                    counters = {"interaction_steps": update["interaction_steps"], "segment": int(position)}
+                    rows.append(_identity(group, run) | counters | rate_columns(Rate(successes, n)))
+    return rows
+
+
+def intervention_rows(groups: Iterable[Group]) -> list[Row]:
+    """Interventions of every run by kind, in all."""
+    rows = []
+    for group in groups:
+        for run in group.runs:
+            last = run.last
+            counters = {name: last[name] for name in ("interaction_steps", "interventions")}
+            rows.append(_identity(group, run) | counters | last["interventions_by_kind"])
+    return rows
+
+
+def speed_rows(groups: Iterable[Group]) -> list[Row]:
+    """Steps per second of every run and where its time went, evaluations and checkpoints left out."""
+    rows = []
+    for group in groups:
+        for run in group.runs:
+            if not run.updates:
+                continue
+            steps = [
+                now["interaction_steps"] - before
+                for before, now in zip(
+                    [0, *(update["interaction_steps"] for update in run.updates)], run.updates, strict=False
+                )
+            ]
+            seconds = [n / update["steps_per_s"] for n, update in zip(steps, run.updates, strict=True)]
+            shares: Row = {}
+            for spent, update in zip(seconds, run.updates, strict=True):
+                for name, share in update["time_share"].items():
+                    shares[name] = shares.get(name, 0.0) + share * spent / sum(seconds)
+            rate = {"steps_per_s": sum(steps) / sum(seconds), "minutes": sum(seconds) / 60}
+            rows.append(_identity(group, run) | rate | {f"{name} share": share for name, share in shares.items()})
+    return rows
+
+
+def _identity(group: Group, run: TrainingRun) -> Row:
+    return {"runs": group.label, "run": run.name, "seed": run.seed}
+
+
+def write_csv(path: Path, rows: list[Row]) -> None:
+    """Write rows that may have different columns; a missing value is an empty cell."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def comparison_text(comparisons: Iterable[Comparison]) -> str:
+    """The before/after table for a terminal, all tasks and each, with n, 95 % intervals and the gain."""
+    header = ("", "before", "after", "gain")
+    lines: list[tuple[str, ...]] = [header]
+    for comparison in comparisons:
+        lines.append((comparison.suite, "", "", ""))
+        for task, gain in {ALL: comparison.overall, **comparison.tasks}.items():
+            lines.append((f"  {task}", str(gain.before), str(gain.after), str(gain)))
+    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
+    )

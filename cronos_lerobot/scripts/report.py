@@ -1,0 +1,94 @@
+"""`cronos-report`: curves, tables and videos of runs, as one HTML page."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from cronos_lerobot.report.page import Report, write_report
+from cronos_lerobot.report.runs import EvaluationRun, find_runs
+from cronos_lerobot.report.tables import comparison_text
+
+EPILOG = """\
+DIR is a run folder of cronos-train, an output folder of lerobot-eval, or any folder above such ones. Runs that
+differ in nothing but the seed are drawn as one line, their mean and standard deviation.
+
+examples:
+  one run while it trains, or after it
+      cronos-report outputs/train/eer
+  episodic against reset-free, three seeds each
+      cronos-report outputs/train/episodic_* outputs/train/eer_* --output=report
+  what a training came to, measured by lerobot-eval on both splits, with videos side by side
+      cronos-report outputs/train/eer --before outputs/eval/base_* --after outputs/eval/eer_*
+
+OUTPUT/index.html contains everything and can be sent as it is; figures (PNG) and tables (CSV) lie beside it.
+"""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The flags of `cronos-report`."""
+    parser = argparse.ArgumentParser(
+        "cronos-report",
+        description=(__doc__ or "").split("`: ")[1].capitalize(),
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+    def add_folders(flag: str, text: str) -> None:
+        parser.add_argument(flag, nargs="+", type=Path, metavar="DIR", default=[], help=text)
+
+    parser.add_argument("runs", nargs="*", type=Path, metavar="DIR", help="folders of runs")
+    add_folders("--before", "lerobot-eval of the policy that the training began with")
+    add_folders("--after", "lerobot-eval of the policy that came out")
+    parser.add_argument("--videos", nargs="+", type=Path, metavar="MP4", default=[], help="more videos to show")
+    parser.add_argument("--output", type=Path, default=Path("report"), help="folder to write (default: report)")
+    parser.add_argument("--title", default="CRONOS report", help="headline of the page")
+    return parser
+
+
+def make_report(
+    runs: list[Path],
+    *,
+    before: list[Path] | None = None,
+    after: list[Path] | None = None,
+    videos: list[Path] | None = None,
+    title: str = "CRONOS report",
+) -> Report:
+    """Read run folders and pair evaluations before with those after.
+
+    Raises:
+        FileNotFoundError: a folder holds no run, or a video is missing.
+    """
+    training, evaluations = find_runs(runs)
+    old, new = _evaluations(before or []), _evaluations(after or [])
+    paired = {run.folder.resolve() for run in old + new}
+    rest = [run for run in evaluations if run.folder.resolve() not in paired]
+    for video in videos or []:
+        if not video.is_file():
+            raise FileNotFoundError(f"No video {video}.")
+    return Report(training, rest, old, new, videos or [], title)
+
+
+def _evaluations(folders: list[Path]) -> list[EvaluationRun]:
+    return find_runs(folders)[1]
+
+
+def main() -> None:
+    """Entry point of `cronos-report`."""
+    parser = make_parser()
+    args = parser.parse_args()
+    if not args.runs + args.before + args.after:
+        parser.error("name at least one run folder; cronos-report --help has examples")
+    try:
+        report = make_report(args.runs, before=args.before, after=args.after, videos=args.videos, title=args.title)
+    except (FileNotFoundError, ValueError) as error:
+        sys.exit(f"error: {error}")
+    page = write_report(report, args.output)
+    if report.comparisons:
+        print(comparison_text(report.comparisons))
+    print(f"Report: {page}")
+
+
+if __name__ == "__main__":
+    main()

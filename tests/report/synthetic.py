@@ -1,0 +1,94 @@
+"""Run folders with made-up numbers, in the formats of cronos-train and lerobot-eval."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from lerobot_env_cronos.scenes import SCENES
+
+from cronos_lerobot.training.evaluation import EvaluationResult
+
+INSTRUCTIONS = [task.instruction for task in SCENES["kitchen_2x2"].tasks]
+STREAMS = 8
+KINDS = ("task_switch", "end_effector_reset", "heuristic_reset", "scene_reset", "divergence", "initial")
+
+
+def write_training_run(folder, *, seed=0, interval=320, successes=(2, 3, 5), updates=8):
+    """A run of `updates` updates of 160 steps; `successes` of 4 episodes a task at each of three evaluations."""
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(seed)
+    lines, n = [], 0
+    lines.append(_counters("evaluation", 0, 0) | _evaluation(successes[0]))
+    for update in range(1, updates + 1):
+        n += 160 * STREAMS
+        segments = {}
+        for position in range(interval // 80):
+            if (update * 2 - 2) % (interval // 80) <= position < (update * 2 - 2) % (interval // 80) + 2:
+                rate = min(0.95, max(0.1, 0.8 - 0.15 * position + 0.02 * update))
+                segments[str(position)] = [int(rng.binomial(STREAMS, rate)), STREAMS]
+        won, tried = np.array(list(segments.values())).sum(0).tolist()
+        resets = STREAMS * (update * 160 // interval)
+        lines.append(
+            _counters("update", n, resets)
+            | {
+                "rollout": {
+                    "success": won / tried,
+                    "segments": tried,
+                    "success_by_segment": segments,
+                    "success_by_task": {INSTRUCTIONS[0]: [won, tried]},
+                    "reward_per_segment": 0.5,
+                    "diverged": 0,
+                },
+                "ppo": {
+                    "approx_kl": 0.01 * update,
+                    "entropy": 3.0 - 0.1 * update,
+                    "explained_variance": None if update == 1 else 0.1 * update,
+                    "clip_fraction": 0.1,
+                    "policy_lr": 3e-5,
+                },
+                "steps_per_s": 500.0 if update % 2 else 1000.0,
+                "time_share": {"env": 0.5, "update": 0.25},
+            }
+        )
+        if update * 2 in (updates, 2 * updates):
+            lines.append(_counters("evaluation", n, resets) | _evaluation(successes[update * 2 // updates]))
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    config = {
+        "seed": seed,
+        "output_dir": str(folder),
+        "num_envs": STREAMS,
+        "protocol": {"scene_reset_interval": interval},
+    }
+    start = {"command": ["cronos-train"], "versions": {"mujoco": "4.0.0"}, "config": config}
+    (folder / "manifest.json").write_text(json.dumps({"starts": [start]}))
+    return folder
+
+
+def _counters(kind, n, resets):
+    kinds = dict.fromkeys(KINDS, 0) | {"scene_reset": resets, "initial": STREAMS}
+    return {"kind": kind, "interaction_steps": n, "interventions": resets, "interventions_by_kind": kinds} | {
+        "updates": n // (160 * STREAMS)
+    }
+
+
+def _evaluation(successes):
+    flags = [i < successes for i in range(8)]
+    return EvaluationResult("train", 0.6, list(range(8)), dict.fromkeys(INSTRUCTIONS, flags)).to_dict()
+
+
+def write_evaluation(folder, suite="independent_train", successes=(1, 2, 3, 4), n=8, video=None):
+    """Output of lerobot-eval: `successes[i]` of `n` episodes of task i, the last ones; `video` is of episode 0."""
+    per_task = []
+    for number, wins in enumerate(successes):
+        paths = []
+        if video:
+            path = Path(folder) / "videos" / f"{suite}_{number}" / "eval_episode_0.mp4"
+            path.parent.mkdir(parents=True)
+            path.write_bytes(video)
+            # lerobot-eval writes the path as it was given --output_dir.
+            paths = [f"elsewhere/{path.relative_to(folder)}"]
+        metrics = {"successes": [i >= n - wins for i in range(n)], "video_paths": paths}
+        per_task.append({"task_group": suite, "task_id": number, "metrics": metrics})
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    (Path(folder) / "eval_info.json").write_text(json.dumps({"per_task": per_task}))
+    return folder

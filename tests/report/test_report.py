@@ -1,0 +1,211 @@
+"""The report's numbers are the runs' numbers, and the intervals those of the books."""
+
+import base64
+import csv
+import json
+import re
+import subprocess
+import sys
+
+import pytest
+from synthetic import INSTRUCTIONS, write_evaluation, write_training_run
+
+from cronos_lerobot.report.page import write_report
+from cronos_lerobot.report.runs import find_runs, group_runs
+from cronos_lerobot.report.series import evaluation_curve, segment_history, segment_rates
+from cronos_lerobot.report.statistics import Gain, Rate, newcombe_interval
+from cronos_lerobot.report.tables import comparison_text, speed_rows
+from cronos_lerobot.scripts.report import make_report
+
+
+def read_csv(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_newcombe_interval_of_the_paper():
+    """Newcombe 1998, Table II, example (a), method 10: 56/70 against 48/80."""
+    low, high = newcombe_interval(before=Rate(48, 80), after=Rate(56, 70))
+    assert (round(low, 4), round(high, 4)) == (0.0524, 0.3339)
+
+
+def test_newcombe_interval_at_the_edge():
+    """0/10 against 10/10 ends at 1 and stays clear of 0."""
+    low, high = newcombe_interval(before=Rate(0, 10), after=Rate(10, 10))
+    # Wilson of 10/10 is [10 / (10 + 1.96^2), 1] = [0.7225, 1], so 1 - sqrt(2) * 0.2775.
+    assert (round(low, 3), high) == (0.608, 1.0)
+
+
+def test_gain_of_nothing_covers_zero():
+    gain = Gain(Rate(30, 64), Rate(30, 64))
+    assert gain.value == 0
+    assert gain.interval[0] < 0 < gain.interval[1]
+    assert gain.interval[0] == pytest.approx(-gain.interval[1])
+
+
+def test_runs_are_found_below_a_folder_once(tmp_path):
+    run = write_training_run(tmp_path / "all/train/a")
+    write_evaluation(tmp_path / "all/eval/held_out", "independent_held_out")
+    training, evaluations = find_runs([tmp_path / "all", run])
+    assert [r.name for r in training] == ["a"]
+    assert [(e.suite, e.overall) for e in evaluations] == [("independent_held_out", Rate(10, 32))]
+    assert evaluations[0].tasks[INSTRUCTIONS[3]] == Rate(4, 8)
+    with pytest.raises(FileNotFoundError, match="nothing"):
+        find_runs([tmp_path / "nothing"])
+
+
+def test_unfinished_last_line_is_skipped(tmp_path):
+    run = write_training_run(tmp_path / "a")
+    with (run / "metrics.jsonl").open("a") as file:
+        file.write('{"kind": "upd')
+    (read,), _ = find_runs([run])
+    assert (len(read.updates), len(read.evaluations)) == (8, 3)
+
+
+def test_groups_differ_in_more_than_the_seed_and_are_called_so(tmp_path):
+    for interval in (160, 320):
+        for seed in (0, 1):
+            write_training_run(tmp_path / f"{interval}_{seed}", seed=seed, interval=interval)
+    groups = group_runs(find_runs([tmp_path])[0])
+    assert [group.label for group in groups] == ["scene_reset_interval=160", "scene_reset_interval=320"]
+    assert [[run.seed for run in group.runs] for group in groups] == [[0, 1], [0, 1]]
+
+
+def test_curve_of_seeds_is_their_mean_and_standard_deviation(tmp_path):
+    write_training_run(tmp_path / "a", seed=0, successes=(2, 4, 6))
+    write_training_run(tmp_path / "b", seed=1, successes=(2, 2, 2))
+    (group,) = group_runs(find_runs([tmp_path])[0])
+    curve = evaluation_curve(group, "interaction_steps")
+    assert curve.x.tolist() == [0, 5120, 10240]
+    assert curve.y.tolist() == [0.25, 0.375, 0.5]
+    # Sample standard deviation of two numbers is their distance over sqrt(2).
+    assert (curve.high - curve.y).tolist() == pytest.approx([0, 0.25 / 2**0.5, 0.5 / 2**0.5])
+    against_resets = evaluation_curve(group, "interventions")
+    assert against_resets.x.tolist() == [0, 16, 32]
+
+
+def test_curve_of_one_run_has_its_wilson_interval(tmp_path):
+    write_training_run(tmp_path / "a", successes=(2, 4, 6))
+    (group,) = group_runs(find_runs([tmp_path])[0])
+    curve = evaluation_curve(group, "interaction_steps")
+    assert curve.low.tolist() == pytest.approx([Rate(8 * k, 32).interval[0] for k in (1, 2, 3)])
+    assert not curve.is_band_over_seeds
+
+
+def test_success_by_segment_of_the_last_part_and_over_the_run(tmp_path):
+    run = write_training_run(tmp_path / "a", interval=320, updates=8)
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    updates = [line["rollout"]["success_by_segment"] for line in lines if line["kind"] == "update"]
+    (group,) = group_runs(find_runs([run])[0])
+    # The last quarter of 8 updates is 2, one whole cycle of 320 steps.
+    expected = {int(k): Rate(*v) for update in updates[-2:] for k, v in update.items()}
+    assert segment_rates(group) == expected
+    assert sorted(expected) == [0, 1, 2, 3]
+    edges, rates = segment_history(group)
+    assert (edges[-1], rates.shape) == (10240, (4, 4))
+    assert rates[2, 1] == updates[3]["2"][0] / updates[3]["2"][1]
+
+
+def test_speed_weighs_updates_by_their_time(tmp_path):
+    run = write_training_run(tmp_path / "a")
+    (row,) = speed_rows(group_runs(find_runs([run])[0]))
+    # As many steps at 500/s as at 1000/s: the harmonic mean.
+    assert row["steps_per_s"] == pytest.approx(2000 / 3)
+    assert row["env share"] == pytest.approx(0.5)
+
+
+@pytest.fixture
+def report_folder(tmp_path):
+    """A report of a training run and evaluations before and after, with its inputs."""
+    write_training_run(tmp_path / "run", successes=(2, 3, 5))
+    write_evaluation(tmp_path / "before", successes=(1, 2, 3, 4), video=b"old video")
+    write_evaluation(tmp_path / "after", successes=(8, 6, 7, 5), video=b"new video")
+    report = make_report([tmp_path / "run"], before=[tmp_path / "before"], after=[tmp_path / "after"])
+    write_report(report, tmp_path / "report")
+    return tmp_path / "report", report
+
+
+def test_page_shows_the_inputs_numbers(report_folder):
+    folder, _ = report_folder
+    page = (folder / "index.html").read_text()
+    # lerobot-eval: 10/32 -> 26/32; the training's own evaluation: 8/32 -> 20/32.
+    assert "31.2 &rarr; 81.2 %" in page
+    assert "n = 32, 32" in page
+    cells = re.findall(r"<td>(.*?)</td>", page)
+    row = cells[cells.index(INSTRUCTIONS[0]) :][:9]
+    assert (row[1], row[3], row[4], row[6], row[7]) == ("0.125", "8", "1.000", "8", "+0.875")
+    assert "scene reset" in page
+    assert "&#34;mujoco&#34;: &#34;4.0.0&#34;" in page
+
+
+def test_page_is_self_contained(report_folder):
+    folder, _ = report_folder
+    page = (folder / "index.html").read_text()
+    sources = re.findall(r'(?:src|href)="(.*?)"', page)
+    assert len(sources) == 5 + 8
+    assert all(source.startswith("data:") for source in sources)
+    videos = [base64.b64decode(s.split(",")[1]) for s in sources if s.startswith("data:video")]
+    assert videos == [b"old video", b"new video"] * 4
+    for name in ("evaluation", "training", "segments", "segment_history", "ppo"):
+        content = base64.b64encode((folder / f"{name}.png").read_bytes()).decode()
+        assert f"data:image/png;base64,{content}" in page
+
+
+def test_csv_files_hold_every_number(report_folder):
+    folder, _ = report_folder
+    gains = {(row["suite"], row["task"]): row for row in read_csv(folder / "gains.csv")}
+    overall = gains["independent_train", "all tasks"]
+    assert (overall["before_successes"], overall["after_successes"], overall["gain"]) == ("10", "26", "0.5")
+    assert len(read_csv(folder / "evaluations.csv")) == 3 * 5
+    updates = read_csv(folder / "updates.csv")
+    assert [float(row["ppo/approx_kl"]) for row in updates] == [0.01 * i for i in range(1, 9)]
+    assert updates[0]["ppo/explained_variance"] == ""
+    assert sum(int(row["n"]) for row in read_csv(folder / "segments.csv")) == 8 * 16
+    (interventions,) = read_csv(folder / "interventions.csv")
+    assert (interventions["scene_reset"], interventions["initial"]) == ("32", "8")
+
+
+@pytest.mark.parametrize("intervals", [(160,), (160, 320), (160, 320, 640)])
+def test_groups_of_any_number_are_drawn(tmp_path, intervals):
+    for interval in intervals:
+        write_training_run(tmp_path / f"runs/{interval}", interval=interval)
+    page = write_report(make_report([tmp_path / "runs"]), tmp_path / "report").read_text()
+    assert page.count("<img") == 5
+
+
+def test_run_without_evaluations_or_finished_updates(tmp_path):
+    run = write_training_run(tmp_path / "run")
+    lines = (run / "metrics.jsonl").read_text().splitlines()
+    (run / "metrics.jsonl").write_text("\n".join(line for line in lines if '"update"' in line))
+    page = write_report(make_report([run]), tmp_path / "no_evaluation").read_text()
+    assert page.count("<img") == 4
+    (run / "metrics.jsonl").write_text(lines[0])
+    page = write_report(make_report([run]), tmp_path / "no_update").read_text()
+    assert page.count("<img") == 1
+
+
+def test_terminal_table_has_n_and_intervals(report_folder):
+    _, report = report_folder
+    lines = comparison_text(report.comparisons).splitlines()
+    assert lines[0].split() == ["before", "after", "gain"]
+    total = next(line for line in lines if "all tasks" in line)
+    assert "0.312 [0.180, 0.486] n=32" in total
+    assert "+0.500 [+0.260, +0.666]" in total
+
+
+def test_large_videos_are_linked(tmp_path, monkeypatch):
+    monkeypatch.setattr("cronos_lerobot.report.clips.MAX_CLIP_BYTES", 4)
+    write_evaluation(tmp_path / "eval", video=b"large")
+    page = write_report(make_report([tmp_path / "eval"]), tmp_path / "report").read_text()
+    assert 'href="../eval/videos/independent_train_0/eval_episode_0.mp4"' in page
+    assert "data:video" not in page
+
+
+def test_command_line(tmp_path):
+    write_training_run(tmp_path / "run")
+    command = [sys.executable, "-m", "cronos_lerobot.scripts.report", str(tmp_path / "run")]
+    done = subprocess.run([*command, f"--output={tmp_path / 'out'}"], capture_output=True, text=True, check=True)
+    assert f"Report: {tmp_path / 'out' / 'index.html'}" in done.stdout
+    wrong = subprocess.run([*command[:-1], str(tmp_path / "no")], capture_output=True, text=True, check=False)
+    assert wrong.returncode != 0
+    assert "metrics.jsonl" in wrong.stderr
