@@ -1,0 +1,1 @@
+"""CRONOS for LeRobot: reset-free multi-task reinforcement learning of robot policies."""

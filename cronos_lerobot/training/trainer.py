@@ -25,41 +25,6 @@ from cronos_lerobot.training.recording import StreamObserver
 from cronos_lerobot.training.seeding import NamedGenerators
 
 
-class TimedEnv:
-    """The streams' environment, with the time spent in it on a stopwatch.
-
-    An env that keeps a dict `seconds` of its own (physics, render) is reported in that detail.
-    """
-
-    def __init__(self, env: Any, stopwatch: Stopwatch) -> None:
-        self._env = env
-        self._stopwatch = stopwatch
-
-    def __getattr__(self, name: str) -> Any:
-        """Pass on everything that is not timed."""
-        return getattr(self._env, name)
-
-    def step(self, actions: np.ndarray) -> tuple:
-        """Step the environment."""
-        with self._stopwatch("env"):
-            return self._env.step(actions)
-
-    def observe(self) -> dict[str, Any]:
-        """Observe, as after an intervention."""
-        with self._stopwatch("env"):
-            return self._env.observe()
-
-    def scene_reset(self, *args: Any, **kwargs: Any) -> None:
-        """Reset scenes."""
-        with self._stopwatch("reset"):
-            self._env.scene_reset(*args, **kwargs)
-
-    def end_effector_reset(self, ids: np.ndarray) -> None:
-        """Send arms home."""
-        with self._stopwatch("reset"):
-            self._env.end_effector_reset(ids)
-
-
 class Trainer:
     """One training run.
 
@@ -88,7 +53,8 @@ class Trainer:
         assert isinstance(config.algorithm, PPOConfig)
         self.config = config
         self.stopwatch = Stopwatch()
-        self.env = TimedEnv(env, self.stopwatch)
+        self.env = env
+        env.timer = self.stopwatch
         self.tasks = list(env.scene.tasks)
         self._make_eval_env = make_eval_env
         self._eval_env: Any = None

@@ -36,7 +36,7 @@ def test_splits_have_64_configurations_and_share_none(scene):
 
 
 def test_unknown_split_names_the_valid_ones():
-    with pytest.raises(ValueError, match="'test'.*train.*held_out"):
+    with pytest.raises(ValueError, match=r"'test'.*train.*held_out"):
         load_configurations("kitchen_2x2", "test")
 
 

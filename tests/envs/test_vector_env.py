@@ -33,7 +33,7 @@ def hold_bottle(env: CronosVectorEnv) -> None:
     p, _ = env.simulation.end_effector()
     everyone = np.arange(env.num_envs)
     pose = np.tile([0, 0, 0, np.sqrt(0.5), 0, 0, np.sqrt(0.5)], (env.num_envs, 1))
-    pose[:, :3] = p + [0, 0, -0.015]
+    pose[:, :3] = p + np.array([0, 0, -0.015])
     env.simulation.move_body(everyone, BOTTLE, pose)
     for _ in range(4):
         env.step(np.tile([0, 0, 0, 0, 0, 0, 0.0], (env.num_envs, 1)))

@@ -4,7 +4,8 @@ It never resets itself and never emits `terminated` or `truncated`: in reset-fre
 an event of the training loop. `lerobot_env_cronos.episodic` adds episodes for evaluation.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import gymnasium as gym
@@ -37,6 +38,10 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             4); `difference` pays the change of that level between two steps (RL4VLA's code).
         num_threads: physics threads, 0 for all cores; results do not depend on it.
         render_size: (height, width) of `render()` [px].
+
+    Attributes:
+        timer: called with `physics`, `observe` or `reset`, returns the context in which that work is done; a
+            training run hangs its stopwatch here.
     """
 
     metadata = {  # noqa: RUF012 - Gymnasium declares it this way
@@ -66,6 +71,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             raise ValueError(f"unknown reward {reward!r}; valid rewards: {list(REWARDS)}")
         self.scene = get_scene(scene)
         self.num_envs = num_envs
+        self.timer: Callable[[str], AbstractContextManager] = lambda name: nullcontext()
         self.reward = reward
         self.simulation = Simulation(self.scene, num_envs, num_threads)
         self._observations = ObservationBuilder(
@@ -122,15 +128,17 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         if bad.any():
             raise ValueError(f"actions of environments {ids[bad].tolist()} are not finite: {actions[ids[bad]]}")
         diverged = np.zeros(self.num_envs, dtype=bool)
-        diverged[ids] = self.simulation.step(np.clip(actions[ids], ACTION_LOW, ACTION_HIGH), ids)
         before = self._level.copy()
-        self._judge(ids)
+        with self.timer("physics"):
+            diverged[ids] = self.simulation.step(np.clip(actions[ids], ACTION_LOW, ACTION_HIGH), ids)
+            self._judge(ids)
         reward = self._level - before if self.reward == "difference" else self._level.copy()
         return reward, diverged
 
     def observe(self) -> dict[str, Any]:
         """The observation now, under the current tasks."""
-        return self._observations.observe()
+        with self.timer("observe"):
+            return self._observations.observe()
 
     def _info(self) -> dict[str, np.ndarray]:
         return {"is_success": self.is_success.copy(), "is_grasped": self.is_grasped.copy()}
@@ -155,14 +163,16 @@ class CronosVectorEnv(gym.vector.VectorEnv):
     def place_bodies(self, ids: np.ndarray, poses: np.ndarray) -> None:
         """Put every body of streams `ids` at `poses` (k, bodies, 7), and the arm home."""
         ids = np.asarray(ids)
-        self.simulation.place(ids, poses)
-        self._judge(ids)
+        with self.timer("reset"):
+            self.simulation.place(ids, poses)
+            self._judge(ids)
 
     def end_effector_reset(self, ids: np.ndarray) -> None:
         """Put the arm of streams `ids` home, gripper open; bodies stay (a held one drops and settles)."""
         ids = np.asarray(ids)
-        self.simulation.send_arm_home(ids)
-        self._judge(ids)
+        with self.timer("reset"):
+            self.simulation.send_arm_home(ids)
+            self._judge(ids)
 
     def put_back(self, stream: int, body: str, rng: np.random.Generator) -> None:
         """Put one body of a stream at a free place of the spawn area, drawn from `rng`."""

@@ -1,0 +1,162 @@
+"""Steps per second of everything a training run pays for, from one process on one machine.
+
+    python -m cronos_lerobot.benchmark [--num_envs 64] [--seconds 8] [--skip train]
+
+Ratios against the pure-physics bound of the same run compare across machines; absolute numbers do not.
+"""
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from lerobot_env_cronos import CronosVectorEnv, get_scene
+from lerobot_env_cronos.expert import ScriptedExpert
+from lerobot_env_cronos.simulation import Simulation
+
+PARTS = ("physics", "state", "pixels", "expert", "train")
+
+
+def rate(step: Callable[[], int], seconds: float) -> float:
+    """Units per second of `step`, which returns how many units it did; the first call is not timed."""
+    step()
+    start, done = time.perf_counter(), 0
+    while (elapsed := time.perf_counter() - start) < seconds:
+        done += step()
+    return done / elapsed
+
+
+def recorded_actions(num_envs: int, scene: str, steps: int = 80) -> tuple[np.ndarray, np.ndarray]:
+    """Expert actions (steps, n, 7) for the training cycle, and the poses (n, bodies, 7) they start from."""
+    env = CronosVectorEnv(num_envs, scene, obs_type="environment_state_agent_pos")
+    env.reset(seed=0)
+    env.set_task(np.arange(num_envs), [env.scene.tasks[i % len(env.scene.tasks)] for i in range(num_envs)])
+    poses = env.simulation.body_poses().copy()
+    expert = ScriptedExpert(env)
+    expert.reset(np.arange(num_envs))
+    actions = []
+    for _ in range(steps):
+        actions.append(expert.act())
+        env.step(actions[-1])
+    return np.stack(actions), poses
+
+
+def physics_rate(num_envs: int, scene: str, seconds: float) -> float:
+    """Control steps per second of the simulation alone: no observation, no reward."""
+    actions, poses = recorded_actions(num_envs, scene)
+    simulation = Simulation(get_scene(scene), num_envs)
+    ids = np.arange(num_envs)
+
+    def segment() -> int:
+        simulation.place(ids, poses)
+        for a in actions:
+            simulation.step(a, ids)
+        return num_envs * len(actions)
+
+    return rate(segment, seconds)
+
+
+def env_rate(num_envs: int, scene: str, obs_type: str, seconds: float) -> float:
+    """Control steps per second of the environment, observation and reward included."""
+    actions, poses = recorded_actions(num_envs, scene)
+    env = CronosVectorEnv(num_envs, scene, obs_type=obs_type)
+    ids = np.arange(num_envs)
+
+    def segment() -> int:
+        env.place_bodies(ids, poses)
+        for a in actions:
+            env.step(a)
+        return num_envs * len(actions)
+
+    try:
+        return rate(segment, seconds)
+    finally:
+        env.close()
+
+
+def expert_rate(num_envs: int, scene: str, seconds: float) -> float:
+    """Control steps per second that the scripted expert can decide."""
+    env = CronosVectorEnv(num_envs, scene, obs_type="environment_state_agent_pos")
+    env.reset(seed=0)
+    expert = ScriptedExpert(env)
+
+    def step() -> int:
+        expert.act()
+        return num_envs
+
+    return rate(step, seconds)
+
+
+def train_rate(num_envs: int, scene: str, record_streams: str, updates: int = 3) -> dict[str, float]:
+    """Interaction steps per second of `cronos-train` on pixels, and the shares of its time, by update mean."""
+    from lerobot.policies import make_policy_config
+
+    from cronos_lerobot.protocol import ProtocolConfig
+    from cronos_lerobot.scripts.train import run
+    from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
+
+    with tempfile.TemporaryDirectory() as folder:
+        config = CronosTrainConfig(
+            env=_env_config(scene),
+            policy=make_policy_config("pocketvla", device="cpu", push_to_hub=False),
+            output_dir=Path(folder) / "run",
+            steps=updates * 160 * num_envs,
+            num_envs=num_envs,
+            protocol=ProtocolConfig(),
+            record=RecordConfig(repo_id="benchmark/streams", streams=record_streams)
+            if record_streams != "0"
+            else RecordConfig(),
+            eval_freq=0,
+            save_checkpoint=False,
+            tensorboard=False,
+        )
+        run(config)
+        lines = [json.loads(line) for line in (Path(folder) / "run/metrics.jsonl").read_text().splitlines()]
+    # The first update pays for what is built lazily.
+    rows = [line for line in lines if line["kind"] == "update"][1:]
+    shares = {
+        f"share {k}": float(np.mean([row["time_share"].get(k, 0) for row in rows])) for k in rows[0]["time_share"]
+    }
+    return {"steps/s": float(np.mean([row["steps_per_s"] for row in rows]))} | shares
+
+
+def _env_config(scene: str):
+    from lerobot_env_cronos import CronosEnvConfig
+
+    return CronosEnvConfig(scene=scene, privileged_state=True)
+
+
+def main() -> None:
+    """Print one line per part."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", default="kitchen_2x2")
+    parser.add_argument("--num_envs", type=int, default=64)
+    parser.add_argument("--seconds", type=float, default=8.0, help="time spent on each part [s]")
+    parser.add_argument("--skip", nargs="*", default=[], choices=PARTS)
+    parser.add_argument(
+        "--record_streams", nargs="*", default=["0", "1", "all"], help="streams recorded in `train`"
+    )
+    args = parser.parse_args()
+    print(f"{args.num_envs} streams of {args.scene}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
+    bound = physics_rate(args.num_envs, args.scene, args.seconds)
+    print(f"{'pure physics (bound)':28s} {bound:8.0f} steps/s  1.00")
+    for name, obs_type in (("state", "environment_state_agent_pos"), ("pixels", "pixels_agent_pos")):
+        if name not in args.skip:
+            speed = env_rate(args.num_envs, args.scene, obs_type, args.seconds)
+            print(f"{'environment, ' + name:28s} {speed:8.0f} steps/s  {speed / bound:.2f}")
+    if "expert" not in args.skip:
+        speed = expert_rate(args.num_envs, args.scene, args.seconds)
+        print(f"{'scripted expert':28s} {speed:8.0f} steps/s  {speed / bound:.2f}")
+    for streams in [] if "train" in args.skip else args.record_streams:
+        result = train_rate(args.num_envs, args.scene, streams)
+        shares = ", ".join(f"{k[6:]} {v:.0%}" for k, v in result.items() if k.startswith("share"))
+        name = f"cronos-train, recording {streams}"
+        print(f"{name:28s} {result['steps/s']:8.0f} steps/s  {result['steps/s'] / bound:.2f}  ({shares})")
+
+
+if __name__ == "__main__":
+    main()
