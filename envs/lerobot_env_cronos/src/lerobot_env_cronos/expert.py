@@ -4,6 +4,8 @@ It looks at the state at every step and derives what to do from it, so that it r
 slip or a perturbed action. It remembers only which grasp and which free spot it chose.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from lerobot_env_cronos.body_boxes import SceneBoxes, WorldBoxes
@@ -34,6 +36,8 @@ YAW_TO_METRES = 0.04
 """A yaw error of 1 rad counts like this horizontal error [m]."""
 GRASP_REACHED = 0.008
 """The fingers close when the hand is this close above the grasp [m]."""
+EMPTY_OPENING = 0.06
+"""Gripper opening below which there is nothing between the fingers."""
 DROP_HEIGHT = 0.003
 """Gap under the object when the hand lets go; more than 12 mm topples objects [m]."""
 RETREAT_HEIGHT = 0.13
@@ -42,6 +46,17 @@ NUM_FAILED, MAX_VAIN_STEPS = 3, 5
 """Failed grasps that are remembered, and steps at a grasp after which it has failed."""
 STALE_DISTANCE, STALE_ANGLE = 0.015, 0.2
 """An object or receptacle that moved further than this is looked at again [m, rad]."""
+
+
+class Command(NamedTuple):
+    """What the hands of n streams should do."""
+
+    position: np.ndarray
+    """(n, 3) where the end effector should go [m]."""
+    closing: np.ndarray
+    """(n, 3) the horizontal direction that its closing axis should have."""
+    gripper: np.ndarray
+    """(n, 1) OPEN or CLOSE."""
 
 
 class ScriptedExpert:
@@ -80,13 +95,11 @@ class ScriptedExpert:
         self._update_goals()
         self._update_grasps()
         self._update_places()
-        position, closing, gripper = self._pick()
-        for values in (self._place(), self._finish()):
-            mask = values[0]
-            position = np.where(mask[:, None], values[1], position)
-            closing = np.where(mask[:, None], values[2], closing)
-            gripper = np.where(mask, values[3], gripper)
-        return self._action(position, closing, gripper)
+        command = self._pick()
+        for applies, other in ((self._holding, self._place()), (self._success, self._finish())):
+            mask = applies[:, None]
+            command = Command(*(np.where(mask, theirs, ours) for theirs, ours in zip(other, command)))
+        return self._action(command)
 
     # Perception -------------------------------------------------------------------------------------------
 
@@ -151,7 +164,7 @@ class ScriptedExpert:
         """Choose a free spot for what is newly held, or where the receptacle has moved since."""
         self._place_known &= self._holding
         receptacle = self._goal[:, 1]
-        xy = self._poses[np.arange(len(xy_ids := receptacle)), np.maximum(xy_ids, 0), :2]
+        xy = self._poses[np.arange(len(receptacle)), np.maximum(receptacle, 0), :2]
         moved = (receptacle >= 0) & (np.linalg.norm(xy - self._place_anchor, axis=1) > STALE_DISTANCE)
         wanted = self._holding & (moved | ~self._place_known)
         for obj, target in np.unique(self._goal[wanted], axis=0):
@@ -169,8 +182,8 @@ class ScriptedExpert:
 
     # Decisions --------------------------------------------------------------------------------------------
 
-    def _pick(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Hover, align, descend and close: goal position, closing axis and gripper command."""
+    def _pick(self) -> Command:
+        """Hover, align, descend and close."""
         point = self._object[:, :3] + np.einsum("nij,nj->ni", self._object_R, self._grasp_point)
         closing = _horizontal(np.einsum("nij,nj->ni", self._object_R, self._grasp_axis))
         grasp = point + np.array([0, 0, PAD_BELOW_EE])
@@ -178,21 +191,25 @@ class ScriptedExpert:
         grasp[:, 2] = np.maximum(grasp[:, 2], lowest)
         error = self._misalignment(grasp, closing)
         low = self._p[:, 2] - grasp[:, 2]
-        there = (error < ALIGNED + 0.004) & (low < GRASP_REACHED)
-        missed = there & (self._opening < 0.06)
-        # Nothing between the fingers, or the hand is kept from getting there, or what it holds stays put.
-        vain = (error < ALIGNED + 0.004) & (self._target_p[:, 2] - grasp[:, 2] < GRASP_REACHED)
-        self._vain = np.where(vain & ~self._holding & ~self._success, self._vain + 1, 0)
-        slipped = self._was_holding & ~self._holding & ~self._success & (self._opening < 0.06)
+        aligned = error < ALIGNED + 0.004
+        empty = self._opening < EMPTY_OPENING
+        missed = aligned & (low < GRASP_REACHED) & empty
+        close = aligned & (low < GRASP_REACHED) & ~empty
+        self._notice_failures(missed, empty, aligned & (self._target_p[:, 2] - grasp[:, 2] < GRASP_REACHED))
+        # Fingers that are still opening do not go down on the object.
+        still_opening = np.where(close, 0.0, 0.05 * np.clip(0.9 - self._opening, 0.0, 0.5) / 0.5)
+        gripper = np.where(close, CLOSE, OPEN)[:, None]
+        return Command(self._funnel(grasp, error, still_opening), closing, gripper)
+
+    def _notice_failures(self, missed: np.ndarray, empty: np.ndarray, there: np.ndarray) -> None:
+        """Give up grasps that closed on nothing, let the object slip, or cannot be reached (n,) bool."""
+        trying = ~self._holding & ~self._success
+        self._vain = np.where(there & trying, self._vain + 1, 0)
+        slipped = self._was_holding & trying & empty
         self._was_holding = self._holding.copy()
         self._give_up(missed & ~self._holding | slipped | (self._vain > MAX_VAIN_STEPS))
-        gripper = np.where(there & ~missed, CLOSE, OPEN)
-        # Fingers that are still opening do not go down on the object.
-        opening = np.where(there & ~missed, 0.0, 0.05 * np.clip(0.9 - self._opening, 0.0, 0.5) / 0.5)
-        position = self._funnel(grasp, error, opening)
-        return position, closing, gripper
 
-    def _place(self) -> tuple[np.ndarray, ...]:
+    def _place(self) -> Command:
         """Lift, carry above the free spot, lower and let go."""
         i = np.arange(len(self._p))
         receptacle = self._goal[:, 1]
@@ -213,16 +230,16 @@ class ScriptedExpert:
         # The target is down but the hand is not: the object rests on something.
         rests = (self._target_p[:, 2] - position[:, 2] < 0.004) & (self._p[:, 2] - self._target_p[:, 2] > 0.005)
         release = (error < ALIGNED + 0.006) & ((low < 0.006) | rests)
-        gripper = np.where(release, OPEN, CLOSE)
-        return self._holding, self._funnel(position, error, np.zeros(len(i))), closing, gripper
+        gripper = np.where(release, OPEN, CLOSE)[:, None]
+        return Command(self._funnel(position, error, np.zeros(len(i))), closing, gripper)
 
-    def _finish(self) -> tuple[np.ndarray, ...]:
+    def _finish(self) -> Command:
         """The task is complete: open, go straight up and wait."""
         position = self._target_p.copy()
         opened = self._opening > 0.5
         height = np.maximum(self._target_p[:, 2], RETREAT_HEIGHT)
         position[:, 2] = np.where(opened, height, position[:, 2])
-        return self._success, position, self._target_R[:, :, 1], np.full(len(position), OPEN)
+        return Command(position, self._target_R[:, :, 1], np.full((len(position), 1), OPEN))
 
     def _misalignment(self, goal: np.ndarray, closing: np.ndarray) -> np.ndarray:
         """Horizontal error (n,) of the hand, a yaw error counting as metres [m]."""
@@ -253,15 +270,16 @@ class ScriptedExpert:
             bottom[mine] = np.einsum("ni,pi->np", self._object_R[mine, 2], corners).min(1)
         return bottom + self._object[:, 2]
 
-    def _action(self, position: np.ndarray, closing: np.ndarray, gripper: np.ndarray) -> np.ndarray:
-        closing = _horizontal(closing)
+    def _action(self, command: Command) -> np.ndarray:
+        """Steps (n, 7) of the target pose towards the command, the hand pointing down, within bounds."""
+        closing = _horizontal(command.closing)
         zeros = np.zeros(len(closing))
         down = np.stack([zeros, zeros, zeros - 1], 1)
         across = np.stack([closing[:, 1], -closing[:, 0], zeros], 1)
         goal_R = np.stack([down, closing, across], 2)
         turn = matrix_to_rotation_vector(goal_R @ self._target_R.transpose(0, 2, 1))
         turn[:, 2] = self._away_from_wrist_limit(turn[:, 2])
-        action = np.concatenate([position - self._target_p, turn, gripper[:, None]], 1)
+        action = np.concatenate([command.position - self._target_p, turn, command.gripper], 1)
         return np.clip(action, ACTION_LOW, ACTION_HIGH)
 
     def _away_from_wrist_limit(self, turn: np.ndarray) -> np.ndarray:
