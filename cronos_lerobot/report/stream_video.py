@@ -1,0 +1,247 @@
+"""Films one reset-free stream of a policy, or of the scripted expert, as MP4 and GIF.
+
+    python -m cronos_lerobot.report.stream_video --policy.path=<checkpoint> --output=stream.mp4 --gif=stream.gif
+
+The stream is that of training (Algorithm 1 of the paper), without the learning: the task switches every 80
+steps, the arm goes home at each switch, and the scene is reset every `--scene_reset_interval` steps or never.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig, RGBEncoderConfig
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.utils.constants import OBS_ENV_STATE
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.random_utils import set_seed
+from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
+from lerobot_env_cronos.expert import ScriptedExpert
+from PIL import Image
+from tqdm import tqdm
+
+from cronos_lerobot.data.schema import Intervention, observation_columns
+from cronos_lerobot.data.video import VideoFile
+from cronos_lerobot.loop_state import LoopState, SegmentEnd, Step
+from cronos_lerobot.protocol import ProtocolConfig
+from cronos_lerobot.report.overlay import Status, draw_status
+from cronos_lerobot.resets import make_resets
+from cronos_lerobot.rf_mtrl import rf_mtrl
+from cronos_lerobot.rl.policy import ActionSample
+from cronos_lerobot.rl.processing import PolicyProcessors, make_processors
+from cronos_lerobot.task_orders import make_task_order
+
+EXPERT = "expert"
+NOTICE_STEPS = 8
+"""Control steps for which an intervention stays announced."""
+GIF_SIZE = (320, 240)
+GIF_FPS = 10
+MAX_GIF_BYTES = 1_500_000
+GIF_QUALITIES = ((2, 128), (2, 64), (3, 64), (4, 48), (6, 32), (8, 32), (12, 24))
+"""(every how many-th control step, colours), tried in this order until the file is small enough."""
+
+
+class Spectator:
+    """An agent of Algorithm 1 that acts and never learns."""
+
+    def begin_segment(self) -> None:
+        """A new task begins."""
+
+    def choose(self, o_t: dict[str, Any], tau: list[str]) -> np.ndarray:
+        """Actions (n, 7) in physical units."""
+        raise NotImplementedError
+
+    def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
+        """See `Agent`."""
+        action = self.choose(o_t, tau)
+        zeros = np.zeros(len(action), np.float32)
+        return ActionSample(action, np.zeros(action.shape, np.int64), zeros, zeros)
+
+    def store(
+        self,
+        o_t: dict[str, Any],
+        tau: list[str],
+        a_t: ActionSample,
+        r_t: np.ndarray,
+        o_tp1: dict[str, Any],
+        cut_t: np.ndarray,
+        diverged_t: np.ndarray,
+    ) -> None:
+        """Keep nothing."""
+
+    def update(self) -> dict[str, float]:
+        """Learn nothing."""
+        return {}
+
+
+class ExpertSpectator(Spectator):
+    """The scripted expert."""
+
+    def __init__(self, env: CronosVectorEnv) -> None:
+        self._expert, self._everyone = ScriptedExpert(env), np.arange(env.num_envs)
+
+    def begin_segment(self) -> None:
+        """Look at the scene anew."""
+        self._expert.reset(self._everyone)
+
+    def choose(self, o_t: dict[str, Any], tau: list[str]) -> np.ndarray:
+        """What the expert does in the env's state as it is now."""
+        return self._expert.act()
+
+
+class PolicySpectator(Spectator):
+    """Any LeRobot policy, at its own sampling temperature."""
+
+    def __init__(self, policy: Any, processors: PolicyProcessors) -> None:
+        self._policy, self._processors = policy.eval(), processors
+
+    def begin_segment(self) -> None:
+        """Forget action chunks and the like."""
+        self._policy.reset()
+
+    @torch.inference_mode()
+    def choose(self, o_t: dict[str, Any], tau: list[str]) -> np.ndarray:
+        """The policy's actions."""
+        batch = self._processors.batch(observation_columns(o_t), tau)
+        return self._processors.physical_actions(self._policy.select_action(batch))
+
+
+def film_stream(
+    env: CronosVectorEnv, agent: Spectator, protocol: ProtocolConfig, num_segments: int, seed: int = 0
+) -> Iterator[np.ndarray]:
+    """Yield a frame (H, W, 3) uint8 after every control step of stream 0, with the overlay.
+
+    Args:
+        env: one stream; its `render_size` is the frames'.
+        agent: acts in it.
+        protocol: task switches and resets; nothing is learned.
+        num_segments: how long.
+        seed: draws the first configuration, those of scene resets, and a random task order.
+    """
+    rng = np.random.default_rng(seed)
+    loop = LoopState(env.num_envs, len(env.scene.tasks))
+    total_steps = num_segments * protocol.task_switch_interval * env.num_envs
+    events = rf_mtrl(
+        env, env.scene.tasks, agent, make_task_order(protocol.task_order, rng), make_resets(protocol, rng),
+        protocol, loop, total_steps,
+    )  # fmt: skip
+    status = Status("", 0, num_segments, succeeded=False, interventions=0)
+    noticed = -NOTICE_STEPS
+    agent.begin_segment()
+    for event in events:
+        if isinstance(event, Step):
+            if event.preceded_by[0] != Intervention.NONE:
+                status.notice, noticed = Intervention(event.preceded_by[0]), event.t
+            elif event.t - noticed >= NOTICE_STEPS:
+                status.notice = Intervention.NONE
+            status.instruction = event.instructions[0]
+            status.interventions = int(event.interventions[0])
+            status.succeeded |= bool(event.success[0])
+            yield draw_status(env.render_streams(np.array([0]))[0], status)
+        elif isinstance(event, SegmentEnd):
+            outcomes = [*status.outcomes, bool(event.success[0])]
+            status = dataclasses.replace(status, segment=status.segment + 1, succeeded=False, outcomes=outcomes)
+            agent.begin_segment()
+
+
+def make_spectator(policy_path: str, device: str = "cpu") -> tuple[CronosEnvConfig, Any]:
+    """Load a policy; returns an env config with what it observes, and a function from an env to its agent."""
+    policy_config = PreTrainedConfig.from_pretrained(policy_path)
+    policy_config.pretrained_path, policy_config.device = Path(policy_path), device
+    sees_pixels = bool(policy_config.image_features)
+    env_config = CronosEnvConfig(
+        obs_type="pixels_agent_pos" if sees_pixels else "environment_state_agent_pos",
+        privileged_state=sees_pixels and OBS_ENV_STATE in (policy_config.input_features or {}),
+    )
+    policy = make_policy(policy_config, env_cfg=env_config)
+    processors = make_pre_post_processors(
+        policy_config, policy_path, preprocessor_overrides={"device_processor": {"device": device}}
+    )
+    return env_config, PolicySpectator(policy, make_processors(policy, *processors))
+
+
+def write_mp4(path: Path, frames: list[np.ndarray], fps: int) -> None:
+    """Encode frames (H, W, 3) uint8 as h264 that every browser plays."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    encoder = RGBEncoderConfig(vcodec="h264", preset="medium", g=10 * fps, crf=28)
+    with VideoFile(path, fps, *frames[0].shape[:2], encoder) as video:
+        video.append(np.stack(frames))
+
+
+def write_gif(path: Path, frames: list[np.ndarray], max_bytes: int = MAX_GIF_BYTES) -> int:
+    """Write a sped-up GIF of at most `max_bytes`, if the coarsest setting allows; returns its size [bytes]."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for stride, colors in GIF_QUALITIES:
+        images = [Image.fromarray(frame).resize(GIF_SIZE, Image.Resampling.LANCZOS) for frame in frames[::stride]]
+        # One palette for all frames, and no dithering, so that what stands still costs nothing.
+        sheet = Image.new("RGB", (GIF_SIZE[0], GIF_SIZE[1] * 8))
+        for i, number in enumerate(np.linspace(0, len(images) - 1, 8).astype(int)):
+            sheet.paste(images[number], (0, i * GIF_SIZE[1]))
+        palette = sheet.quantize(colors, method=Image.Quantize.MEDIANCUT)
+        small = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+        small[0].save(
+            path, save_all=True, append_images=small[1:], duration=1000 // GIF_FPS, loop=0, optimize=True
+        )
+        if path.stat().st_size <= max_bytes:
+            break
+    return path.stat().st_size
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The flags of this command."""
+    description = (__doc__ or "").splitlines()[0]
+    parser = argparse.ArgumentParser(description=description, allow_abbrev=False)
+    who = parser.add_mutually_exclusive_group(required=True)
+    who.add_argument("--policy.path", dest="policy_path", metavar="PATH", help="checkpoint or Hub id of a policy")
+    who.add_argument("--policy", choices=[EXPERT], help="the scripted expert")
+    parser.add_argument("--policy.device", dest="device", default="cpu")
+    parser.add_argument("--scene", default="kitchen_2x2")
+    parser.add_argument("--segments", type=int, default=8, help="length of the stream, 80 steps each (default: 8)")
+    parser.add_argument(
+        "--scene_reset_interval", type=int, help="control steps between scene resets; never if absent"
+    )
+    parser.add_argument("--task_order", default="heuristic", help="heuristic or random")
+    parser.add_argument("--no_end_effector_reset", action="store_true", help="leave the arm where it is")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path, default=Path("stream.mp4"), help="the MP4 (default: stream.mp4)")
+    parser.add_argument("--fps", type=int, default=20, help="frames per second; 5 is real time (default: 20)")
+    parser.add_argument("--gif", type=Path, help="also write a small GIF of the first segments")
+    parser.add_argument("--gif_segments", type=int, default=4, help="how many segments (default: 4)")
+    return parser
+
+
+def main() -> None:
+    """Film a stream as the command line says."""
+    args = make_parser().parse_args()
+    register_third_party_plugins()
+    set_seed(args.seed)
+    protocol = ProtocolConfig(
+        scene_reset_interval=args.scene_reset_interval,
+        end_effector_reset=not args.no_end_effector_reset,
+        task_order=args.task_order,
+    )
+    config, agent = CronosEnvConfig(obs_type="environment_state_agent_pos"), None
+    if args.policy_path:
+        config, agent = make_spectator(args.policy_path, args.device)
+    env = CronosVectorEnv(1, args.scene, **config.gym_kwargs)
+    try:
+        stream = film_stream(env, agent or ExpertSpectator(env), protocol, args.segments, args.seed)
+        total = args.segments * protocol.task_switch_interval
+        frames = list(tqdm(stream, total=total, unit="frame", desc="filming"))
+    finally:
+        env.close()
+    write_mp4(args.output, frames, args.fps)
+    print(f"{args.output}: {len(frames)} frames, {args.output.stat().st_size / 1e6:.1f} MB")
+    if args.gif:
+        size = write_gif(args.gif, frames[: args.gif_segments * protocol.task_switch_interval])
+        print(f"{args.gif}: {size / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    main()

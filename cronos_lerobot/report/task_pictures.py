@@ -1,0 +1,75 @@
+"""Draws every task of a scene, one picture each with its instruction and both cameras, onto one sheet.
+
+python -m cronos_lerobot.report.task_pictures --scene=kitchen_2x2
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos.scenes import SCENES
+from PIL import Image, ImageDraw, ImageFont
+
+CAMERAS = ("front", "bridge")
+PICTURE = (320, 240)
+"""Width and height of one camera's picture on the sheet [px]; rendered at twice that."""
+CAPTION, GAP, COLUMNS = 34, 14, 2
+
+
+def render_tasks(scene: str, split: str = "train") -> list[tuple[str, list[np.ndarray]]]:
+    """Return (instruction, one frame (480, 640, 3) uint8 per camera) of every task's start.
+
+    Task i is shown from configuration i of the split, so that the sheet also shows how scenes differ.
+    """
+    tasks = SCENES[scene].tasks
+    width, height = 2 * PICTURE[0], 2 * PICTURE[1]
+    env = CronosVectorEnv(
+        len(tasks), scene, observation_height=height, observation_width=width, camera_name=",".join(CAMERAS)
+    )
+    try:
+        everyone = np.arange(len(tasks))
+        env.scene_reset(everyone, everyone, split)
+        env.set_task(everyone, tasks)
+        pixels = env.observe()["pixels"]
+        return [(task.instruction, [pixels[camera][i] for camera in CAMERAS]) for i, task in enumerate(tasks)]
+    finally:
+        env.close()
+
+
+def draw_sheet(pictures: list[tuple[str, list[np.ndarray]]]) -> Image.Image:
+    """Lay the pictures out, two tasks a row."""
+    cell_width, cell_height = len(CAMERAS) * PICTURE[0], CAPTION + PICTURE[1]
+    rows = -(-len(pictures) // COLUMNS)
+    size = (COLUMNS * (cell_width + GAP) + GAP, rows * (cell_height + GAP) + GAP)
+    sheet = Image.new("RGB", size, "white")
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"), 19)
+    for i, (instruction, frames) in enumerate(pictures):
+        x = GAP + i % COLUMNS * (cell_width + GAP)
+        y = GAP + i // COLUMNS * (cell_height + GAP)
+        draw.text((x, y + CAPTION / 2), instruction, font=font, anchor="lm", fill="#222222")
+        for j, frame in enumerate(frames):
+            picture = Image.fromarray(frame).resize(PICTURE, Image.Resampling.LANCZOS)
+            sheet.paste(picture, (x + j * PICTURE[0], y + CAPTION))
+    return sheet
+
+
+def main() -> None:
+    """Write the sheet of a scene."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--scene", default="kitchen_2x2", choices=sorted(SCENES))
+    parser.add_argument("--split", default="train", choices=("train", "held_out"))
+    parser.add_argument("--output", type=Path, help="default: docs/images/tasks_SCENE.png")
+    args = parser.parse_args()
+    output = args.output or Path("docs/images") / f"tasks_{args.scene}.png"
+    output.parent.mkdir(parents=True, exist_ok=True)
+    draw_sheet(render_tasks(args.scene, args.split)).save(output, optimize=True)
+    print(output)
+
+
+if __name__ == "__main__":
+    main()
