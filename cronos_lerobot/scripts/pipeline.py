@@ -1,0 +1,122 @@
+"""Runs commands one after the other, shows each before it runs, and skips what is done when run again."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+STATE = "demo.json"
+"""What has been done, in the output folder."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command of a pipeline."""
+
+    name: str
+    title: str
+    """What it does, for the reader."""
+    command: list[str]
+    """A console script of this environment, or `python`, and its flags."""
+    output: Path
+    """File or folder that the command makes; removed before the command runs anew."""
+    resume: Callable[[], list[str] | None] = lambda: None
+    """The command that goes on with an unfinished `output`, or None if there is nothing to go on with."""
+    always: bool = False
+    """Run it even if it was done before."""
+
+
+class StepFailedError(Exception):
+    """A command ended with an error."""
+
+
+def run_steps(steps: Sequence[Step], folder: Path) -> None:
+    """Run the steps that are not done yet; from the first one that runs on, all later ones do.
+
+    Args:
+        steps: in their order; each may use the outputs of those before it.
+        folder: holds their outputs and a note of what was done with which command.
+
+    Raises:
+        FileExistsError: the folder holds something else.
+        StepFailedError: a command failed; running the steps again goes on from there.
+    """
+    state = _read_state(folder)
+    stale = False
+    for number, step in enumerate(steps, start=1):
+        heading = f"[{number}/{len(steps)}] {step.title}"
+        note = state.get(step.name, {})
+        same = note.get("command") == step.command
+        if same and note.get("done") and step.output.exists() and not stale and not step.always:
+            print(f"\n{heading}: done before ({step.output})", flush=True)
+            continue
+        resumed = step.resume() if same and not stale else None
+        stale = True
+        if resumed is None:
+            _remove(step.output)
+        for later in steps[number - 1 :]:
+            state.get(later.name, {}).pop("done", None)
+        state[step.name] = {"command": step.command}
+        _write_state(folder, state)
+        print(f"\n{heading}", flush=True)
+        start = time.perf_counter()
+        run_command(resumed or step.command)
+        seconds = time.perf_counter() - start
+        state[step.name] |= {"done": True, "seconds": round(seconds, 1)}
+        _write_state(folder, state)
+        print(f"    took {seconds / 60:.1f} min", flush=True)
+
+
+def run_command(command: list[str]) -> None:
+    """Show a command as one may type it, and run it; its output goes where ours goes.
+
+    Raises:
+        StepFailedError: it ended with an error.
+    """
+    print(f"    $ {command_line(command)}\n", flush=True)
+    # The script of the environment that this Python runs in, whatever PATH says.
+    program = Path(sys.executable) if command[0] == "python" else Path(sys.executable).with_name(command[0])
+    if subprocess.run([str(program), *command[1:]], check=False).returncode != 0:
+        raise StepFailedError(f"the command failed:\n    {command_line(command)}")
+
+
+def command_line(command: list[str]) -> str:
+    """A command for a shell, each flag on a line of its own with its values."""
+    lines = [command[0]]
+    for part in command[1:]:
+        word = shlex.quote(part)
+        if part.startswith("--"):
+            lines.append(word)
+        else:
+            lines[-1] += f" {word}"
+    return " \\\n        ".join(lines)
+
+
+def _read_state(folder: Path) -> dict[str, dict]:
+    path = folder / STATE
+    if path.is_file():
+        return json.loads(path.read_text())
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise FileExistsError(f"{folder} is not empty and not of an earlier run; choose another --output_dir.")
+    return {}
+
+
+def _write_state(folder: Path, state: dict[str, dict]) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    partial = folder / f".{STATE}"
+    partial.write_text(json.dumps(state, indent=2))
+    partial.replace(folder / STATE)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

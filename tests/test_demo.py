@@ -1,0 +1,136 @@
+"""`cronos-demo`: the pipeline's bookkeeping with trivial commands, and the real one at its smallest."""
+
+import csv
+import json
+import subprocess
+import sys
+
+import pandas as pd
+import pytest
+from lerobot.datasets import LeRobotDataset
+
+from cronos_lerobot.scripts.demo import SCALES, make_steps
+from cronos_lerobot.scripts.pipeline import Step, StepFailedError, command_line, run_steps
+
+
+def append_step(folder, name, text="x", **options):
+    """A command that appends `text` to a file, so that the file tells how often it ran."""
+    output = folder / f"{name}.txt"
+    command = ["python", "-c", f"open({str(output)!r}, 'a').write({text!r})"]
+    return Step(name, name.upper(), command, output, **options)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "out"
+
+
+def contents(folder):
+    return {path.stem: path.read_text() for path in sorted(folder.glob("*.txt"))}
+
+
+def test_steps_that_are_done_are_skipped(folder, capsys):
+    steps = [append_step(folder, "a"), append_step(folder, "b")]
+    run_steps(steps, folder)
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("*.txt")}
+    capsys.readouterr()
+    run_steps(steps, folder)
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("*.txt")} == before
+    assert capsys.readouterr().out.count("done before") == 2
+
+
+def test_changed_command_runs_anew_and_so_do_all_after_it(folder):
+    run_steps([append_step(folder, "a"), append_step(folder, "b"), append_step(folder, "c")], folder)
+    for name in "abc":
+        (folder / f"{name}.txt").write_text("touched")
+    run_steps([append_step(folder, "a"), append_step(folder, "b", "new"), append_step(folder, "c")], folder)
+    assert contents(folder) == {"a": "touched", "b": "new", "c": "x"}
+
+
+def test_lost_output_is_made_again(folder):
+    steps = [append_step(folder, "a"), append_step(folder, "b")]
+    run_steps(steps, folder)
+    (folder / "a.txt").unlink()
+    run_steps(steps, folder)
+    assert contents(folder) == {"a": "x", "b": "x"}
+
+
+def test_failed_step_is_resumed_where_it_can_be(folder):
+    output = folder / "b.txt"
+    fail = ["python", "-c", f"open({str(output)!r}, 'a').write('half'); raise SystemExit(3)"]
+    resume = ["python", "-c", f"open({str(output)!r}, 'a').write(' and half')"]
+    steps = [append_step(folder, "a"), Step("b", "B", fail, output, resume=lambda: resume)]
+    with pytest.raises(StepFailedError, match="SystemExit"):
+        run_steps(steps, folder)
+    run_steps(steps, folder)
+    assert contents(folder) == {"a": "x", "b": "half and half"}
+    # Once it has run to its end, it is done.
+    run_steps(steps, folder)
+    assert contents(folder)["b"] == "half and half"
+
+
+def test_unfinished_output_without_resume_is_removed_first(folder):
+    steps = [append_step(folder, "a")]
+    run_steps(steps, folder)
+    state = json.loads((folder / "demo.json").read_text())
+    del state["a"]["done"]
+    (folder / "demo.json").write_text(json.dumps(state))
+    run_steps(steps, folder)
+    assert contents(folder) == {"a": "x"}
+
+
+def test_always_runs_again(folder):
+    steps = [append_step(folder, "a"), append_step(folder, "b", always=True)]
+    run_steps(steps, folder)
+    for name in "ab":
+        (folder / f"{name}.txt").write_text("touched")
+    run_steps(steps, folder)
+    assert contents(folder) == {"a": "touched", "b": "x"}
+
+
+def test_folder_of_something_else_is_left_alone(folder):
+    folder.mkdir()
+    (folder / "a.txt").write_text("precious")
+    with pytest.raises(FileExistsError, match="not of an earlier run"):
+        run_steps([append_step(folder, "a")], folder)
+    assert contents(folder) == {"a": "precious"}
+
+
+def test_shown_command_can_be_copied(tmp_path):
+    line = command_line(["printf", "%s,", "--a=1", "b c", "--d", "$e"])
+    assert (
+        subprocess.run(line, shell=True, capture_output=True, text=True, check=True).stdout == "--a=1,b c,--d,$e,"
+    )
+
+
+def test_full_demo_evaluates_every_configuration_of_both_splits(tmp_path):
+    commands = {step.name: step.command for step in make_steps(SCALES["full"], tmp_path)}
+    for when in ("before", "after"):
+        for split in ("train", "held_out"):
+            assert {f"--env.split={split}", "--eval.n_episodes=64"} <= set(commands[f"{when}_{split}"])
+    # Whole cycles between scene resets, so that success by segment is known for all segments.
+    full = SCALES["full"]
+    assert full.train_steps % (full.streams * full.scene_reset_interval) == 0
+
+
+def test_demo_end_to_end(tmp_path):
+    command = [sys.executable, "-m", "cronos_lerobot.scripts.demo", "--scale=smoke"]
+    command += [f"--output_dir={tmp_path / 'demo'}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    demo = tmp_path / "demo"
+    assert "$ cronos-train" in done.stdout
+    assert "independent_held_out" in done.stdout.split("$ cronos-report")[1]
+    assert LeRobotDataset("local/cronos_demos", root=demo / "demos").num_episodes == 8
+    stream = LeRobotDataset("local/cronos_demo_streams", root=demo / "finetune/streams")
+    assert stream.num_frames == 160
+    with (demo / "report/gains.csv").open() as file:
+        gains = {row["suite"]: row for row in csv.DictReader(file) if row["task"] == "all tasks"}
+    evaluated = json.loads((demo / "eval/after_held_out/eval_info.json").read_text())
+    successes = sum(sum(task["metrics"]["successes"]) for task in evaluated["per_task"])
+    after = gains["independent_held_out"]
+    assert (after["after_successes"], after["after_n"]) == (str(successes), "4")
+    page = (demo / "report/index.html").read_text()
+    # The stream, and each of four tasks before and after.
+    assert page.count("data:video/mp4") == 1 + 8
+    assert pd.read_csv(demo / "report/updates.csv")["interaction_steps"].tolist() == [320, 640]
