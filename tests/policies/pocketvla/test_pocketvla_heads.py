@@ -17,7 +17,9 @@ from lerobot_policy_pocketvla.heads import (
 
 def gaussian_head(gripper_dim: int | None = None, sigma: float = 0.2, dims: int = 3) -> GaussianHead:
     """A head whose mean is exactly its input's (limited) value: the projection is the identity."""
-    head = GaussianHead(dims, dims, 256, gripper_dim, sigma_init=sigma, sigma_min=0.01, sigma_max=0.9)
+    head = GaussianHead(
+        dims, dims, 256, gripper_dim, sigma_init=sigma, sigma_min=0.01, sigma_max=0.9, gripper_logit_limit=5.0
+    )
     with torch.no_grad():
         head.project.weight.copy_(torch.eye(dims))
     return head
@@ -55,15 +57,22 @@ def test_discretised_gaussian_is_the_normal_density_at_the_bin_centres(sigma, te
     np.testing.assert_allclose(got, density / density.sum(-1, keepdims=True), atol=2e-6)
 
 
-def test_the_gripper_takes_only_its_outermost_bins_with_the_sigmoid_of_one_logit():
+def test_the_gripper_takes_only_its_outermost_bins_with_the_sigmoid_of_one_limited_logit():
     logits = gaussian_head(gripper_dim=-1)(torch.tensor([[0.0, 0.0, 1.5]]))
     probs = BinDistribution(logits).log_probs()[0, 2].exp()
-    assert probs[255].item() == pytest.approx(1 / (1 + math.exp(-1.5)), abs=1e-6)
-    assert probs[0].item() == pytest.approx(1 / (1 + math.exp(1.5)), abs=1e-6)
+    logit = 5 * math.tanh(1.5 / 5)
+    assert probs[255].item() == pytest.approx(1 / (1 + math.exp(-logit)), abs=1e-6)
+    assert probs[0].item() == pytest.approx(1 / (1 + math.exp(logit)), abs=1e-6)
     assert probs[1:255].sum().item() == 0.0
     # Halving the temperature doubles the logit.
     cold = BinDistribution(logits).log_probs(0.5)[0, 2, 255].exp().item()
-    assert cold == pytest.approx(1 / (1 + math.exp(-3.0)), abs=1e-6)
+    assert cold == pytest.approx(1 / (1 + math.exp(-2 * logit)), abs=1e-6)
+
+
+def test_the_less_likely_gripper_command_stays_possible():
+    """However sure the network is, the other command keeps the probability sigmoid(-5) = 0.67 %."""
+    logits = gaussian_head(gripper_dim=-1)(torch.tensor([[0.0, 0.0, 1e4]]))
+    assert BinDistribution(logits).log_probs()[0, 2, 0].exp().item() == pytest.approx(0.0066929, abs=1e-6)
 
 
 def test_gripper_index_zero_is_replaced_and_the_others_are_not():

@@ -49,6 +49,9 @@ class PocketVLAConfig(PreTrainedConfig):
     """Smallest standard deviation that can be learned; below half a bin nothing is explored."""
     sigma_max: float = 0.6
     """Largest standard deviation that can be learned."""
+    gripper_logit_limit: float = 5.0
+    """Largest logit of the gripper's sign (`gaussian` head): at temperature 1 the less likely command keeps a
+    probability of 0.7 %, so that reinforcement learning still explores when to close and open."""
     temperature: float = 0.6
     """Sampling temperature of `select_action`: logits are divided by it; 0 takes the likeliest bin."""
     action_bounds: BoundsSource = "bridge_orig"
@@ -117,6 +120,8 @@ class PocketVLAConfig(PreTrainedConfig):
                 raise ValueError(f"{name}={getattr(self, name)!r} is not one of {list(get_args(choices))}")
         if self.n_obs_steps != 1:
             raise ValueError(f"n_obs_steps={self.n_obs_steps}: PocketVLA sees one step, n_obs_steps must be 1")
+        if self.gripper_logit_limit <= 0:
+            raise ValueError(f"gripper_logit_limit must be positive, got {self.gripper_logit_limit}")
         if not 0 < self.sigma_min < self.sigma_init < self.sigma_max:
             raise ValueError(
                 "0 < sigma_min < sigma_init < sigma_max is needed, got "

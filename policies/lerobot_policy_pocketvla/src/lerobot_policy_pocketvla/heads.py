@@ -105,6 +105,7 @@ class GaussianHead(nn.Module):
         num_bins: bins over [-1, 1].
         gripper_dim: index of the gripper dimension, None for none.
         sigma_init, sigma_min, sigma_max: start and range of sigma, in normalised action units.
+        gripper_logit_limit: the gripper's logit stays inside (-limit, limit).
         mean_limit: the mean stays inside (-mean_limit, mean_limit); above 1 so that edge bins are reachable.
     """
 
@@ -119,12 +120,13 @@ class GaussianHead(nn.Module):
         sigma_init: float,
         sigma_min: float,
         sigma_max: float,
+        gripper_logit_limit: float,
         mean_limit: float = 1.25,
     ) -> None:
         """Build the layers."""
         super().__init__()
         self.gripper_dim = None if gripper_dim is None else gripper_dim % action_dim
-        self.mean_limit = mean_limit
+        self.mean_limit, self.gripper_logit_limit = mean_limit, gripper_logit_limit
         self.log_sigma_range = (math.log(sigma_min), math.log(sigma_max))
         self.project = nn.Linear(features, action_dim)
         nn.init.orthogonal_(self.project.weight, gain=0.1)
@@ -149,5 +151,6 @@ class GaussianHead(nn.Module):
         if self.gripper_dim is None:
             return logits
         dim = self.gripper_dim
-        gripper = two_point_logits(raw[:, dim], logits.shape[-1])
+        limit = self.gripper_logit_limit
+        gripper = two_point_logits(limit * torch.tanh(raw[:, dim] / limit), logits.shape[-1])
         return torch.cat((logits[:, :dim], gripper[:, None], logits[:, dim + 1 :]), dim=1)

@@ -67,6 +67,7 @@ class PocketVLAPolicy(PreTrainedPolicy):
             config.sigma_init,
             config.sigma_min,
             config.sigma_max,
+            config.gripper_logit_limit,
         )
 
     # What the networks are fed.
