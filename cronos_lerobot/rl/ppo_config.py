@@ -16,13 +16,13 @@ VALUE_LOSSES = ("huber", "mse")
 class PPOConfig(RLAlgorithmConfig):
     """PPO with settings for PocketVLA, a small network trained on a laptop CPU. Bad values are a ValueError."""
 
-    epochs: int = 2
+    epochs: int = 4
     """Passes over the rollout that train the policy and the value."""
-    value_epochs: int = 4
+    value_epochs: int = 3
     """Passes after them that train the value alone."""
-    value_warmup_updates: int = 1
+    value_warmup_updates: int = 2
     """Updates at the start of a run that train the value alone, because it starts from noise."""
-    minibatch_size: int = 512
+    minibatch_size: int = 2048
     """Transitions in one backward pass."""
     grad_accumulation: int = 1
     """Minibatches in one optimizer step."""
@@ -30,7 +30,7 @@ class PPOConfig(RLAlgorithmConfig):
     """The probability ratio is clipped to 1 - clip .. 1 + clip."""
     gamma: float = 0.99
     """Discount factor per control step (0.2 s)."""
-    gae_lambda: float = 0.95
+    gae_lambda: float = 0.9
     """GAE's weight of the longer returns."""
     normalize_advantage: bool = True
     """Give the advantages of a rollout mean 0 and standard deviation 1."""
@@ -44,14 +44,14 @@ class PPOConfig(RLAlgorithmConfig):
     """Error beyond which the Huber loss is linear."""
     value_clip: float | None = None
     """Largest change of a value that an update is paid for; null does not clip."""
-    policy_lr: float = 3e-5
+    policy_lr: float = 5e-5
     """Learning rate of the policy's parameters, at the start of the run if it adapts."""
     value_lr: float = 1e-3
     """Learning rate of the value's parameters."""
     lr_schedule: str = "kl_update"
     """`fixed`; `kl_step` or `kl_update` scale the policy's learning rate after every optimizer step or
     update to keep the KL divergence of an update near target_kl."""
-    target_kl: float | None = 0.04
+    target_kl: float | None = 0.05
     """KL divergence [nats] between the policies before and after an update that is aimed at; null if none."""
     kl_stop_factor: float | None = 2.0
     """The policy's training in an update stops once a step sees a KL above this times target_kl; null never
@@ -110,6 +110,7 @@ class PaperPPOConfig(PPOConfig):
     value_warmup_updates: int = 0
     minibatch_size: int = 8
     grad_accumulation: int = 20
+    gae_lambda: float = 0.95
     value_clip: float | None = 0.2
     policy_lr: float = 1e-4
     value_lr: float = 3e-3
