@@ -10,7 +10,7 @@ import torch
 from cronos_lerobot.data.schema import observation_columns
 from cronos_lerobot.rl.policy import ActionSample
 from cronos_lerobot.rl.ppo import PPO
-from cronos_lerobot.rl.rollout_buffer import RolloutBuffer
+from cronos_lerobot.rl.rollout_buffer import Columns, RolloutBuffer
 from cronos_lerobot.stopwatch import Stopwatch
 
 
@@ -31,6 +31,7 @@ class PPOAgent:
         self.buffer = buffer
         self.generator = generator
         self.stopwatch = stopwatch or Stopwatch()
+        self._encoded: Columns = {}
         # Dropout and the like stay off in the update too, or the ratio would not be 1 before its first step.
         ppo.policy.eval()
 
@@ -38,7 +39,8 @@ class PPOAgent:
     def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
         """Sample an action for each of the N streams."""
         with self.stopwatch("infer"):
-            batch = self.ppo.processors.batch(observation_columns(o_t), tau)
+            self._encoded = self.ppo.processors.encode(observation_columns(o_t), tau)
+            batch = self.ppo.processors.encoded_batch(self._encoded, tau)
             sample = self.ppo.policy.sample_actions(
                 batch, temperature=self.ppo.config.temperature, generator=self.generator
             )
@@ -59,11 +61,14 @@ class PPOAgent:
         cut_t: np.ndarray,
         diverged_t: np.ndarray,
     ) -> None:
-        """Keep one transition of every stream, with the value to bootstrap from where the trace is cut."""
+        """Keep one transition of every stream, with the value to bootstrap from where the trace is cut.
+
+        `o_t` is kept as `act` encoded it.
+        """
         bootstrap = a_t.value
         if (cut_t & ~diverged_t).any():
             bootstrap = np.where(diverged_t, a_t.value, self._values(o_tp1, tau))
-        self.buffer.add(observation_columns(o_t), tau, a_t, r_t, cut_t, bootstrap)
+        self.buffer.add(self._encoded, tau, a_t, r_t, cut_t, bootstrap)
 
     def update(self) -> dict[str, float]:
         """Learn from the buffer and clear it."""
@@ -75,5 +80,6 @@ class PPOAgent:
 
     @torch.inference_mode()
     def _values(self, observation: dict[str, Any], tau: list[str]) -> np.ndarray:
-        batch = self.ppo.processors.batch(observation_columns(observation), tau)
+        encoded = self.ppo.processors.encode(observation_columns(observation), tau)
+        batch = self.ppo.processors.encoded_batch(encoded, tau)
         return self.ppo.policy.predict_values(batch).float().cpu().numpy()

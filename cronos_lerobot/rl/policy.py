@@ -18,7 +18,12 @@ POLICY_METHODS = ("sample_actions", "evaluate_actions", "predict_values", "rl_pa
 
 @runtime_checkable
 class TrainablePolicy(Protocol):
-    """A LeRobot policy that PPO can train: it says how likely its own actions were."""
+    """A LeRobot policy that PPO can train: it says how likely its own actions were.
+
+    A policy whose first layers are frozen may also have `encode_observation(batch) -> Batch` (or None), which replaces
+    inputs by what those layers make of them. It is called once for each observation; what it returns is kept
+    until the update and handed to the other methods in place of the batch.
+    """
 
     def sample_actions(
         self, batch: Batch, *, temperature: float = 1.0, generator: torch.Generator | None = None

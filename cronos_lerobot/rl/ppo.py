@@ -182,7 +182,7 @@ class PPO:
 
     def _loss(self, minibatch: Minibatch) -> tuple[Tensor, dict[str, float]]:
         config = self.config
-        batch = self.processors.batch(minibatch.observation, minibatch.instructions)
+        batch = self.processors.encoded_batch(minibatch.observation, minibatch.instructions)
         tokens = self._tensor(minibatch.tokens)
         advantage = self._tensor(minibatch.advantage)
         new = self.policy.evaluate_actions(batch, tokens, temperature=config.temperature)
@@ -217,7 +217,7 @@ class PPO:
                 self.optimizer.zero_grad(set_to_none=True)
                 size = sum(len(minibatch.indices) for minibatch in group)
                 for minibatch in group:
-                    batch = self.processors.batch(minibatch.observation, minibatch.instructions)
+                    batch = self.processors.encoded_batch(minibatch.observation, minibatch.instructions)
                     old_value, return_ = self._tensor(minibatch.value), self._tensor(minibatch.return_)
                     error = value_error(self.policy.predict_values(batch), old_value, return_, config)
                     (error.sum() / size).backward()

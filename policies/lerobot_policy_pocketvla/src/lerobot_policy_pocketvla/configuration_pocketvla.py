@@ -36,6 +36,11 @@ class PocketVLAConfig(PreTrainedConfig):
     """With an image actor and `critic_observation=actor`, the value head reads the actor's features; True
     keeps the value loss from changing them."""
 
+    freeze_encoder: bool = False
+    """With an image actor: reinforcement learning leaves the image encoder and the instruction's embedding as
+    they were cloned. What they say of an observation is then computed once, while acting, and kept for the
+    update, which trains the trunk and the head many times faster. Cloning always trains everything."""
+
     action_head: ActionHead = "gaussian"
     """`gaussian`: a mean and one sigma per dimension generate the bins' logits, the gripper has a sign.
     `categorical`: a free logit for every bin."""

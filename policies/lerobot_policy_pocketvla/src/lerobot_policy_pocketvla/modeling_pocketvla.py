@@ -1,11 +1,11 @@
 """The PocketVLA policy: behaviour cloning, acting, and what an actor-critic trainer needs."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE, OBS_STR
 from torch import Tensor, nn
 
 from lerobot_policy_pocketvla.configuration_pocketvla import PocketVLAConfig
@@ -23,6 +23,10 @@ from lerobot_policy_pocketvla.precision import use_bfloat16
 Batch = Mapping[str, Any]
 """A batch after the preprocessor: `observation.images.<camera>` (B, 3, H, W), uint8 or floats in [0, 1];
 `observation.state` (B, P) and `observation.environment_state` (B, E), normalised; `task`, B strings."""
+
+
+ENCODING = f"{OBS_STR}.encoding"
+"""Key of a cached encoding in a batch, see `PocketVLAPolicy.encode_observation`."""
 
 
 class PocketVLAPolicy(PreTrainedPolicy):
@@ -92,12 +96,17 @@ class PocketVLAPolicy(PreTrainedPolicy):
         """Actor features, (B, hidden_width)."""
         if not self.uses_images:
             return self.actor(self._vector(batch, with_environment=True), self._texts(batch))
+        encoding = batch[ENCODING] if ENCODING in batch else self._encode(batch, shift_px)
+        return self.actor(encoding, self._vector(batch, with_environment=False), self._texts(batch))
+
+    def _encode(self, batch: Batch, shift_px: int = 0) -> Tensor:
+        """What the image encoder says of the batch's images, (B, encoder.width)."""
+        assert isinstance(self.actor, ImageNetwork)
         key, shape = self.config.camera
         if key not in batch:
             raise ValueError(f"the batch lacks {key!r}; it has {sorted(batch)}")
         check_image_size(batch[key], shape, key)
-        images = random_shift(batch[key], shift_px)
-        return self.actor(images, self._vector(batch, with_environment=False), self._texts(batch))
+        return self.actor.encode(random_shift(batch[key], shift_px), self._texts(batch))
 
     def _values(self, batch: Batch, features: Tensor | None) -> Tensor:
         """Values (B,); `features` are the actor's, if they are at hand."""
@@ -199,6 +208,17 @@ class PocketVLAPolicy(PreTrainedPolicy):
 
     # What an actor-critic trainer needs (structurally; nothing is imported from it).
 
+    @property
+    def encode_observation(self) -> Callable[[Batch], Batch] | None:
+        """With `freeze_encoder`, the function that puts encodings in place of a batch's images; else None."""
+        return self._with_encoding if self.uses_images and self.config.freeze_encoder else None
+
+    @torch.no_grad()
+    def _with_encoding(self, batch: Batch) -> Batch:
+        with self._full_precision():
+            kept = {key: value for key, value in batch.items() if key != self.config.camera[0]}
+            return kept | {ENCODING: self._encode(batch)}
+
     @torch.no_grad()
     def sample_actions(
         self, batch: Batch, *, temperature: float = 1.0, generator: torch.Generator | None = None
@@ -242,9 +262,12 @@ class PocketVLAPolicy(PreTrainedPolicy):
             return self._values(batch, None)
 
     def rl_parameter_groups(self) -> list[dict[str, Any]]:
-        """Two disjoint groups that hold every parameter: `policy` and `value`."""
+        """Two disjoint groups, `policy` and `value`; they hold every parameter but those of a frozen encoder."""
         value = list(self.value_head.parameters())
         if self.critic is not None:
             value += list(self.critic.parameters())
-        policy = [*self.actor.parameters(), *self.head.parameters()]
+        actor = self.actor
+        if self.config.freeze_encoder and isinstance(actor, ImageNetwork):
+            actor = actor.trunk
+        policy = [*actor.parameters(), *self.head.parameters()]
         return [{"name": "policy", "params": policy}, {"name": "value", "params": value}]

@@ -164,11 +164,14 @@ class ImageNetwork(nn.Module):
         self.encoder = ImageEncoder(task_width, keypoints, bfloat16)
         self.trunk = FilmMLP(self.encoder.width + inputs, width, depth, task_width)
 
-    def forward(self, images: Tensor, state: Tensor, texts: list[str]) -> Tensor:
-        """Images (B, 3, H, W), normalised proprioception (B, inputs), B instructions to (B, width)."""
-        task = self.text(texts)
+    def encode(self, images: Tensor, texts: list[str]) -> Tensor:
+        """Images (B, 3, H, W) under B instructions to encodings (B, encoder.width), float32."""
+        return self.encoder(images, self.text(texts))
+
+    def forward(self, encoding: Tensor, state: Tensor, texts: list[str]) -> Tensor:
+        """Encodings, normalised proprioception (B, inputs), B instructions to features (B, width)."""
         state = state.float().clamp(-STATE_LIMIT, STATE_LIMIT)
-        return self.trunk(torch.cat((self.encoder(images, task), state), dim=-1), task)
+        return self.trunk(torch.cat((encoding, state), dim=-1), self.text(texts))
 
 
 class ValueHead(nn.Module):
