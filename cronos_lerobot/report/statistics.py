@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import hypot
 
-from cronos_lerobot.training.evaluation import wilson_interval
+from lerobot_env_cronos.statistics import wilson_interval
 
 
 @dataclass(frozen=True)

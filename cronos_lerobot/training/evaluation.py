@@ -4,33 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from math import sqrt
 from typing import Any
 
 import numpy as np
 import torch
+from lerobot_env_cronos import STEPS_PER_TASK
+from lerobot_env_cronos.statistics import wilson_interval
 
 from cronos_lerobot.data.schema import observation_columns
 from cronos_lerobot.rl.processing import PolicyProcessors
-
-STEPS_PER_TASK = 80
-"""Control steps of one evaluation episode (paper, Section 5)."""
-Z_95 = 1.959963984540054
-"""97.5 % quantile of the normal distribution."""
-
-
-def wilson_interval(successes: int, n: int) -> tuple[float, float]:
-    """Return the 95 % Wilson score interval of a success rate.
-
-    Raises:
-        ValueError: there are no trials, or more successes than trials.
-    """
-    if not 0 <= successes <= n or n == 0:
-        raise ValueError(f"Need 0 <= successes <= n and n > 0, got successes={successes}, n={n}.")
-    p, z2 = successes / n, Z_95**2
-    centre = (p + z2 / (2 * n)) / (1 + z2 / n)
-    half = Z_95 * sqrt(p * (1 - p) / n + z2 / (4 * n * n)) / (1 + z2 / n)
-    return max(0.0, centre - half), min(1.0, centre + half)
 
 
 @dataclass(frozen=True)

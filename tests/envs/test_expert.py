@@ -11,7 +11,6 @@ from lerobot_env_cronos.expert_ceiling import (
     measure_reset_free,
     run_segment,
     success_rate,
-    wilson_interval,
     write_csv,
 )
 from lerobot_env_cronos.simulation import ACTION_HIGH, ACTION_LOW
@@ -193,12 +192,6 @@ def test_end_effector_reset_moves_no_unheld_body(env):
 
 
 # The report ---------------------------------------------------------------------------------------------
-
-
-def test_wilson_interval_by_hand():
-    # 10 of 10: low = 1 / (1 + z^2 / 10), z = 1.96.
-    assert wilson_interval(10, 10) == pytest.approx((0.7225, 1.0), abs=1e-4)
-    assert wilson_interval(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-4)
 
 
 def test_csv_has_one_row_per_rate(tmp_path):

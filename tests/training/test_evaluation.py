@@ -4,7 +4,7 @@ import torch
 from dummies import TASKS, DummyEnv, DummyPolicy, identity_processors
 
 from cronos_lerobot.rl.processing import PolicyProcessors
-from cronos_lerobot.training.evaluation import SuccessRate, evaluate_independent, wilson_interval
+from cronos_lerobot.training.evaluation import SuccessRate, evaluate_independent
 
 PROCESSORS = PolicyProcessors(*identity_processors())
 
@@ -24,15 +24,6 @@ class ScriptedPolicy(DummyPolicy):
 
 def evaluate(policy, num_envs=8, **options):
     return evaluate_independent(DummyEnv(num_envs), TASKS, policy, PROCESSORS, **options)
-
-
-def test_wilson_interval_of_known_counts():
-    # Published values: 0/10 -> (0, .2775), 9/10 -> (.5958, .9821), 5/10 -> (.2366, .7634).
-    assert wilson_interval(0, 10) == pytest.approx((0, 0.2775), abs=1e-4)
-    assert wilson_interval(9, 10) == pytest.approx((0.5958, 0.9821), abs=1e-4)
-    assert wilson_interval(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-4)
-    with pytest.raises(ValueError, match="n=0"):
-        wilson_interval(0, 0)
 
 
 @pytest.mark.parametrize("num_envs", [1, 5, 16])

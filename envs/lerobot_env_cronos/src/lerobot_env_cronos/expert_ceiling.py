@@ -19,10 +19,10 @@ from lerobot_env_cronos.configurations import NUM_CONFIGURATIONS, SPLITS
 from lerobot_env_cronos.expert import ScriptedExpert
 from lerobot_env_cronos.scenes import STEPS_PER_TASK, Task
 from lerobot_env_cronos.simulation import EE_HIGH, EE_LOW
+from lerobot_env_cronos.statistics import wilson_interval
 from lerobot_env_cronos.vector_env import CronosVectorEnv
 
 STATE_OBSERVATIONS = "environment_state_agent_pos"
-Z_95 = 1.959964
 
 
 @dataclass(frozen=True)
@@ -38,14 +38,6 @@ class SuccessRate:
     rate: float
     low: float
     high: float
-
-
-def wilson_interval(successes: int, n: int) -> tuple[float, float]:
-    """95 % score interval of a proportion (Wilson 1927)."""
-    p, z2 = successes / n, Z_95**2
-    middle = (p + z2 / (2 * n)) / (1 + z2 / n)
-    half = Z_95 / (1 + z2 / n) * np.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
-    return float(max(0.0, middle - half)), float(min(1.0, middle + half))
 
 
 def success_rate(group: str, task: str, success: np.ndarray) -> SuccessRate:
