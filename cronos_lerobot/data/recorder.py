@@ -21,6 +21,7 @@ from cronos_lerobot.data.schema import (
     VALUE,
     Intervention,
     feature_names,
+    frame_format,
     observation_columns,
     stream_features,
 )
@@ -250,7 +251,6 @@ class StreamRecorder:
     def _new_buffer(self) -> dict[str, np.ndarray]:
         buffer = {}
         for key, feature in self.writer.features.items():
-            shape = () if feature["shape"] == (1,) else feature["shape"]
-            dtype = np.uint8 if feature["dtype"] == "video" else feature["dtype"]
+            shape, dtype = frame_format(feature)
             buffer[key] = np.empty((self.segment_length, *shape), dtype=dtype)
         return buffer

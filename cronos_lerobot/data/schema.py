@@ -72,6 +72,7 @@ STREAM_COLUMNS = tuple(_STREAM_COLUMNS)
 def demonstration_features(
     observation_space: gymnasium.Space,
     *,
+    video: bool = True,
     state_names: Sequence[str] | None = None,
     environment_state_names: Sequence[str] | None = None,
 ) -> Features:
@@ -80,6 +81,7 @@ def demonstration_features(
     Args:
         observation_space: of ONE environment, in the raw format of `lerobot.envs`: a Dict with any of
             "pixels" (a Dict of uint8 (H, W, 3) boxes by camera), "agent_pos", "environment_state".
+        video: store the pixels as mp4 (small); if False as PNG in the data files (exact, fast to read).
         state_names: one name per dimension of `agent_pos`; numbered when None.
         environment_state_names: the same for `environment_state`.
 
@@ -97,7 +99,7 @@ def demonstration_features(
         if key == "pixels":
             cameras = cast(gymnasium.spaces.Dict, space)
             for camera, box in cameras.items():
-                features[f"{OBS_IMAGES}.{camera}"] = _video_feature(box.shape or ())
+                features[f"{OBS_IMAGES}.{camera}"] = _camera_feature(box.shape or (), video)
         elif key in _VECTOR_KEYS:
             features[_VECTOR_KEYS[key]] = _vector_feature(key, space.shape or (), names[key])
         else:
@@ -109,7 +111,12 @@ def demonstration_features(
     return features
 
 
-def stream_features(observation_space: gymnasium.Space, **names: Sequence[str] | None) -> Features:
+def stream_features(
+    observation_space: gymnasium.Space,
+    *,
+    state_names: Sequence[str] | None = None,
+    environment_state_names: Sequence[str] | None = None,
+) -> Features:
     """Features of a recorded training stream: those of `demonstration_features` and `STREAM_COLUMNS`.
 
     - `cronos.stream_id`: which of the parallel streams.
@@ -124,7 +131,10 @@ def stream_features(observation_space: gymnasium.Space, **names: Sequence[str] |
     - `cronos.value`: that policy's value of the observation.
     """
     columns = {key: _scalar_feature(dtype) for key, dtype in _STREAM_COLUMNS.items()}
-    return demonstration_features(observation_space, **names) | columns
+    observation_and_action = demonstration_features(
+        observation_space, state_names=state_names, environment_state_names=environment_state_names
+    )
+    return observation_and_action | columns
 
 
 def feature_names(env: CronosVectorEnv) -> dict[str, Sequence[str]]:
@@ -133,6 +143,12 @@ def feature_names(env: CronosVectorEnv) -> dict[str, Sequence[str]]:
         "state_names": AGENT_POS_NAMES,
         "environment_state_names": environment_state_names(env.scene),
     }
+
+
+def frame_format(feature: Mapping[str, Any]) -> tuple[tuple[int, ...], np.dtype]:
+    """Shape and dtype of one frame of a feature as the writer takes it: pixels are uint8 (H, W, 3)."""
+    shape = () if feature["shape"] == (1,) else tuple(feature["shape"])
+    return shape, np.dtype(np.uint8 if feature["dtype"] in ("image", "video") else feature["dtype"])
 
 
 def observation_columns(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -153,12 +169,16 @@ def observation_columns(observation: Mapping[str, Any]) -> dict[str, np.ndarray]
 _VECTOR_KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
 
 
-def _video_feature(shape: tuple[int, ...]) -> dict[str, Any]:
+def _camera_feature(shape: tuple[int, ...], video: bool) -> dict[str, Any]:
     if len(shape) != 3 or shape[2] != 3:
         raise ValueError(f"pixels must have the shape (H, W, 3), got {shape}")
-    if shape[0] % 2 or shape[1] % 2:
+    if video and (shape[0] % 2 or shape[1] % 2):
         raise ValueError(f"pixels must have an even height and width to be encoded as yuv420p, got {shape}")
-    return {"dtype": "video", "shape": tuple(shape), "names": ["height", "width", "channels"]}
+    return {
+        "dtype": "video" if video else "image",
+        "shape": tuple(shape),
+        "names": ["height", "width", "channels"],
+    }
 
 
 def _vector_feature(key: str, shape: tuple[int, ...], names: Sequence[str] | None) -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """The files of a LeRobotDataset (v3), a *shard* at a time: one data, one episodes and one mp4 file each.
 
+Pixels of the dtype `image` have no file of their own: they are PNG inside the data file, as LeRobot does it.
+
 A shard is written under `<root>/.incomplete`, in the tree it will have, and moved into place when it is
 whole, `info.json` last. A process killed at any moment leaves a dataset that loads: LeRobot takes the number
 of episodes from `info.json` and looks up everything else from there.
@@ -35,6 +37,7 @@ from lerobot.datasets.utils import (
 )
 from lerobot.utils.utils import flatten_dict, unflatten_dict
 
+from cronos_lerobot.data.png import encode_png
 from cronos_lerobot.data.stats import Stats, episode_stats
 from cronos_lerobot.data.video import VideoFile
 
@@ -42,7 +45,7 @@ INCOMPLETE = ".incomplete"
 
 
 class Shard:
-    """One data file, one episodes file and one mp4 per camera, being written under `.incomplete`."""
+    """One data file, one episodes file and one mp4 per video key, being written under `.incomplete`."""
 
     def __init__(self, meta: LeRobotDatasetMetadata, index: int, encoder: RGBEncoderConfig) -> None:
         """Start shard `index` (0, 1, ...) of the dataset `meta`."""
@@ -51,6 +54,7 @@ class Shard:
         self._meta = meta
         self._staging = meta.root / INCOMPLETE
         self.num_frames = 0
+        self.num_bytes = 0
         self.rows: list[dict[str, Any]] = []
         self.stats: list[Stats] = []
         self._schema = get_hf_features_from_features(meta.features).arrow_schema
@@ -82,7 +86,9 @@ class Shard:
             "task_index": np.full(length, task_index),
         }
         # One row group per episode, as LeRobot's own writer does, for readers that want single episodes.
-        self._data.write_table(_to_table(columns, self._schema))
+        table = _to_table(columns, self._schema)
+        self._data.write_table(table)
+        self.num_bytes += table.nbytes
         row: dict[str, Any] = {
             "episode_index": episode,
             "tasks": [task],
@@ -254,6 +260,8 @@ def _to_table(columns: Mapping[str, np.ndarray], schema: pa.Schema) -> pa.Table:
         if pa.types.is_fixed_size_list(field.type):
             flat = pa.array(np.ascontiguousarray(values).reshape(-1), type=field.type.value_type)
             arrays.append(pa.FixedSizeListArray.from_arrays(flat, type=field.type))
+        elif pa.types.is_struct(field.type):  # the storage of datasets.Image
+            arrays.append(pa.array([{"bytes": encode_png(image)} for image in values], type=field.type))
         else:
             arrays.append(pa.array(values, type=field.type))
     return pa.Table.from_arrays(arrays, schema=schema)

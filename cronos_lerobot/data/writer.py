@@ -16,7 +16,7 @@ from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.utils import INFO_PATH
 
-from cronos_lerobot.data.schema import Features
+from cronos_lerobot.data.schema import Features, frame_format
 from cronos_lerobot.data.storage import INCOMPLETE, Shard, next_shard_index, truncate
 from cronos_lerobot.data.video import MAX_FILE_DURATION_S, fast_encoder
 
@@ -40,8 +40,10 @@ class _Flush:
 class SegmentWriter:
     """Appends segments (arrays in memory) to a LeRobotDataset, one episode each.
 
-    A thread of its own encodes and writes; frames/s are those of libx264, not of PNG files. Episodes share
-    files: many in one mp4, one parquet and one episodes file per flush (or per 1000 s of video).
+    A thread of its own encodes, in memory, and writes. Pixels go where their feature's dtype says: `video` into
+    mp4 files, `image` as PNG into the data files, which are then lossless and fast to read at random. Episodes
+    share files: many in one mp4, one parquet and one episodes file per flush (or per 1000 s of video, or per
+    `data_files_size_in_mb` of data).
     """
 
     def __init__(
@@ -132,7 +134,7 @@ class SegmentWriter:
 
         Args:
             frames: one array (T, *shape) of the feature's dtype per feature ((T,) where the shape is (1,));
-                videos as uint8 (T, H, W, 3). They are NOT copied: leave them alone afterwards.
+                pixels as uint8 (T, H, W, 3). They are NOT copied: leave them alone afterwards.
             task: the instruction.
             episode_metadata: columns for the episode's row in `meta/episodes`, the same keys every time.
 
@@ -225,8 +227,7 @@ class SegmentWriter:
         if not 1 <= length <= self._max_shard_frames:
             raise ValueError(f"a segment needs 1 to {self._max_shard_frames} frames, got {length}")
         for key, feature in self.features.items():
-            shape = () if feature["shape"] == (1,) else feature["shape"]
-            dtype = np.dtype(np.uint8 if feature["dtype"] == "video" else feature["dtype"])
+            shape, dtype = frame_format(feature)
             array = frames[key]
             if array.dtype != dtype or array.shape != (length, *shape):
                 raise ValueError(f"{key} must be {dtype} {(length, *shape)}, got {array.dtype} {array.shape}")
@@ -250,7 +251,10 @@ class SegmentWriter:
             self._publish()
             return
         length = len(next(iter(item.frames.values())))
-        if self._shard is not None and self._shard.num_frames + length > self._max_shard_frames:
+        max_bytes = self._meta.info.data_files_size_in_mb * 2**20
+        if self._shard is not None and (
+            self._shard.num_frames + length > self._max_shard_frames or self._shard.num_bytes >= max_bytes
+        ):
             self._publish()
         if self._shard is None:
             self._shard = Shard(self._meta, self._next_shard, self._encoder)

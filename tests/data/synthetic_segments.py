@@ -21,8 +21,8 @@ def observation_space(environment_state: int | None = 3) -> gymnasium.spaces.Dic
     return gymnasium.spaces.Dict(spaces)
 
 
-def features():
-    return demonstration_features(observation_space())
+def features(video: bool = True):
+    return demonstration_features(observation_space(), video=video)
 
 
 def images(length: int, seed: int = 0) -> np.ndarray:

@@ -1,4 +1,7 @@
 import logging
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -206,8 +209,8 @@ def test_wrong_options_are_named(make, message):
 
 
 def command(root, num_episodes, **options) -> RecordDemosConfig:
-    overwrite = options.pop("overwrite", False)
-    dataset = DemoDatasetConfig("me/demos", root, num_episodes, overwrite)
+    flags = {key: options.pop(key) for key in ("video", "overwrite") if key in options}
+    dataset = DemoDatasetConfig("me/demos", root, num_episodes, **flags)
     environment = CronosEnvConfig(observation_height=64, observation_width=64)
     return RecordDemosConfig(env=environment, dataset=dataset, num_envs=2, **options)
 
@@ -230,3 +233,24 @@ def test_the_command_records_resumes_and_overwrites(tmp_path, caplog):
     (tmp_path / "precious" / "thesis.tex").write_text("...")
     with pytest.raises(FileExistsError, match="is not a LeRobotDataset"):
         record_demos(command(tmp_path / "precious", 1, overwrite=True))
+
+
+def test_lerobot_train_reads_demonstrations_stored_as_images(tmp_path):
+    root = tmp_path / "d"
+    record_demos(command(root, 2, video=False))
+    with pytest.raises(ValueError, match=r"was recorded with --dataset\.video=false"):
+        record_demos(command(root, 3, resume=True))
+    record_demos(command(root, 3, resume=True, video=False))
+    dataset = LeRobotDataset("me/demos", root=root)
+    assert (dataset.num_episodes, dataset.meta.image_keys) == (3, ["observation.images.front"])
+    train = [
+        *(sys.executable, "-m", "lerobot.scripts.lerobot_train", "--policy.type=pocketvla"),
+        *("--policy.push_to_hub=false", "--policy.device=cpu", "--policy.hidden_width=16"),
+        *("--dataset.repo_id=me/demos", f"--dataset.root={root}", f"--output_dir={tmp_path / 'run'}"),
+        *("--steps=2", "--log_freq=1", "--batch_size=4", "--num_workers=0", "--env_eval_freq=0"),
+        "--wandb.enable=false",
+    ]
+    environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(train, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr[-4000:]
+    assert "step:2" in done.stdout + done.stderr

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset
-from synthetic import FPS, STATE_DIM, images, observation_space
+from synthetic_segments import FPS, STATE_DIM, images, observation_space
 
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.schema import Intervention, stream_features

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from lerobot.configs import FeatureType
 from lerobot.utils.feature_utils import dataset_to_policy_features
-from synthetic import observation_space
+from synthetic_segments import observation_space
 
 from cronos_lerobot.data.schema import (
     STREAM_COLUMNS,
@@ -54,6 +54,13 @@ def test_pictures_that_cannot_be_encoded_are_refused(shape):
     pixels = gymnasium.spaces.Dict({"front": gymnasium.spaces.Box(0, 255, shape, np.uint8)})
     with pytest.raises(ValueError, match="pixels must have"):
         demonstration_features(gymnasium.spaces.Dict({"pixels": pixels}))
+
+
+def test_images_may_have_an_odd_size():
+    pixels = gymnasium.spaces.Dict({"front": gymnasium.spaces.Box(0, 255, (63, 64, 3), np.uint8)})
+    features = demonstration_features(gymnasium.spaces.Dict({"pixels": pixels}), video=False)
+    assert features["observation.images.front"]["shape"] == (63, 64, 3)
+    assert features["observation.images.front"]["dtype"] == "image"
 
 
 def test_wrong_number_of_names_is_refused():

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from lerobot.datasets.compute_stats import get_feature_stats, sample_indices
-from synthetic import images
+from synthetic_segments import images
 
 from cronos_lerobot.data.stats import episode_stats, image_stats, vector_stats
 

@@ -1,3 +1,4 @@
+import json
 import signal
 import subprocess
 import sys
@@ -5,15 +6,23 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets import LeRobotDataset
-from synthetic import FPS, assert_same_pictures, features, segment
+from synthetic_segments import FPS, assert_same_pictures, features, segment
 
 from cronos_lerobot.data import storage
 from cronos_lerobot.data.schema import demonstration_features
 from cronos_lerobot.data.writer import SegmentWriter
 
 LENGTHS = [12, 1, 25, 7, 18]
+CAMERA = "observation.images.front"
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["video", "images"])
+def video(request) -> bool:
+    """Pixels in mp4 files, or as PNG in the data files."""
+    return request.param
 
 
 @pytest.fixture(scope="module")
@@ -21,8 +30,8 @@ def segments():
     return [(segment(length, seed), f"task {seed % 3}") for seed, length in enumerate(LENGTHS)]
 
 
-def write(root: Path, segments, flush_after=()) -> SegmentWriter:
-    writer = SegmentWriter("me/test", root, features(), FPS, robot_type="widowx")
+def write(root: Path, segments, flush_after=(), video=True) -> SegmentWriter:
+    writer = SegmentWriter("me/test", root, features(video), FPS, robot_type="widowx")
     for i, (frames, task) in enumerate(segments):
         writer.add_segment(frames, task, episode_metadata={"number": i})
         if i in flush_after:
@@ -42,15 +51,24 @@ def assert_holds(root: Path, segments) -> LeRobotDataset:
             assert (item["episode_index"], item["frame_index"], item["index"]) == (episode, t, index)
             assert item["timestamp"] == pytest.approx(t / FPS)
             assert item["task"] == task
-            for key in set(frames) - {"observation.images.front"}:
+            for key in set(frames) - {CAMERA}:
                 np.testing.assert_array_equal(item[key].numpy(), frames[key][t], err_msg=key)
-            assert_same_pictures(item["observation.images.front"], frames["observation.images.front"][t])
+            assert_stored(dataset, item[CAMERA], frames[CAMERA][t])
             index += 1
     return dataset
 
 
-def test_round_trip(tmp_path, segments):
-    write(tmp_path / "d", segments).finalize()
+def assert_stored(dataset: LeRobotDataset, decoded, written: np.ndarray) -> None:
+    """Images bit for bit, videos up to the codec."""
+    if CAMERA in dataset.meta.image_keys:
+        pixels = np.moveaxis(written, -1, -3).astype(np.float32) / np.float32(255)
+        np.testing.assert_array_equal(np.asarray(decoded), pixels)
+    else:
+        assert_same_pictures(decoded, written)
+
+
+def test_round_trip(tmp_path, segments, video):
+    write(tmp_path / "d", segments, video=video).finalize()
     dataset = assert_holds(tmp_path / "d", segments)
     assert dataset.meta.fps == FPS
     assert dataset.meta.info.robot_type == "widowx"
@@ -67,6 +85,29 @@ def test_many_episodes_share_the_files_of_a_flush(tmp_path, segments):
         assert len(list((tmp_path / "d" / kind).rglob(f"*.{suffix}"))) == 2
 
 
+def test_images_are_in_the_data_files_and_nowhere_else(tmp_path, segments):
+    write(tmp_path / "d", segments, video=False).finalize()
+    moved = (tmp_path / "d").rename(tmp_path / "elsewhere")
+    dataset = assert_holds(moved, segments)
+    assert (dataset.meta.image_keys, dataset.meta.video_keys, dataset.meta.video_path) == ([CAMERA], [], None)
+    info = json.loads((moved / "meta/info.json").read_text())
+    assert info["features"][CAMERA] == features(video=False)[CAMERA] | {"shape": [64, 64, 3]}
+    assert {path.suffix for path in moved.rglob("*") if path.is_file()} == {".json", ".parquet"}
+    # One episode can be read without the others.
+    assert pq.ParquetFile(moved / "data/chunk-000/file-000.parquet").num_row_groups == len(LENGTHS)
+
+
+def test_a_data_file_of_images_that_grew_too_big_is_followed_by_another(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (60, 64, 64, 3), dtype=np.uint8)  # 0.7 MB
+    segments = [(segment(60, seed) | {CAMERA: noise}, "task") for seed in range(3)]
+    writer = SegmentWriter("me/test", tmp_path / "d", features(video=False), FPS)
+    writer._meta.info.data_files_size_in_mb = 1
+    for frames, task in segments:
+        writer.add_segment(frames, task)
+    writer.finalize()
+    assert assert_holds(tmp_path / "d", segments).meta.episodes["data/file_index"] == [0, 0, 1]
+
+
 def test_a_file_that_would_grow_too_long_is_followed_by_another(tmp_path, segments, monkeypatch):
     monkeypatch.setattr("cronos_lerobot.data.writer.MAX_FILE_DURATION_S", 30 / FPS)
     write(tmp_path / "d", segments).finalize()
@@ -74,24 +115,24 @@ def test_a_file_that_would_grow_too_long_is_followed_by_another(tmp_path, segmen
     assert dataset.meta.episodes["data/file_index"] == [0, 0, 1, 2, 2]
 
 
-def test_delta_timestamps_stay_within_an_episode(tmp_path, segments):
-    write(tmp_path / "d", segments).finalize()
-    deltas = {key: [-1 / FPS, 0, 1 / FPS] for key in ("observation.images.front", "action")}
+def test_delta_timestamps_stay_within_an_episode(tmp_path, segments, video):
+    write(tmp_path / "d", segments, video=video).finalize()
+    deltas = {key: [-1 / FPS, 0, 1 / FPS] for key in (CAMERA, "action")}
     dataset = LeRobotDataset("me/test", root=tmp_path / "d", delta_timestamps=deltas)
     first, last = LENGTHS[0] + LENGTHS[1], LENGTHS[0] + LENGTHS[1] + LENGTHS[2] - 1
     frames = segments[2][0]
     item = dataset[first]
     assert item["action_is_pad"].tolist() == [True, False, False]
     np.testing.assert_array_equal(item["action"].numpy(), frames["action"][[0, 0, 1]])
-    assert_same_pictures(item["observation.images.front"], frames["observation.images.front"][[0, 0, 1]])
+    assert_stored(dataset, item[CAMERA], frames[CAMERA][[0, 0, 1]])
     item = dataset[last]
     assert item["action_is_pad"].tolist() == [False, False, True]
-    assert_same_pictures(item["observation.images.front"], frames["observation.images.front"][[-2, -1, -1]])
+    assert_stored(dataset, item[CAMERA], frames[CAMERA][[-2, -1, -1]])
 
 
-def test_same_dataset_as_lerobots_own_writer(tmp_path, segments):
-    write(tmp_path / "ours", segments, flush_after=[1, 3]).finalize()
-    theirs = LeRobotDataset.create("me/test", FPS, features(), root=tmp_path / "theirs")
+def test_same_dataset_as_lerobots_own_writer(tmp_path, segments, video):
+    write(tmp_path / "ours", segments, flush_after=[1, 3], video=video).finalize()
+    theirs = LeRobotDataset.create("me/test", FPS, features(video), root=tmp_path / "theirs", use_videos=video)
     for frames, task in segments:
         for t in range(len(frames["action"])):
             row = {key: np.atleast_1d(array[t]) for key, array in frames.items()}
@@ -107,6 +148,10 @@ def test_same_dataset_as_lerobots_own_writer(tmp_path, segments):
         for name, value in stats.items():
             atol = 2e-3 * max(1.0, float(np.ptp(np.concatenate([stats["max"], stats["min"]]))))
             np.testing.assert_allclose(ours.meta.stats[key][name], value, atol=atol, err_msg=f"{key} {name}")
+    schemas = [pq.read_schema(dataset.root / "data/chunk-000/file-000.parquet") for dataset in (ours, theirs)]
+    assert schemas[0].equals(schemas[1])
+    described = [json.loads(schema.metadata[b"huggingface"])["info"]["features"] for schema in schemas]
+    assert described[0] == described[1]
     rows = [dataset.hf_dataset.with_format("numpy")[:] for dataset in (ours, theirs)]
     for key in ("action", "timestamp", "index", "episode_index", "task_index", "next.done"):
         np.testing.assert_array_equal(rows[0][key], rows[1][key], err_msg=key)
@@ -116,9 +161,9 @@ KILLED_WRITER = """
 import os, signal, sys
 sys.path.insert(0, {tests!r})
 from test_writer import LENGTHS, write
-from synthetic import segment
+from synthetic_segments import segment
 segments = [(segment(length, seed), f"task {{seed % 3}}") for seed, length in enumerate(LENGTHS)]
-writer = write({root!r}, segments[:3], flush_after=[2])
+writer = write({root!r}, segments[:3], flush_after=[2], video={video})
 for frames, task in segments[3:]:
     writer.add_segment(frames, task, episode_metadata={{"number": 0}})
 while not writer._queue.empty():
@@ -128,10 +173,10 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 @pytest.fixture(scope="module")
-def killed(tmp_path_factory):
+def killed(tmp_path_factory, video):
     """A dataset whose process was killed with segments written after the last flush."""
     root = tmp_path_factory.mktemp("killed") / "d"
-    script = KILLED_WRITER.format(tests=str(Path(__file__).parent), root=str(root))
+    script = KILLED_WRITER.format(tests=str(Path(__file__).parent), root=str(root), video=video)
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert result.returncode == -signal.SIGKILL, result.stderr
     return root
@@ -150,11 +195,11 @@ def test_resumes_after_a_kill_without_gap_or_duplicate(killed, segments):
 
 
 @pytest.mark.parametrize("flush_after", [(1,), (0, 1, 3), (2,), ()], ids=str)
-def test_truncates_to_a_state_and_goes_on(tmp_path, segments, flush_after):
+def test_truncates_to_a_state_and_goes_on(tmp_path, segments, flush_after, video):
     """Also where the state's episodes end inside a file."""
-    straight = write(tmp_path / "straight", segments)
+    straight = write(tmp_path / "straight", segments, video=video)
     straight.finalize()
-    write(tmp_path / "d", segments, flush_after=flush_after).finalize()
+    write(tmp_path / "d", segments, flush_after=flush_after, video=video).finalize()
     with SegmentWriter.resume("me/test", tmp_path / "d", {"num_episodes": 2}) as writer:
         assert writer.num_frames == sum(LENGTHS[:2])
         assert_holds(tmp_path / "d", segments[:2])
@@ -167,17 +212,17 @@ def test_truncates_to_a_state_and_goes_on(tmp_path, segments, flush_after):
             np.testing.assert_allclose(resumed.meta.stats[key][name], value, atol=1e-9, err_msg=f"{key} {name}")
 
 
-def test_truncates_to_nothing(tmp_path, segments):
-    write(tmp_path / "d", segments).finalize()
+def test_truncates_to_nothing(tmp_path, segments, video):
+    write(tmp_path / "d", segments, video=video).finalize()
     with SegmentWriter.resume("me/test", tmp_path / "d", {"num_episodes": 0}) as writer:
         writer.add_segment(*segments[3], episode_metadata={"number": 0})
     assert_holds(tmp_path / "d", [segments[3]])
 
 
 @pytest.mark.parametrize("relative", ["data/chunk-000/file-001.parquet", "meta/info.json", "meta/stats.json"])
-def test_killed_while_publishing_it_still_loads_and_resumes(tmp_path, segments, monkeypatch, relative):
+def test_killed_while_publishing_it_still_loads_and_resumes(tmp_path, segments, monkeypatch, relative, video):
     """The process dies right before one of the files of the second flush is moved into place."""
-    writer = write(tmp_path / "d", segments[:2], flush_after=[1])
+    writer = write(tmp_path / "d", segments[:2], flush_after=[1], video=video)
     move = storage.move_into_place
 
     def die(root, path):
