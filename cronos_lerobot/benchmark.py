@@ -96,7 +96,7 @@ def train_rate(num_envs: int, scene: str, record_streams: str, updates: int = 3)
     from lerobot.policies import make_policy_config
 
     from cronos_lerobot.protocol import ProtocolConfig
-    from cronos_lerobot.scripts.train import run
+    from cronos_lerobot.scripts.train import train
     from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
 
     with tempfile.TemporaryDirectory() as folder:
@@ -114,7 +114,7 @@ def train_rate(num_envs: int, scene: str, record_streams: str, updates: int = 3)
             save_checkpoint=False,
             tensorboard=False,
         )
-        run(config)
+        train(config)
         lines = [json.loads(line) for line in (Path(folder) / "run/metrics.jsonl").read_text().splitlines()]
     # The first update pays for what is built lazily.
     rows = [line for line in lines if line["kind"] == "update"][1:]

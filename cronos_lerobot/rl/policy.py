@@ -20,9 +20,9 @@ POLICY_METHODS = ("sample_actions", "evaluate_actions", "predict_values", "rl_pa
 class TrainablePolicy(Protocol):
     """A LeRobot policy that PPO can train: it says how likely its own actions were.
 
-    A policy whose first layers are frozen may also have `encode_observation(batch) -> Batch` (or None), which replaces
-    inputs by what those layers make of them. It is called once for each observation; what it returns is kept
-    until the update and handed to the other methods in place of the batch.
+    A policy whose first layers are frozen may also have `encode_observation(batch) -> Batch` (or None there),
+    which replaces inputs by what those layers make of them. It is called once for each observation; what it
+    returns is kept until the update and handed to the other methods in place of the batch.
     """
 
     def sample_actions(
