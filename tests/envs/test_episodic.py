@@ -91,6 +91,8 @@ def test_policy_features_match_what_the_env_observes():
 @pytest.mark.parametrize(
     ("field", "value"), [("suite", "chains"), ("split", "test"), ("scene", "x"), ("task", "tidy up"), ("fps", 30)]
 )
-def test_config_errors_name_the_bad_value(field, value):
+def test_config_errors_name_the_bad_value(field, value, caplog):
     with pytest.raises(ValueError, match=str(value)):
         CronosEnvConfig(**{field: value})
+    # draccus hides the exception's text from command lines, so it is logged as well.
+    assert str(value) in caplog.text

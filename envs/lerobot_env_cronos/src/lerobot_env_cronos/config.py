@@ -1,5 +1,6 @@
 """`--env.type=cronos`: the LeRobot configuration of the CRONOS scenes."""
 
+import logging
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -52,6 +53,15 @@ class CronosEnvConfig(EnvConfig):
     features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self):
+        try:
+            self._build()
+        except ValueError as error:
+            # Command lines only say that the config could not be instantiated: draccus drops the reason.
+            logging.getLogger(__name__).error("--env: %s", error)
+            raise
+
+    def _build(self) -> None:
+        """Check the fields and derive the features from them."""
         scene = get_scene(self.scene)
         _check("suite", self.suite, SUITES)
         _check("split", self.split, SPLITS)
