@@ -24,8 +24,8 @@ system: ## Install what headless rendering needs (EGL and software OpenGL)
 demo: setup ## Record, clone, fine-tune without resets, evaluate, report: about 15 minutes on 2 cores
 	$(RUN) cronos-demo
 
-test: setup ## Run the whole test suite
-	$(RUN) pytest
+test: setup ## Run the whole test suite, one worker a core
+	OMP_NUM_THREADS=1 $(RUN) pytest -n auto --dist loadfile
 
 check: lint type ## What CI checks besides the tests
 

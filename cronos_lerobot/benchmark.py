@@ -12,13 +12,15 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from lerobot_env_cronos import CronosVectorEnv, get_scene
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, get_scene
 from lerobot_env_cronos.expert import ScriptedExpert
 from lerobot_env_cronos.simulation import Simulation
 
-PARTS = ("physics", "state", "pixels", "expert", "train")
+PARTS = ("state", "pixels", "expert", "inference", "train")
 
 
 def rate(step: Callable[[], int], seconds: float) -> float:
@@ -91,7 +93,34 @@ def expert_rate(num_envs: int, scene: str, seconds: float) -> float:
     return rate(step, seconds)
 
 
-def train_rate(num_envs: int, scene: str, record_streams: str, updates: int = 3) -> dict[str, float]:
+def inference_rate(num_envs: int, scene: str, seconds: float) -> float:
+    """Observations per second that a fresh image PocketVLA turns into actions, preprocessing included."""
+    import torch
+    from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
+
+    from cronos_lerobot.data.schema import observation_columns
+    from cronos_lerobot.rl.processing import make_processors
+
+    env_config = CronosEnvConfig(scene=scene)
+    policy_config = make_policy_config("pocketvla", device="cpu", push_to_hub=False)
+    policy: Any = make_policy(policy_config, env_cfg=env_config).eval()
+    processors = make_processors(policy, *make_pre_post_processors(policy_config))
+    env = CronosVectorEnv(num_envs, scene, **env_config.gym_kwargs)
+    columns, instructions = observation_columns(env.observe()), env.instructions
+    env.close()
+
+    def step() -> int:
+        with torch.inference_mode():
+            sample = policy.sample_actions(processors.batch(columns, instructions))
+            processors.physical_actions(sample["action"])
+        return num_envs
+
+    return rate(step, seconds)
+
+
+def train_rate(
+    num_envs: int, scene: str, record_streams: str, frozen_encoder: bool, updates: int = 4
+) -> dict[str, float]:
     """Interaction steps per second of `cronos-train` on pixels, and the shares of its time, by update mean."""
     from lerobot.policies import make_policy_config
 
@@ -101,8 +130,14 @@ def train_rate(num_envs: int, scene: str, record_streams: str, updates: int = 3)
 
     with tempfile.TemporaryDirectory() as folder:
         config = CronosTrainConfig(
-            env=_env_config(scene),
-            policy=make_policy_config("pocketvla", device="cpu", push_to_hub=False),
+            env=CronosEnvConfig(scene=scene, privileged_state=True),
+            policy=make_policy_config(
+                "pocketvla",
+                device="cpu",
+                push_to_hub=False,
+                critic_observation="environment_state",
+                freeze_encoder=frozen_encoder,
+            ),
             output_dir=Path(folder) / "run",
             steps=updates * 160 * num_envs,
             num_envs=num_envs,
@@ -124,12 +159,6 @@ def train_rate(num_envs: int, scene: str, record_streams: str, updates: int = 3)
     return {"steps/s": float(np.mean([row["steps_per_s"] for row in rows]))} | shares
 
 
-def _env_config(scene: str):
-    from lerobot_env_cronos import CronosEnvConfig
-
-    return CronosEnvConfig(scene=scene, privileged_state=True)
-
-
 def main() -> None:
     """Print one line per part."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -141,6 +170,7 @@ def main() -> None:
         "--record_streams", nargs="*", default=["0", "1", "all"], help="streams recorded in `train`"
     )
     args = parser.parse_args()
+    register_third_party_plugins()
     print(f"{args.num_envs} streams of {args.scene}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
     bound = physics_rate(args.num_envs, args.scene, args.seconds)
     print(f"{'pure physics (bound)':28s} {bound:8.0f} steps/s  1.00")
@@ -151,11 +181,16 @@ def main() -> None:
     if "expert" not in args.skip:
         speed = expert_rate(args.num_envs, args.scene, args.seconds)
         print(f"{'scripted expert':28s} {speed:8.0f} steps/s  {speed / bound:.2f}")
+    if "inference" not in args.skip:
+        speed = inference_rate(args.num_envs, args.scene, args.seconds)
+        ms = 1000 * args.num_envs / speed
+        print(f"{'PocketVLA from pixels':28s} {speed:8.0f} steps/s  {speed / bound:.2f}  ({ms:.0f} ms a batch)")
     for streams in [] if "train" in args.skip else args.record_streams:
-        result = train_rate(args.num_envs, args.scene, streams)
-        shares = ", ".join(f"{k[6:]} {v:.0%}" for k, v in result.items() if k.startswith("share"))
-        name = f"cronos-train, recording {streams}"
-        print(f"{name:28s} {result['steps/s']:8.0f} steps/s  {result['steps/s'] / bound:.2f}  ({shares})")
+        for frozen in (True, False):
+            result = train_rate(args.num_envs, args.scene, streams, frozen)
+            shares = ", ".join(f"{k[6:]} {v:.0%}" for k, v in result.items() if k.startswith("share"))
+            name = f"cronos-train, pixels, {'frozen encoder' if frozen else 'all layers'}, {streams} recorded"
+            print(f"{name:52s} {result['steps/s']:8.0f} steps/s  {result['steps/s'] / bound:.2f}  ({shares})")
 
 
 if __name__ == "__main__":
