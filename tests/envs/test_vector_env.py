@@ -244,3 +244,20 @@ def test_errors_name_the_bad_value_and_the_valid_ones(kwargs, message):
         make(1, **kwargs)
     with pytest.raises(ValueError, match="unknown task"):
         make(1).set_task([0], [Task("banana", PLATE)])
+
+
+def test_environments_render_from_many_threads_at_once():
+    """Mesa's software rasteriser crashes when two threads draw at once; LeRobot may evaluate in threads."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    def frames(_: int) -> np.ndarray:
+        env = make(2, obs_type="pixels_agent_pos", observation_height=32, observation_width=32)
+        env.reset(seed=0)
+        seen = [env.step(np.tile(STILL, (2, 1)))[0]["pixels"]["front"] for _ in range(5)]
+        env.close()
+        return np.stack(seen)
+
+    with ThreadPoolExecutor(4) as pool:
+        results = list(pool.map(frames, range(8)))
+    for result in results[1:]:
+        np.testing.assert_array_equal(result, results[0])

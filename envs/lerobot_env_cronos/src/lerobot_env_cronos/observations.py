@@ -1,6 +1,5 @@
 """Observations: pixels, proprioception and the privileged state, in Gymnasium's and LeRobot's raw format."""
 
-import os
 from typing import Any
 
 import gymnasium as gym
@@ -36,11 +35,6 @@ def environment_state_names(scene: Scene) -> tuple[str, ...]:
         *(f"from_ee.{axis}" for axis in "xyz"),
     )
     return tuple(f"{body}.{part}".replace(" ", "_") for body in scene.bodies for part in parts)
-
-
-def default_render_workers() -> int:
-    """Two rendering threads where there are two cores: each software-rendered frame keeps one busy."""
-    return min(2, os.cpu_count() or 1)
 
 
 class ObservationBuilder:
@@ -112,8 +106,7 @@ class ObservationBuilder:
     def _renderer(self, size: tuple[int, int], camera: str) -> BatchRenderer:
         key = (size, camera)
         if key not in self._renderers:
-            workers = min(default_render_workers(), self.simulation.num_sims)
-            self._renderers[key] = BatchRenderer(self.simulation.model, *size, camera, workers)
+            self._renderers[key] = BatchRenderer(self.simulation.model, *size, camera)
         return self._renderers[key]
 
     def close(self) -> None:

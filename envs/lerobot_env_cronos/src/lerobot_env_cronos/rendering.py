@@ -1,4 +1,9 @@
-"""Frames of many simulations, by MuJoCo's classic renderer on a few threads."""
+"""Frames of many simulations, by MuJoCo's classic renderer.
+
+All OpenGL work of a process is done in one thread. A context belongs to the thread in which it is current, and
+Mesa's software rasteriser, which spreads every frame over the cores by itself, crashes when two threads draw at
+once.
+"""
 
 import os
 import weakref
@@ -9,67 +14,59 @@ import numpy as np
 
 from lerobot_env_cronos import gl
 
+_GL_THREAD = ThreadPoolExecutor(1, thread_name_prefix="opengl")
+
 
 class BatchRenderer:
     """Renders `camera` of simulation states at `height` x `width`.
 
-    Each worker thread owns one OpenGL context, created and used in that thread only. Shadows and reflections
-    are off unless asked for: in software rendering they cost five times the rest of the frame.
+    Shadows and reflections are off unless asked for: in software rendering they cost five times the rest of the
+    frame.
+
+    Raises:
+        KeyError: the model has no such camera.
+        RuntimeError: no OpenGL context can be opened.
     """
 
-    def __init__(
-        self, model: mujoco.MjModel, height: int, width: int, camera: str, num_workers: int = 1, shadows=False
-    ):
-        if model.camera(camera).id < 0:  # pragma: no cover - model.camera raises with the valid names
-            raise ValueError(f"unknown camera {camera!r}")
-        self.model, self.height, self.width, self.camera = model, height, width, camera
-        self._shadows = shadows
-        self._pools = [ThreadPoolExecutor(1, thread_name_prefix="render") for _ in range(num_workers)]
-        self._workers = [pool.submit(self._make_worker).result() for pool in self._pools]
-        self._finalizer = weakref.finalize(self, _free, self._pools, self._workers)
+    def __init__(self, model: mujoco.MjModel, height: int, width: int, camera: str, *, shadows: bool = False):
+        self.model, self.height, self.width = model, height, width
+        self.camera = model.camera(camera).id
+        self._data = mujoco.MjData(model)
+        self._renderer = _GL_THREAD.submit(_open, model, height, width, shadows).result()
+        self._finalizer = weakref.finalize(self, _close, self._renderer)
 
-    def _make_worker(self) -> tuple[mujoco.Renderer, mujoco.MjData]:
-        try:
-            renderer = mujoco.Renderer(self.model, self.height, self.width, max_geom=500)
-        except Exception as error:  # The platforms raise whatever their bindings do.
-            raise RuntimeError(gl.HELP.format(platform=os.environ.get("MUJOCO_GL"))) from error
-        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._shadows
-        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = self._shadows
-        return renderer, mujoco.MjData(self.model)
-
-    def render(self, qpos: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+    def render(self, qpos: np.ndarray) -> np.ndarray:
         """Render states `qpos` (n, nq) to uint8 frames (n, height, width, 3)."""
-        n = len(qpos)
-        frames = np.empty((n, self.height, self.width, 3), np.uint8) if out is None else out
-        k = len(self._workers)
-        jobs = [
-            pool.submit(_render_some, worker, self.camera, qpos, frames, range(i, n, k))
-            for i, (pool, worker) in enumerate(zip(self._pools, self._workers, strict=True))
-        ]
-        for job in jobs:
-            job.result()
+        return _GL_THREAD.submit(self._render, qpos).result()
+
+    def _render(self, qpos: np.ndarray) -> np.ndarray:
+        frames = np.empty((len(qpos), self.height, self.width, 3), np.uint8)
+        for frame, q in zip(frames, qpos, strict=True):
+            self._data.qpos[:] = q
+            mujoco.mj_kinematics(self.model, self._data)
+            mujoco.mj_camlight(self.model, self._data)
+            self._renderer.update_scene(self._data, camera=self.camera)
+            self._renderer.render(out=frame)
         return frames
 
     def close(self) -> None:
-        """Free the OpenGL contexts; also done when the renderer is garbage-collected."""
+        """Free the OpenGL context; also done when the renderer is garbage-collected."""
         self._finalizer()
 
 
-def _free(pools: list[ThreadPoolExecutor], workers: list) -> None:
-    """Free each OpenGL context in the thread in which it is current: elsewhere EGL refuses."""
-    for pool, (renderer, _) in zip(pools, workers, strict=True):
-        try:
-            pool.submit(renderer.close).result()
-        except RuntimeError:  # At interpreter exit the threads are gone, and so is their hold on the context.
-            renderer.close()
-        pool.shutdown()
+def _open(model: mujoco.MjModel, height: int, width: int, shadows: bool) -> mujoco.Renderer:
+    try:
+        renderer = mujoco.Renderer(model, height, width, max_geom=500)
+    except Exception as error:  # The platforms raise whatever their bindings do.
+        raise RuntimeError(gl.HELP.format(platform=os.environ.get("MUJOCO_GL"))) from error
+    renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+    renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = shadows
+    return renderer
 
 
-def _render_some(worker, camera: str, qpos: np.ndarray, frames: np.ndarray, indices: range) -> None:
-    renderer, data = worker
-    for i in indices:
-        data.qpos[:] = qpos[i]
-        mujoco.mj_kinematics(renderer.model, data)
-        mujoco.mj_camlight(renderer.model, data)
-        renderer.update_scene(data, camera=camera)
-        renderer.render(out=frames[i])
+def _close(renderer: mujoco.Renderer) -> None:
+    # Nobody waits for it: the garbage collector may run in the OpenGL thread itself.
+    try:
+        _GL_THREAD.submit(renderer.close)
+    except RuntimeError:  # At interpreter exit the thread is gone, and so is its hold on the context.
+        renderer.close()
