@@ -53,8 +53,8 @@ class Scale:
 
 SCALES = {
     "full": Scale(
-        demos=300,
-        clone_steps=1500,
+        demos=400,
+        clone_steps=320,
         clone_batch=256,
         train_steps=327_680,
         streams=64,
@@ -82,8 +82,9 @@ SCALES = {
     ),
 }
 
-RECORD_FLAGS = ["--seed=1"]
-"""Flags of `cronos-record-demos` that no scale changes."""
+RECORD_FLAGS = ["--seed=1", "--noise.share=0.75", "--misses.share=0.25", "--steps_after_release=8"]
+"""Flags of `cronos-record-demos` that no scale changes. Noise and misses show how to recover; the frames after the
+release show that a finished task is left alone."""
 CLONE_FLAGS = ["--seed=1"]
 """Flags of `lerobot-train` that no scale changes."""
 TRAIN_FLAGS = ["--seed=1", "--protocol.end_effector_reset=true"]
@@ -124,7 +125,7 @@ def clone_step(scale: Scale, demos: Path, base: Path) -> Step:
         f"--batch_size={scale.clone_batch}",
         f"--steps={scale.clone_steps}",
         f"--save_freq={scale.clone_steps}",
-        "--log_freq=250",
+        "--log_freq=40",
         "--num_workers=0",
         "--wandb.enable=false",
         f"--output_dir={base}",
