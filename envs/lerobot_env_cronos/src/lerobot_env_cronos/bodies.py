@@ -47,6 +47,19 @@ def _add_shovel(spec_body: mujoco.MjsBody, body: Body) -> None:
     _add_geom(spec_body, body, box, [SHOVEL_HANDLE_HALF_WIDTH, hy - blade_hy, hz], [0, blade_hy, 0])
 
 
+BEAR_BODY_SHARE = 0.55
+BEAR_HEAD_DEPTH, BEAR_HEAD_WIDTH = 0.75, 0.85
+
+
+def _add_bear(spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A sitting bear: body and legs as wide as the bounding box, so that it stands firmly, and a smaller head."""
+    hx, hy, hz = (s / 2 for s in body.size)
+    lower, upper = BEAR_BODY_SHARE * hz, (1 - BEAR_BODY_SHARE) * hz
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    _add_geom(spec_body, body, box, [hx, hy, lower], [0, 0, -hz + lower])
+    _add_geom(spec_body, body, box, [BEAR_HEAD_DEPTH * hx, BEAR_HEAD_WIDTH * hy, upper], [0, 0, hz - upper])
+
+
 def _add_plate(spec_body: mujoco.MjsBody, body: Body) -> None:
     _add_geom(spec_body, body, mujoco.mjtGeom.mjGEOM_CYLINDER, [body.size[0] / 2, body.size[2] / 2, 0])
 
@@ -60,7 +73,14 @@ SHAPES: dict[str, Callable[[mujoco.MjsBody, Body], None]] = {
     "shovel": _add_shovel,
     "plate": _add_plate,
     "cloth": _add_slab,
+    "bear": _add_bear,
+    "water bottle": _add_bottle,
+    "carpet": _add_slab,
+    "newspaper": _add_slab,
+    "box": _add_slab,
+    "disc": _add_plate,
 }
+"""How to build a body, by `Body.shape`; another shape is another entry here and in `visuals.objects.LOOKS`."""
 
 
 def add_body(spec: mujoco.MjSpec, body: Body) -> mujoco.MjsBody:

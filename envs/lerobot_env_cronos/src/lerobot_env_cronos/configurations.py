@@ -1,13 +1,14 @@
 """Benchmark configurations: frozen poses of every body, 64 for training and 64 held out per scene.
 
 They were drawn once by `python -m lerobot_env_cronos.configurations SCENE` from a fixed seed and are data of this
-package (`data/<scene>.json`); a change of them is a new version of the environment id.
+package (`data/<scene>.json`); a change of them is a new version of the environment id. Scenes from outside the
+package come with a file of their own, or theirs are drawn from the same seed when they are first used.
 """
 
 import argparse
 import json
 from functools import cache
-from importlib import resources
+from importlib import import_module, resources
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,9 @@ CLEARANCE_M = 0.015
 """Smallest gap between the footprints of two bodies [m]."""
 OBJECT_YAWS = np.array([0.0, 0.25, 0.5, 0.75]) * np.pi
 RECEPTACLE_YAWS = np.array([0.0, 0.5]) * np.pi
-MAX_ATTEMPTS = 10_000
+MAX_ATTEMPTS, MAX_RESTARTS = 10_000, 20
+SEED = 2026
+"""Of the packaged configurations, and of those of scenes without a file."""
 
 
 def _check_split(split: str) -> None:
@@ -31,18 +34,48 @@ def _check_split(split: str) -> None:
         raise ValueError(f"unknown split {split!r}; valid splits: {list(SPLITS)}")
 
 
-@cache
+_files: dict[str, Path] = {}
+"""Files of scenes that are not part of the package."""
+
+
 def load_configurations(scene_name: str, split: str) -> np.ndarray:
     """Poses (64, bodies, 7) of a split: position [m], quaternion (w, x, y, z), bodies in the scene's order."""
     _check_split(split)
-    scene = get_scene(scene_name)
-    text = resources.files("lerobot_env_cronos").joinpath(f"data/{scene.name}.json").read_text()
-    content = json.loads(text)
+    return _load_splits(get_scene(scene_name), _files.get(scene_name))[split]
+
+
+def set_configurations_file(scene: Scene, path: Path) -> None:
+    """Read the configurations of `scene` from `path` from now on.
+
+    Raises:
+        ValueError: the file is of other bodies, or a split has not 64 configurations.
+    """
+    _load_splits(scene, path)
+    _files[scene.name] = path
+
+
+@cache
+def _load_splits(scene: Scene, path: Path | None) -> dict[str, np.ndarray]:
+    packaged = resources.files("lerobot_env_cronos").joinpath(f"data/{scene.name}.json")
+    if path is not None or packaged.is_file():
+        content = json.loads((path or packaged).read_text())
+        _check_content(scene, content, path or packaged)
+    else:
+        content = _generate(scene, SEED)
+    splits = {split: np.array(content["splits"][split]) for split in SPLITS}
+    for poses in splits.values():
+        poses.flags.writeable = False
+    return splits
+
+
+def _check_content(scene: Scene, content: dict, source: object) -> None:
     if tuple(content["bodies"]) != scene.bodies or content["version"] != VERSION:
-        raise ValueError(f"data/{scene.name}.json is of bodies {content['bodies']}, v{content['version']}")
-    poses = np.array(content["splits"][split])
-    poses.flags.writeable = False
-    return poses
+        found = f"v{content['version']} of bodies {content['bodies']}"
+        raise ValueError(f"{source} is {found}; {scene.name} needs v{VERSION} of bodies {list(scene.bodies)}")
+    shape = (NUM_CONFIGURATIONS, len(scene.bodies), 7)
+    for split in SPLITS:
+        if np.shape(content["splits"].get(split)) != shape:
+            raise ValueError(f"split {split} of {source} must be of shape {shape}")
 
 
 def footprint_corners(name: str, xy: np.ndarray, yaw: float) -> np.ndarray:
@@ -90,8 +123,12 @@ def sample_place(
 
 
 def sample_configuration(scene: Scene, rng: np.random.Generator) -> np.ndarray:
-    """Draw poses (bodies, 7) of all bodies at rest on the table, no two touching."""
-    while True:
+    """Draw poses (bodies, 7) of all bodies at rest on the table, no two touching.
+
+    Raises:
+        RuntimeError: the bodies do not fit into the spawn area.
+    """
+    for _ in range(MAX_RESTARTS):
         poses, footprints = {}, []
         try:
             # Receptacles are large: placed first, they leave room for the objects.
@@ -101,6 +138,10 @@ def sample_configuration(scene: Scene, rng: np.random.Generator) -> np.ndarray:
         except RuntimeError:
             continue
         return np.stack([poses[body] for body in scene.bodies])
+    raise RuntimeError(
+        f"{scene.name}: {len(scene.bodies)} bodies do not fit into the spawn area {scene.spawn_low} to "
+        f"{scene.spawn_high} with {CLEARANCE_M} m between them"
+    )
 
 
 def _generate(scene: Scene, seed: int) -> dict:
@@ -113,17 +154,25 @@ def _generate(scene: Scene, seed: int) -> dict:
     return {"scene": scene.name, "version": VERSION, "seed": seed, "bodies": scene.bodies, "splits": splits}
 
 
+def write_configurations(scene_name: str, folder: Path, seed: int = SEED) -> Path:
+    """Draw the configurations of a scene and write them to `folder/<scene>.json`; returns the path."""
+    scene = get_scene(scene_name)
+    path = folder / f"{scene.name}.json"
+    path.write_text(json.dumps(_generate(scene, seed)) + "\n")
+    return path
+
+
 def main() -> None:
     """Write the configurations of a scene; for maintainers, when a new version is made."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("scene")
-    parser.add_argument("--seed", type=int, default=2026)
-    parser.add_argument("--output", type=Path, default=Path("."))
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--output", type=Path, default=Path("."), help="folder")
+    parser.add_argument("--discover_packages_path", help="package to import first, which registers the scene")
     args = parser.parse_args()
-    scene = get_scene(args.scene)
-    path = args.output / f"{scene.name}.json"
-    path.write_text(json.dumps(_generate(scene, args.seed)) + "\n")
-    print(f"wrote {path}")
+    if args.discover_packages_path:
+        import_module(args.discover_packages_path)
+    print(f"wrote {write_configurations(args.scene, args.output, args.seed)}")
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import argparse
 import csv
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, fields
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -141,12 +142,15 @@ def _parse_args() -> argparse.Namespace:
     parser.add_argument("--num_segments", type=int, default=16)
     parser.add_argument("--no_end_effector_reset", action="store_true", help="leave the arm where it is")
     parser.add_argument("--output", type=Path, help="folder for CSV and PNG files")
+    parser.add_argument("--discover_packages_path", help="package to import first, which registers the scene")
     return parser.parse_args()
 
 
 def main() -> None:
     """Measure, print and write the ceiling of a scene."""
     args = _parse_args()
+    if args.discover_packages_path:
+        import_module(args.discover_packages_path)
     env = CronosVectorEnv(NUM_CONFIGURATIONS, args.scene, obs_type=STATE_OBSERVATIONS)
     independent = []
     for split in SPLITS:

@@ -16,6 +16,11 @@ COLOURS: dict[str, tuple[tuple[float, float, float], float, float]] = {
     "handle": ((0.10, 0.24, 0.66), 0.4, 0.5),
     "yellow ceramic": ((1.0, 0.78, 0.02), 0.4, 0.6),
     "yellow glaze": ((1.0, 0.88, 0.28), 0.4, 0.6),
+    "fur": ((0.50, 0.28, 0.11), 0.05, 0.1),
+    "light fur": ((0.90, 0.72, 0.47), 0.05, 0.1),
+    "bead": ((0.06, 0.05, 0.05), 0.5, 0.6),
+    "clear plastic": ((0.50, 0.82, 0.95), 0.7, 0.7),
+    "bottle label": ((0.07, 0.25, 0.72), 0.2, 0.3),
     "oak": ((0.74, 0.67, 0.58), 0.1, 0.3),
     "light oak": ((0.77, 0.70, 0.605), 0.1, 0.3),
     "dark oak": ((0.71, 0.64, 0.55), 0.1, 0.3),
@@ -28,7 +33,13 @@ def add_materials(spec: mujoco.MjSpec) -> None:
     """Add every material and texture that the visuals name."""
     for name, (rgb, specular, shininess) in COLOURS.items():
         spec.add_material(name=name, rgba=[*rgb, 1.0], specular=specular, shininess=shininess)
-    _add_textured(spec, "cloth", _gingham(64))
+    for name, image in {"cloth": _gingham(64), "carpet": _rug(64), "newspaper": _front_page(64)}.items():
+        _add_textured(spec, name, image)
+
+
+def add_plain_material(spec: mujoco.MjSpec, name: str, colour: tuple[float, float, float]) -> None:
+    """Add an untextured material of a body's own colour (RGB, 0 to 1)."""
+    spec.add_material(name=name, rgba=[*colour, 1.0], specular=0.2, shininess=0.3)
 
 
 def _add_textured(spec: mujoco.MjSpec, name: str, image: np.ndarray) -> None:
@@ -45,3 +56,29 @@ def _gingham(n: int) -> np.ndarray:
     stripe = (np.arange(n) * 5 // n) % 2 == 0
     cover = (stripe[:, None] * 0.5 + stripe[None] * 0.5)[..., None]
     return (1 - cover) * np.array([0.97, 0.96, 0.99]) + cover * np.array([0.44, 0.27, 0.72])
+
+
+def _rug(n: int) -> np.ndarray:
+    """A crimson rug (n, n, 3) with a navy and cream border and a diamond in the middle."""
+    crimson, navy, cream = np.array([[0.62, 0.06, 0.10], [0.10, 0.12, 0.34], [0.94, 0.85, 0.66]])
+    x = np.abs((np.arange(n) + 0.5) / n * 2 - 1)
+    edge, diamond = np.maximum(x[:, None], x[None]), x[:, None] + x[None]
+    image = np.broadcast_to(crimson, (n, n, 3)).copy()
+    image[diamond < 0.62] = cream
+    image[diamond < 0.44] = navy
+    image[edge > 0.74] = cream
+    image[edge > 0.84] = navy
+    return image
+
+
+def _front_page(n: int) -> np.ndarray:
+    """The folded front page of a newspaper (n, n, 3), read from the front: columns run along the y axis."""
+    paper, ink, grey = np.array([0.93, 0.92, 0.88]), np.array([0.10, 0.10, 0.12]), np.array([0.50, 0.50, 0.52])
+    page = np.broadcast_to(paper, (n, n, 3)).copy()  # (from top to bottom, from left to right)
+    row, column = np.arange(n)[:, None] / n, np.arange(n)[None] / n
+    inside = (column > 0.06) & (column < 0.94)
+    page[(row > 0.08) & (row < 0.25) & inside & (column * 9 % 1 < 0.8)] = ink
+    page[(row > 0.31) & (row < 0.34) & inside] = ink
+    page[(row > 0.41) & (row < 0.94) & (np.arange(n)[:, None] % 8 < 4) & inside & (column * 3.4 % 1 < 0.86)] = grey
+    page[(row > 0.43) & (row < 0.78) & (column > 0.52) & (column < 0.94)] = [0.42, 0.46, 0.55]
+    return page.transpose(1, 0, 2)

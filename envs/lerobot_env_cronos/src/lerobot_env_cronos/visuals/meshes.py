@@ -136,11 +136,17 @@ def stack(
 
 
 def add_visual(
-    spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, material: str, *parts: Surface, texture_size: float = 0.0
+    spec: mujoco.MjSpec,
+    body: mujoco.MjsBody,
+    name: str,
+    material: str,
+    *parts: Surface,
+    texture_size: float | tuple[float, float] = 0.0,
 ) -> None:
     """Add the merged `parts` to `body` as one visual geom.
 
-    With a `texture_size` [m] the mesh is textured as seen from above, one repeat per `texture_size`.
+    With a `texture_size` (x and y, or one for both) [m] the mesh is textured as seen from above, one repeat per
+    `texture_size`.
     """
     vertices, faces = merge(*parts)
     corners = vertices[faces].reshape(-1, 3)

@@ -6,15 +6,21 @@ import mujoco
 
 from lerobot_env_cronos.bodies import SHOVEL_BLADE_SHARE, SHOVEL_HANDLE_HALF_WIDTH
 from lerobot_env_cronos.scenes import Body
+from lerobot_env_cronos.visuals.materials import add_plain_material
 from lerobot_env_cronos.visuals.meshes import (
+    Surface,
     add_visual,
     box,
     circle,
+    cylinder,
     prism,
     rounded_rectangle,
     stack,
     superellipse,
 )
+
+DEFAULT_COLOUR = (0.55, 0.55, 0.58)
+"""RGB of a plain body without a colour of its own."""
 
 
 def _dress_bottle(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
@@ -71,10 +77,96 @@ def _dress_cloth(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> 
     add_visual(spec, spec_body, body.name, "cloth", surface, texture_size=max(body.size))
 
 
+def _dress_bear(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A teddy bear that sits upright and looks along +x: brown, with a pale snout, tummy and soles."""
+    hx, hy, hz = (s / 2 for s in body.size)
+    limb, ear, back = 0.36 * hy, 0.34 * hy, -0.25 * hx
+    torso = stack(
+        superellipse(0.75 * hx, 0.84 * hy, 2.4, 10),
+        [(-hz, 0.74), (-0.76 * hz, 0.98), (-0.42 * hz, 1.0), (-0.08 * hz, 0.82), (0.12 * hz, 0.6)],
+        caps="none", pos=(back, 0, 0),
+    )  # fmt: skip
+    head = stack(
+        superellipse(0.75 * hx, 0.86 * hy, 2.2, 10),
+        [(-0.06 * hz, 0.55), (0.14 * hz, 0.92), (0.42 * hz, 1.0), (0.68 * hz, 0.86), (0.86 * hz, 0.45)],
+        caps="last", pos=(back, 0, 0),
+    )  # fmt: skip
+    legs, arms, ears, soles = [], [], [], []
+    for side in (-1, 1):
+        y = side * (hy - limb)
+        legs.append(cylinder(limb, -0.2 * hx, 0.96 * hx, "x", (0, y, -hz + limb), 8, "last"))
+        arms.append(
+            cylinder(0.8 * limb, -0.4 * hx, 0.62 * hx, "x", (0, side * (hy - 0.8 * limb), -0.2 * hz), 8, "last")
+        )
+        ears.append(cylinder(ear, -0.45 * hx, -0.1 * hx, "x", (0, side * (hy - ear), hz - ear), 8))
+        soles.append(cylinder(0.7 * limb, 0.96 * hx, hx, "x", (0, y, -hz + limb), 8, "last"))
+    add_visual(spec, spec_body, body.name, "fur", torso, head, *legs, *arms, *ears)
+    snout = cylinder(0.36 * hy, 0.2 * hx, 0.76 * hx, "x", (0, 0, 0.26 * hz), 8, "last")
+    tummy = cylinder(0.48 * hy, 0.3 * hx, 0.54 * hx, "x", (0, 0, -0.42 * hz), 8, "last")
+    add_visual(spec, spec_body, f"{body.name} pale", "light fur", snout, tummy, *soles)
+    eyes = [
+        cylinder(0.13 * hy, 0.3 * hx, 0.5 * hx, "x", (0, s * 0.42 * hy, 0.56 * hz), 6, "last") for s in (-1, 1)
+    ]
+    nose = cylinder(0.17 * hy, 0.7 * hx, 0.86 * hx, "x", (0, 0, 0.36 * hz), 6, "last")
+    add_visual(spec, spec_body, f"{body.name} face", "bead", nose, *eyes)
+
+
+def _dress_water_bottle(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A pale blue bottle lying along y, with a dark blue label and a white screw cap at +y."""
+    hx, hy, hz = (s / 2 for s in body.size)
+    outline = superellipse(hx, hz, 2.6)
+    shoulder, neck, cap = 0.30 * hy, 0.70 * hy, 0.78 * hy
+    profile = [(-hy, 0.80), (-0.95 * hy, 0.99), (shoulder, 0.99), (0.5 * hy, 0.72), (neck, 0.42), (cap, 0.42)]
+    add_visual(spec, spec_body, body.name, "clear plastic", stack(outline, profile, "y", "first"))
+    label = prism(outline, -0.58 * hy, 0.10 * hy, "y", "none")
+    add_visual(spec, spec_body, f"{body.name} label", "bottle label", label)
+    screw = prism(circle(0.52 * hx, 8), cap, hy, "y")
+    add_visual(spec, spec_body, f"{body.name} cap", "white plastic", screw)
+
+
+def _dress_carpet(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A crimson rug with a border and a diamond."""
+    hx, hy, hz = (s / 2 for s in body.size)
+    surface = box((-hx, -hy, -hz), (hx, hy, hz), caps="last")
+    add_visual(spec, spec_body, body.name, "carpet", surface, texture_size=body.size[:2])
+
+
+def _dress_newspaper(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A folded newspaper: a lower layer that shows at the edges and the front page on top."""
+    hx, hy, hz = (s / 2 for s in body.size)
+    edge = 0.0012
+    lower = box((-hx, -hy, -hz), (hx, hy, 0.2 * hz), caps="last")
+    upper = box((-hx + edge, -hy + edge, 0.2 * hz), (hx - edge, hy - edge, hz), caps="last")
+    add_visual(spec, spec_body, body.name, "newspaper", lower, upper, texture_size=body.size[:2])
+
+
+def _dress_box(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A plain box of the body's colour."""
+    hx, hy, hz = (s / 2 for s in body.size)
+    _add_plain(spec, spec_body, body, box((-hx, -hy, -hz), (hx, hy, hz)))
+
+
+def _dress_disc(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A plain disc of the body's colour."""
+    _add_plain(spec, spec_body, body, cylinder(body.size[0] / 2, -body.size[2] / 2, body.size[2] / 2, sides=24))
+
+
+def _add_plain(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body, surface: Surface) -> None:
+    material = f"{body.name} colour"
+    add_plain_material(spec, material, body.colour or DEFAULT_COLOUR)
+    add_visual(spec, spec_body, body.name, material, surface)
+
+
 LOOKS: dict[str, Callable[[mujoco.MjSpec, mujoco.MjsBody, Body], None]] = {
     "bottle": _dress_bottle,
     "shovel": _dress_shovel,
     "plate": _dress_plate,
     "cloth": _dress_cloth,
+    "bear": _dress_bear,
+    "water bottle": _dress_water_bottle,
+    "carpet": _dress_carpet,
+    "newspaper": _dress_newspaper,
+    "box": _dress_box,
+    "disc": _dress_disc,
 }
 """How to draw a body, by `Body.shape`."""
