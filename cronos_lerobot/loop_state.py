@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from cronos_lerobot.rl.policy import ActionSample
 
 
+HISTORY = 32
+"""Segments of each stream that `LoopState` remembers one by one."""
+
+
 @dataclass
 class LoopState:
     """Counters of Algorithm 1 for `num_streams` streams; all of it is in every checkpoint.
@@ -23,6 +27,9 @@ class LoopState:
 
     num_streams: int
     num_tasks: int
+    """Tasks that are evaluated: indices 0 .. num_tasks - 1 of the task set."""
+    num_reset_tasks: int = 0
+    """Learned reset tasks, behind them in the task set. With any, every second segment is one."""
     t: int = 0
     """Control steps taken by each stream."""
     switches: int = 0
@@ -40,9 +47,13 @@ class LoopState:
     preceded_by: np.ndarray = field(init=False)
     """(N,) Intervention between the last step and the next one."""
     attempts: np.ndarray = field(init=False)
-    """(N, num_tasks) finished segments of each task."""
+    """(N, tasks) finished segments of each task of the task set, reset tasks included."""
     successes: np.ndarray = field(init=False)
-    """(N, num_tasks) finished segments of each task with a success."""
+    """(N, tasks) finished segments of each task with a success."""
+    recent_task: np.ndarray = field(init=False)
+    """(N, HISTORY) tasks of the latest segments, the last one at the end; -1 where there was none yet."""
+    recent_success: np.ndarray = field(init=False)
+    """(N, HISTORY) whether they were a success: 1 or 0; -1 where there was none yet."""
     interventions: np.ndarray = field(init=False)
     """(N, len(Intervention)) events of each kind."""
 
@@ -53,14 +64,21 @@ class LoopState:
         self.position = np.zeros(n, np.int64)
         self.succeeded = np.zeros(n, np.bool_)
         self.preceded_by = np.full(n, Intervention.NONE, np.int64)
-        self.attempts = np.zeros((n, self.num_tasks), np.int64)
-        self.successes = np.zeros((n, self.num_tasks), np.int64)
+        self.attempts = np.zeros((n, self.num_tasks + self.num_reset_tasks), np.int64)
+        self.successes = np.zeros_like(self.attempts)
+        self.recent_task = np.full((n, HISTORY), -1, np.int64)
+        self.recent_success = np.full((n, HISTORY), -1, np.int64)
         self.interventions = np.zeros((n, len(Intervention)), np.int64)
 
     @property
     def n(self) -> int:
         """Interaction steps, summed over the streams."""
         return self.t * self.num_streams
+
+    @property
+    def round(self) -> int:
+        """Tasks that each stream has been given so far, reset tasks not counted."""
+        return (self.switches + 1) // 2 if self.num_reset_tasks else self.switches
 
     @property
     def b(self) -> int:
@@ -107,6 +125,8 @@ class LoopState:
         streams = np.arange(self.num_streams)
         self.attempts[streams, self.task] += 1
         self.successes[streams, self.task] += self.succeeded
+        self.recent_task = np.column_stack([self.recent_task[:, 1:], self.task])
+        self.recent_success = np.column_stack([self.recent_success[:, 1:], self.succeeded])
         self.succeeded = np.zeros(self.num_streams, np.bool_)
         self.position += 1
         return end
@@ -118,7 +138,7 @@ class LoopState:
     @classmethod
     def from_state_dict(cls, state: dict[str, Any]) -> LoopState:
         """Inverse of `state_dict`."""
-        loop = cls(state["num_streams"], state["num_tasks"])
+        loop = cls(state["num_streams"], state["num_tasks"], state["num_reset_tasks"])
         for name, value in state.items():
             template = getattr(loop, name)
             if isinstance(template, np.ndarray):

@@ -8,6 +8,9 @@ from cronos_lerobot.data.schema import Intervention
 
 REWARDS = ("difference", "level")
 
+NUM_TRAIN_CONFIGURATIONS = 64
+"""Benchmark configurations of the training split (paper, Section 5)."""
+
 COUNTED_INTERVENTIONS = (Intervention.SCENE_RESET, Intervention.HEURISTIC_RESET, Intervention.DIVERGENCE)
 """What spends the budget B. Task switches, end-effector resets and the first placement are free."""
 
@@ -29,13 +32,18 @@ class ProtocolConfig:
     end_effector_reset: bool = True
     """Send the arm home at every task switch (EER). The objects stay; it costs no intervention."""
     heuristic_reset: bool = False
-    """Put back bodies that left the workspace at a task switch (HSR)."""
+    """At a task switch, put back the bodies that no task can reach any more (HSR). It is an intervention."""
     learned_reset: bool = False
-    """Alternate tasks with learned reset tasks (LSR)."""
+    """After every task, the stream is told to put that object back on the table (LSR)."""
+    extra_resets: list[str] = field(default_factory=list)
+    """Your own strategies by their registered names, applied in this order between HSR and the scene reset."""
     reset_budget: int | None = None
     """B: stop once this many interventions, summed over the streams, have been spent. null is no limit."""
     task_order: str = "heuristic"
-    """How the next task is chosen: `heuristic` (the fixed cycle of Appendix E) or `random`."""
+    """How the next task is chosen: `heuristic` (the fixed cycle of Appendix E), `random` (uniform) or the name of
+    a registered order."""
+    num_configurations: int = 64
+    """Scene resets draw from the first so many configurations of the training split, 1 to 64."""
     reward: str = "difference"
     """`difference` pays the change of the reward level (0.1 grasped, 1.0 success) between two steps, `level`
     pays the level at every step."""
@@ -51,9 +59,11 @@ class ProtocolConfig:
             raise ValueError(f"protocol.reset_budget must be >= 1 or null, got {self.reset_budget}.")
         if self.reward not in REWARDS:
             raise ValueError(f"protocol.reward must be one of {REWARDS}, got {self.reward!r}.")
-        for name in ("heuristic_reset", "learned_reset"):
-            if getattr(self, name):
-                raise ValueError(f"protocol.{name}=true is not available in this version of cronos-lerobot.")
+        if not 1 <= self.num_configurations <= NUM_TRAIN_CONFIGURATIONS:
+            raise ValueError(
+                f"protocol.num_configurations must be 1 to {NUM_TRAIN_CONFIGURATIONS}, "
+                f"got {self.num_configurations}."
+            )
 
     def scene_reset_interval_at(self, interaction_step: int) -> int | None:
         """T in force at `interaction_step` (summed over the streams); None means no periodic reset."""

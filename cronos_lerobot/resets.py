@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,16 +11,18 @@ import numpy as np
 
 from cronos_lerobot.data.schema import Intervention
 from cronos_lerobot.loop_state import LoopState
-from cronos_lerobot.protocol import ProtocolConfig
-
-NUM_TRAIN_CONFIGURATIONS = 64
-"""Benchmark configurations of the training split (paper, Section 5)."""
+from cronos_lerobot.protocol import NUM_TRAIN_CONFIGURATIONS, ProtocolConfig
 
 
 class ResetStrategy(ABC):
-    """One kind of intervention: which streams need it now, and how it is applied to them."""
+    """One kind of intervention: which streams need it now, and how it is applied to them.
+
+    It keeps nothing of its own besides its generator; what it has to remember of a stream is in `LoopState`, so
+    that a run can be resumed.
+    """
 
     kind: Intervention
+    """What it is counted and recorded as; `protocol.COUNTED_INTERVENTIONS` are those that spend the budget."""
 
     @abstractmethod
     def due(self, env: Any, loop: LoopState) -> np.ndarray:
@@ -67,19 +69,48 @@ class EndEffectorReset(ResetStrategy):
         env.end_effector_reset(ids)
 
 
-class SceneReset(ResetStrategy):
-    """Bodies go back to a random training configuration and the arm goes home. The base of two strategies.
+class HeuristicReset(ResetStrategy):
+    """Bodies that no task can reach any more are put back on the table, the others stay (HSR).
+
+    A body is, if its centre is outside the end effector's workspace or the camera's picture, or if it fell; see
+    `lerobot_env_cronos.workspace`. One event for each stream, however many bodies it had to put back.
 
     Args:
-        rng: draws the configuration, 0..63 of the train split, one for each stream.
+        rng: draws the free places.
     """
+
+    kind = Intervention.HEURISTIC_RESET
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
 
+    def due(self, env: Any, loop: LoopState) -> np.ndarray:
+        """Streams with an unsuitable body."""
+        return np.flatnonzero(env.unsuitable_bodies().any(axis=1))
+
+    def apply(self, env: Any, ids: np.ndarray) -> None:
+        """Put every unsuitable body of the streams `ids` at a free place."""
+        unsuitable = env.unsuitable_bodies()
+        for stream in ids:
+            for body in np.flatnonzero(unsuitable[stream]):
+                env.put_back(int(stream), env.scene.bodies[body], self.rng)
+
+
+class SceneReset(ResetStrategy):
+    """Bodies go back to a random training configuration and the arm goes home. The base of three strategies.
+
+    Args:
+        rng: draws the configuration of the train split, one for each stream.
+        num_configurations: draws only from the first so many of the split's 64.
+    """
+
+    def __init__(self, rng: np.random.Generator, num_configurations: int = NUM_TRAIN_CONFIGURATIONS) -> None:
+        self.rng = rng
+        self.num_configurations = num_configurations
+
     def apply(self, env: Any, ids: np.ndarray) -> None:
         """Place the streams `ids` in configurations of the training split."""
-        env.scene_reset(ids, self.rng.integers(NUM_TRAIN_CONFIGURATIONS, size=len(ids)))
+        env.scene_reset(ids, self.rng.integers(self.num_configurations, size=len(ids)))
 
 
 class PeriodicSceneReset(SceneReset):
@@ -87,9 +118,9 @@ class PeriodicSceneReset(SceneReset):
 
     kind = Intervention.SCENE_RESET
 
-    def __init__(self, rng: np.random.Generator, interval_at: Callable[[int], int | None]) -> None:
-        super().__init__(rng)
-        self.interval_at = interval_at
+    def __init__(self, rng: np.random.Generator, protocol: ProtocolConfig) -> None:
+        super().__init__(rng, protocol.num_configurations)
+        self.interval_at = protocol.scene_reset_interval_at
 
     def due(self, env: Any, loop: LoopState) -> np.ndarray:
         """Every stream when its step count is a multiple of the T in force."""
@@ -113,8 +144,8 @@ class DivergenceReset(SceneReset):
 
     kind = Intervention.DIVERGENCE
 
-    def __init__(self, rng: np.random.Generator) -> None:
-        super().__init__(rng)
+    def __init__(self, rng: np.random.Generator, num_configurations: int = NUM_TRAIN_CONFIGURATIONS) -> None:
+        super().__init__(rng, num_configurations)
         self.diverged: np.ndarray = np.empty(0, np.bool_)
 
     def due(self, env: Any, loop: LoopState) -> np.ndarray:
@@ -135,26 +166,57 @@ class Resets:
     divergence: DivergenceReset
     end_effector: ResetStrategy
     heuristic: ResetStrategy
+    extra: tuple[ResetStrategy, ...]
     scene: ResetStrategy
 
 
-ResetFactory = Callable[[ProtocolConfig, np.random.Generator], ResetStrategy]
+ResetFactory = Callable[[np.random.Generator, ProtocolConfig], ResetStrategy]
 
-RESET_STRATEGIES: dict[str, ResetFactory] = {
-    "none": lambda protocol, rng: NoReset(),
-    "end_effector": lambda protocol, rng: EndEffectorReset(),
-    "scene": lambda protocol, rng: PeriodicSceneReset(rng, protocol.scene_reset_interval_at),
-}
-"""Strategies by name; a new one is registered here."""
+EXTRA_RESETS: dict[str, ResetFactory] = {}
+"""Strategies of users by name."""
+
+
+def register_reset(name: str) -> Callable[[ResetFactory], ResetFactory]:
+    """Make a strategy selectable as `--protocol.extra_resets='[name]'`.
+
+    It decorates a class whose constructor, or a function that, takes the generator of the run's resets and the
+    protocol.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+
+    def register(factory: ResetFactory) -> ResetFactory:
+        if name in EXTRA_RESETS:
+            raise ValueError(f"there is a reset {name!r} already; taken names: {sorted(EXTRA_RESETS)}.")
+        EXTRA_RESETS[name] = factory
+        return factory
+
+    return register
+
+
+def check_extra_resets(names: Sequence[str]) -> None:
+    """Raise a ValueError that lists the valid names, unless all of `names` are registered."""
+    unknown = [name for name in names if name not in EXTRA_RESETS]
+    if unknown:
+        raise ValueError(
+            f"protocol.extra_resets has {unknown}; registered: {sorted(EXTRA_RESETS)}. Register your own with "
+            "cronos_lerobot.resets.register_reset, in a module named by --protocol.discover_packages_path."
+        )
 
 
 def make_resets(protocol: ProtocolConfig, rng: np.random.Generator) -> Resets:
-    """Return the strategies that `protocol` enables; `rng` draws every configuration of the run."""
-    end_effector = "end_effector" if protocol.end_effector_reset else "none"
+    """Return the strategies that `protocol` enables; `rng` draws every configuration and place of the run.
+
+    Raises:
+        ValueError: an extra reset is not registered.
+    """
+    check_extra_resets(protocol.extra_resets)
     return Resets(
-        initial=InitialPlacement(rng),
-        divergence=DivergenceReset(rng),
-        end_effector=RESET_STRATEGIES[end_effector](protocol, rng),
-        heuristic=RESET_STRATEGIES["none"](protocol, rng),
-        scene=RESET_STRATEGIES["scene"](protocol, rng),
+        initial=InitialPlacement(rng, protocol.num_configurations),
+        divergence=DivergenceReset(rng, protocol.num_configurations),
+        end_effector=EndEffectorReset() if protocol.end_effector_reset else NoReset(),
+        heuristic=HeuristicReset(rng) if protocol.heuristic_reset else NoReset(),
+        extra=tuple(EXTRA_RESETS[name](rng, protocol) for name in protocol.extra_resets),
+        scene=PeriodicSceneReset(rng, protocol),
     )

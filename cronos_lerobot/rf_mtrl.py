@@ -62,6 +62,8 @@ def rf_mtrl(
         segment = loop.end_segment()
         resets.end_effector.apply_if_due(env, loop)  # 21, 22
         resets.heuristic.apply_if_due(env, loop)  # 23, 24
+        for strategy in resets.extra:
+            strategy.apply_if_due(env, loop)
         resets.scene.apply_if_due(env, loop)  # 25, 26
         yield segment
 

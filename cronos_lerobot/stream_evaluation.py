@@ -18,12 +18,12 @@ from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.statistics import wilson_interval
 from tqdm import tqdm
 
-from cronos_lerobot.loop_state import LoopState, SegmentEnd, Step
+from cronos_lerobot.loop_state import SegmentEnd, Step
 from cronos_lerobot.protocol import ProtocolConfig
 from cronos_lerobot.report.stream_video import Spectator, make_spectator
 from cronos_lerobot.resets import make_resets
 from cronos_lerobot.rf_mtrl import rf_mtrl
-from cronos_lerobot.task_orders import make_task_order
+from cronos_lerobot.task_orders import TaskSet, make_task_order
 
 
 def success_by_segment(
@@ -39,14 +39,15 @@ def success_by_segment(
         seed: draws the first configurations, those of scene resets, and a random task order.
     """
     rng = np.random.default_rng(seed)
-    loop = LoopState(env.num_envs, len(env.scene.tasks))
+    task_set = TaskSet.of(env.scene, protocol)
+    loop = task_set.new_loop(env.num_envs)
     total_steps = num_segments * protocol.task_switch_interval * env.num_envs
     outcomes = []
     with tqdm(total=total_steps, unit="step", unit_scale=True, disable=None) as bar:
         agent.begin_segment()
         for event in rf_mtrl(
-            env, env.scene.tasks, agent, make_task_order(protocol.task_order, rng), make_resets(protocol, rng),
-            protocol, loop, total_steps,
+            env, task_set.all, agent, make_task_order(protocol.task_order, rng, task_set),
+            make_resets(protocol, rng), protocol, loop, total_steps,
         ):  # fmt: skip
             if isinstance(event, Step):
                 bar.update(env.num_envs)

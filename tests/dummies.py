@@ -16,19 +16,22 @@ NUM_BINS = 3
 @dataclass(frozen=True)
 class DummyTask:
     goal: float
+    object: str = ""
 
     @property
     def instruction(self) -> str:
         return f"go to {self.goal}"
 
 
-TASKS = (DummyTask(1.0), DummyTask(-1.0), DummyTask(2.0), DummyTask(-2.0))
+TASKS = (DummyTask(1.0, "a"), DummyTask(-1.0, "a"), DummyTask(2.0, "b"), DummyTask(-2.0, "b"))
+RESET_TASKS = (DummyTask(0.0, "a"), DummyTask(0.5, "b"))
 
 
 class DummyEnv:
     """Points on a line: action 0 moves stream i, and a task is complete within 0.3 of its goal.
 
-    `calls` is the tape of everything that was asked of it; `diverge_at` are the (step, stream) that break down.
+    `calls` is the tape of everything that was asked of it; `diverge_at` are the (step, stream) that break down,
+    `lost` the (stream, body) that have left the workspace.
     """
 
     metadata = {"render_fps": 5}  # noqa: RUF012
@@ -36,7 +39,8 @@ class DummyEnv:
 
     def __init__(self, num_envs: int, diverge_at: set[tuple[int, int]] | None = None):
         self.num_envs = num_envs
-        self.scene = SimpleNamespace(tasks=TASKS, bodies=())
+        self.scene = SimpleNamespace(tasks=TASKS, reset_tasks=RESET_TASKS, bodies=("a", "b", "plate"))
+        self.lost: set[tuple[int, int]] = set()
         self.tasks = [TASKS[0]] * num_envs
         self.x = np.zeros(num_envs)
         self.t = 0
@@ -75,12 +79,21 @@ class DummyEnv:
     def end_effector_reset(self, ids):
         self.calls.append(("end_effector_reset", list(ids)))
 
+    def unsuitable_bodies(self):
+        return np.array([[(i, k) in self.lost for k in range(3)] for i in range(self.num_envs)])
+
+    def put_back(self, stream, body, rng):
+        self.calls.append(("put_back", stream, body))
+        self.lost.discard((stream, self.scene.bodies.index(body)))
+
     def get_state(self):
-        return {"x": self.x.copy(), "t": np.array(self.t), "task": np.array([TASKS.index(t) for t in self.tasks])}
+        everything = TASKS + RESET_TASKS
+        tasks = np.array([everything.index(task) for task in self.tasks])
+        return {"x": self.x.copy(), "t": np.array(self.t), "task": tasks}
 
     def set_state(self, state):
         self.x, self.t = state["x"].copy(), int(state["t"])
-        self.tasks = [TASKS[i] for i in state["task"]]
+        self.tasks = [(TASKS + RESET_TASKS)[i] for i in state["task"]]
 
     def close(self):
         pass

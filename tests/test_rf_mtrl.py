@@ -10,7 +10,7 @@ from cronos_lerobot.protocol import ProtocolConfig
 from cronos_lerobot.resets import make_resets
 from cronos_lerobot.rf_mtrl import rf_mtrl
 from cronos_lerobot.rl.policy import ActionSample
-from cronos_lerobot.task_orders import make_task_order
+from cronos_lerobot.task_orders import TaskSet, make_task_order
 
 
 class DummyAgent:
@@ -44,11 +44,12 @@ class FastEnv(DummyEnv):
 
 def run(protocol, steps, num_streams=2, env=None, loop=None, seed=0):
     env = env or DummyEnv(num_streams)
-    loop = loop or LoopState(num_streams, len(TASKS))
+    task_set = TaskSet.of(env.scene, protocol)
+    loop = loop or task_set.new_loop(num_streams)
     agent = DummyAgent(num_streams, env.calls)
     rng = np.random.default_rng(seed)
-    order = make_task_order(protocol.task_order, np.random.default_rng(seed + 1))
-    events = list(rf_mtrl(env, TASKS, agent, order, make_resets(protocol, rng), protocol, loop, steps))
+    order = make_task_order(protocol.task_order, np.random.default_rng(seed + 1), task_set)
+    events = list(rf_mtrl(env, task_set.all, agent, order, make_resets(protocol, rng), protocol, loop, steps))
     return env, agent, loop, events
 
 
@@ -202,8 +203,8 @@ def test_loop_state_survives_json():
         ({"curriculum": [(100, 4), (50, 8)]}, "increasing"),
         ({"reset_budget": 0}, "reset_budget"),
         ({"reward": "dense"}, "difference"),
-        ({"heuristic_reset": True}, "not available in this version"),
-        ({"learned_reset": True}, "not available in this version"),
+        ({"num_configurations": 0}, "num_configurations must be 1 to 64"),
+        ({"num_configurations": 65}, "num_configurations must be 1 to 64"),
     ],
 )
 def test_bad_protocols_are_named(options, message):

@@ -28,14 +28,14 @@ from tqdm import tqdm
 
 from cronos_lerobot.data.schema import Intervention, observation_columns
 from cronos_lerobot.data.video import VideoFile
-from cronos_lerobot.loop_state import LoopState, SegmentEnd, Step
+from cronos_lerobot.loop_state import SegmentEnd, Step
 from cronos_lerobot.protocol import ProtocolConfig
 from cronos_lerobot.report.overlay import Status, draw_status
 from cronos_lerobot.resets import make_resets
 from cronos_lerobot.rf_mtrl import rf_mtrl
 from cronos_lerobot.rl.policy import ActionSample
 from cronos_lerobot.rl.processing import PolicyProcessors, make_processors
-from cronos_lerobot.task_orders import make_task_order
+from cronos_lerobot.task_orders import TaskSet, make_task_order
 
 EXPERT = "expert"
 NOTICE_STEPS = 8
@@ -125,10 +125,11 @@ def film_stream(
         seed: draws the first configuration, those of scene resets, and a random task order.
     """
     rng = np.random.default_rng(seed)
-    loop = LoopState(env.num_envs, len(env.scene.tasks))
+    task_set = TaskSet.of(env.scene, protocol)
+    loop = task_set.new_loop(env.num_envs)
     total_steps = num_segments * protocol.task_switch_interval * env.num_envs
     events = rf_mtrl(
-        env, env.scene.tasks, agent, make_task_order(protocol.task_order, rng), make_resets(protocol, rng),
+        env, task_set.all, agent, make_task_order(protocol.task_order, rng, task_set), make_resets(protocol, rng),
         protocol, loop, total_steps,
     )  # fmt: skip
     status = Status("", 0, num_segments, succeeded=False, interventions=0)

@@ -106,7 +106,7 @@ def load_checkpoint(run: RunState, folder: Path) -> dict[str, Any]:
     if not state_dir.is_dir():
         raise NotADirectoryError(f"{folder} is no checkpoint of a run: it has no {TRAINING_STATE_DIR}.")
     state = json.loads((state_dir / LOOP).read_text())
-    for name in ("num_streams", "num_tasks"):
+    for name in ("num_streams", "num_tasks", "num_reset_tasks"):
         if state["loop"][name] != getattr(run.loop, name):
             raise ValueError(
                 f"The checkpoint has {name}={state['loop'][name]}, this run {getattr(run.loop, name)}."

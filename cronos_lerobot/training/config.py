@@ -17,8 +17,9 @@ from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from cronos_lerobot.protocol import ProtocolConfig
+from cronos_lerobot.resets import check_extra_resets
 from cronos_lerobot.rl.ppo_config import PPOConfig
-from cronos_lerobot.task_orders import TASK_ORDERS
+from cronos_lerobot.task_orders import check_task_order
 
 NUM_CONFIGURATIONS = 64
 """Benchmark configurations of each split."""
@@ -130,10 +131,8 @@ class CronosTrainConfig:
                 raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}.")
         if self.keep_checkpoints is not None and self.keep_checkpoints < 1:
             raise ValueError(f"keep_checkpoints must be >= 1 or null, got {self.keep_checkpoints}.")
-        if self.protocol.task_order not in TASK_ORDERS:
-            raise ValueError(
-                f"protocol.task_order must be one of {sorted(TASK_ORDERS)}, got {self.protocol.task_order!r}."
-            )
+        check_task_order(self.protocol.task_order)
+        check_extra_resets(self.protocol.extra_resets)
         _ = self.record.num_streams
 
     @property

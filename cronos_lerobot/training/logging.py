@@ -32,10 +32,12 @@ class RolloutStatistics:
 
     Args:
         instructions: of the task set, in the order of its indices.
+        num_tasks: how many of them are evaluated, the first ones; the rest are reset tasks. None is all.
     """
 
-    def __init__(self, instructions: Sequence[str]) -> None:
+    def __init__(self, instructions: Sequence[str], num_tasks: int | None = None) -> None:
         self.instructions = list(instructions)
+        self.num_tasks = len(self.instructions) if num_tasks is None else num_tasks
         self._clear()
 
     def on_event(self, event: Event) -> None:
@@ -47,22 +49,24 @@ class RolloutStatistics:
         elif isinstance(event, SegmentEnd):
             for task, position, success in zip(event.task, event.position, event.success, strict=True):
                 self._count(self._by_task, self.instructions[task], success)
-                self._count(self._by_position, str(position), success)
+                if task < self.num_tasks:
+                    self._count(self._by_position, str(position), success)
 
     def pop(self) -> dict[str, Any]:
         """Return the statistics since the last `pop`, and begin anew.
 
         `success_by_segment` has one [successes, n] for each number of task switches since the scene reset,
-        `success_by_task` one for each instruction.
+        `success_by_task` one for each instruction. Learned reset tasks are in the latter only.
         """
-        segments = np.array(list(self._by_task.values()) or [[0, 0]]).sum(axis=0)
+        segments = np.array(list(self._by_position.values()) or [[0, 0]]).sum(axis=0)
+        all_segments = sum(n for _, n in self._by_task.values())
         positions = sorted(self._by_position.items(), key=lambda item: int(item[0]))
         statistics = {
             "success": float(segments[0] / segments[1]) if segments[1] else None,
             "segments": int(segments[1]),
             "success_by_segment": dict(positions),
             "success_by_task": {task: self._by_task[task] for task in self.instructions if task in self._by_task},
-            "reward_per_segment": self._reward / segments[1] if segments[1] else None,
+            "reward_per_segment": self._reward / all_segments if all_segments else None,
             "diverged": self._diverged,
         }
         self._clear()

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cronos_lerobot.loop_state import Event, LoopState, SegmentEnd, Step, Update
+from cronos_lerobot.loop_state import Event, SegmentEnd, Step, Update
 from cronos_lerobot.resets import make_resets
 from cronos_lerobot.rf_mtrl import rf_mtrl
 from cronos_lerobot.rl.agent import PPOAgent
@@ -16,7 +16,7 @@ from cronos_lerobot.rl.ppo_config import PPOConfig
 from cronos_lerobot.rl.processing import make_processors
 from cronos_lerobot.rl.rollout_buffer import RolloutBuffer
 from cronos_lerobot.stopwatch import Stopwatch
-from cronos_lerobot.task_orders import make_task_order
+from cronos_lerobot.task_orders import TaskSet, make_task_order
 from cronos_lerobot.training.checkpoint import RunState, load_checkpoint, save_checkpoint
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.evaluation import evaluate_independent
@@ -55,7 +55,7 @@ class Trainer:
         self.stopwatch = Stopwatch()
         self.env = env
         env.timer = self.stopwatch
-        self.tasks = list(env.scene.tasks)
+        self.task_set = TaskSet.of(env.scene, config.protocol)
         self._make_eval_env = make_eval_env
         self._eval_env: Any = None
         device = str(next(policy.parameters()).device)
@@ -64,12 +64,13 @@ class Trainer:
         ppo = PPO(policy, self.processors, config.algorithm, self.generators.for_numpy("minibatches"))
         buffer = RolloutBuffer(config.protocol.update_interval, config.num_envs)
         self.agent = PPOAgent(ppo, buffer, self.generators.for_torch("actions"), self.stopwatch)
-        self.loop = LoopState(config.num_envs, len(self.tasks))
+        self.loop = self.task_set.new_loop(config.num_envs)
         self.run_state = RunState(ppo, self.loop, self.generators, env, preprocessor, postprocessor)
-        self.statistics = RolloutStatistics([task.instruction for task in self.tasks])
+        self.statistics = RolloutStatistics([t.instruction for t in self.task_set.all], len(self.task_set.tasks))
         # Every named generator exists before a checkpoint is loaded into them.
         self._resets = make_resets(config.protocol, self.generators.for_numpy("configurations"))
-        self._task_order = make_task_order(config.protocol.task_order, self.generators.for_numpy("task_order"))
+        task_rng = self.generators.for_numpy("task_order")
+        self._task_order = make_task_order(config.protocol.task_order, task_rng, self.task_set)
 
     def train(self) -> None:
         """Run to the last step or the end of the budget, from the start or from the config's checkpoint."""
@@ -115,7 +116,7 @@ class Trainer:
     def _events(self) -> Any:
         return rf_mtrl(
             self.env,
-            self.tasks,
+            self.task_set.all,
             self.agent,
             self._task_order,
             self._resets,
@@ -147,11 +148,11 @@ class Trainer:
             return
         options = self.config.eval
         if self._eval_env is None:
-            num_episodes = len(self.tasks) * options.n_episodes
+            num_episodes = len(self.task_set.tasks) * options.n_episodes
             self._eval_env = self._make_eval_env(min(options.batch_size, num_episodes))
         result = evaluate_independent(
             self._eval_env,
-            self.tasks,
+            self.task_set.tasks,
             self.agent.ppo.policy,
             self.processors,
             configurations=range(options.n_episodes),

@@ -60,7 +60,7 @@ def test_steps_are_rounded_up_to_whole_updates():
         (["--eval.n_episodes=65"], "1 to 64"),
         (["--eval.split=test"], "held_out"),
         (["--protocol.update_interval=100"], "multiple of protocol.task_switch_interval=80"),
-        (["--protocol.heuristic_reset=true"], "not available in this version"),
+        (["--protocol.extra_resets=[nobody]"], "registered"),
         (["--protocol.task_order=sorted"], "heuristic"),
         (["--record.streams=some"], "number or 'all'"),
         (["--keep_checkpoints=0"], "keep_checkpoints"),

@@ -66,14 +66,26 @@ def build_model(scene: Scene) -> mujoco.MjModel:
     return build_spec(scene).compile()
 
 
-def _camera_quat(xyaxes: list[float]) -> np.ndarray:
-    """Orientation (w, x, y, z) of a camera from its image x and y axes, made orthonormal."""
+def camera_axes(name: str) -> tuple[np.ndarray, np.ndarray, float]:
+    """Position (3,) [m], rotation (3, 3) with the image's x, y and the backward axis as columns, and half the
+    vertical field of view [rad] of a camera in the base frame."""
+    camera = CAMERAS[name]
+    return np.array(camera["pos"]), _camera_rotation(camera["xyaxes"]), np.deg2rad(camera["fovy"]) / 2
+
+
+def _camera_rotation(xyaxes: list[float]) -> np.ndarray:
+    """Rotation matrix of a camera from its image x and y axes, made orthonormal."""
     x, y = np.array(xyaxes[:3]), np.array(xyaxes[3:])
     x = x / np.linalg.norm(x)
     y = y - x * (x @ y)
     y = y / np.linalg.norm(y)
+    return np.stack([x, y, np.cross(x, y)], axis=1)
+
+
+def _camera_quat(xyaxes: list[float]) -> np.ndarray:
+    """Orientation (w, x, y, z) of a camera from its image x and y axes."""
     quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, np.stack([x, y, np.cross(x, y)], axis=1).ravel())
+    mujoco.mju_mat2Quat(quat, _camera_rotation(xyaxes).ravel())
     return quat
 
 

@@ -13,13 +13,12 @@ import numpy as np
 
 from lerobot_env_cronos.configurations import (
     NUM_CONFIGURATIONS,
-    footprint_corners,
     load_configurations,
-    sample_place,
 )
 from lerobot_env_cronos.observations import ObservationBuilder
 from lerobot_env_cronos.scenes import CONTROL_HZ, Task, get_scene
 from lerobot_env_cronos.simulation import ACTION_HIGH, ACTION_LOW, Simulation
+from lerobot_env_cronos.workspace import find_free_pose, find_unsuitable
 
 GRASP_REWARD, SUCCESS_REWARD = 0.1, 1.0
 REWARDS = ("difference", "level")
@@ -135,10 +134,10 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         reward = self._level - before if self.reward == "difference" else self._level.copy()
         return reward, diverged
 
-    def observe(self) -> dict[str, Any]:
-        """The observation now, under the current tasks."""
+    def observe(self, ids: np.ndarray | None = None) -> dict[str, Any]:
+        """The observation now, under the current tasks: of all streams, or with one row for each of `ids`."""
         with self.timer("observe"):
-            return self._observations.observe()
+            return self._observations.observe(self._all if ids is None else np.asarray(ids))
 
     def _info(self) -> dict[str, np.ndarray]:
         return {"is_success": self.is_success.copy(), "is_grasped": self.is_grasped.copy()}
@@ -174,15 +173,16 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             self.simulation.send_arm_home(ids)
             self._judge(ids)
 
+    def unsuitable_bodies(self) -> np.ndarray:
+        """Bodies that no task can reach any more, (n, bodies) bool; see `workspace.find_unsuitable`."""
+        return np.any(list(find_unsuitable(self.simulation).values()), axis=0)
+
     def put_back(self, stream: int, body: str, rng: np.random.Generator) -> None:
-        """Put one body of a stream at a free place of the spawn area, drawn from `rng`."""
-        poses = dict(zip(self.scene.bodies, self.simulation.body_poses()[stream], strict=True))
-        others = [
-            footprint_corners(name, pose[:2], 2 * np.arctan2(pose[6], pose[3]))
-            for name, pose in poses.items()
-            if name != body
-        ]
-        pose, _ = sample_place(self.scene, body, others, rng)
+        """Put one body of a stream at a free place of the spawn area, drawn from `rng`.
+
+        On a table without a free place it is let fall over a random one.
+        """
+        pose = find_free_pose(self.simulation, stream, body, rng)
         ids = np.array([stream])
         self.simulation.move_body(ids, body, pose[None])
         self._judge(ids)
