@@ -39,8 +39,8 @@ def evaluation_figure(groups: list[Group]) -> Figure | None:
     axes = figure.subplots(1, 2, sharey=True)
     for ax, axis in zip(axes, ("interaction_steps", "interventions"), strict=True):
         for i, group in enumerate(groups):
-            _draw(ax, evaluation_curve(group, axis), i, _label(group), marker="o")
-        _style(ax, f"{axis.replace('_', ' ')}, all streams")
+            draw_curve(ax, evaluation_curve(group, axis), i, _label(group), marker="o")
+        style_axes(ax, f"{axis.replace('_', ' ')}, all streams")
         ax.set_ylim(0, 1.02)
     axes[0].set_ylabel("evaluation success")
     _legend(axes[0], groups)
@@ -52,8 +52,8 @@ def training_figure(groups: list[Group]) -> Figure | None:
     figure = Figure(figsize=(10, 3.2), layout="constrained")
     ax = figure.subplots()
     for i, group in enumerate(groups):
-        _draw(ax, update_curve(group, lambda update: update["rollout"]["success"]), i, _label(group))
-    _style(ax, "interaction steps, all streams")
+        draw_curve(ax, update_curve(group, lambda update: update["rollout"]["success"]), i, _label(group))
+    style_axes(ax, "interaction steps, all streams")
     ax.set(ylabel="success of training segments", ylim=(0, 1.02))
     _legend(ax, groups)
     return figure if ax.lines else None
@@ -70,8 +70,8 @@ def segments_figure(groups: list[Group]) -> Figure | None:
         intervals = np.array([rate.interval for rate in rates.values()])
         y = np.array([rate.value for rate in rates.values()])
         curve = Curve(np.array(list(rates)) + 1, y, intervals[:, 0], intervals[:, 1], is_band_over_seeds=False)
-        _draw(ax, curve, i, _label(group), marker="o")
-    _style(ax, "segment since the last scene reset (1 is the first after it)")
+        draw_curve(ax, curve, i, _label(group), marker="o")
+    style_axes(ax, "segment since the last scene reset (1 is the first after it)")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set(ylabel="success of training segments", ylim=(0, 1.02))
     _legend(ax, groups)
@@ -94,7 +94,7 @@ def segment_history_figure(groups: list[Group]) -> Figure | None:
     for ax, group in zip(axes, groups, strict=True):
         edges, rates = segment_history(group)
         mesh = ax.pcolormesh(edges, np.arange(len(rates) + 1) + 0.5, rates, vmin=0, vmax=1, cmap="viridis")
-        _style(ax, "interaction steps, all streams", grid=False)
+        style_axes(ax, "interaction steps, all streams", grid=False)
         ax.yaxis.set_major_locator(MaxNLocator(integer=True))
         ax.set_ylabel("segment since the reset")
         ax.set_title(_label(group), fontsize=9, color=INK, loc="left")
@@ -109,8 +109,8 @@ def ppo_figure(groups: list[Group]) -> Figure | None:
     panels = [*((title, _metric(name)) for title, name in PPO_PANELS), ("reward per segment", _reward)]
     for ax, (title, value) in zip(axes, panels, strict=True):
         for i, group in enumerate(groups):
-            _draw(ax, update_curve(group, value), i, _label(group), width=1.2)
-        _style(ax, "")
+            draw_curve(ax, update_curve(group, value), i, _label(group), width=1.2)
+        style_axes(ax, "")
         ax.set_title(title, fontsize=9, color=INK, loc="left")
     _legend(axes[0], groups)
     return figure if any(ax.lines for ax in axes) else None
@@ -128,7 +128,8 @@ def _label(group: Group) -> str:
     return group.label if len(group.runs) == 1 else f"{group.label} ({len(group.runs)} seeds)"
 
 
-def _draw(ax: Axes, curve: Curve | None, i: int, label: str, marker: str = "", width: float = 1.6) -> None:
+def draw_curve(ax: Axes, curve: Curve | None, i: int, label: str, marker: str = "", width: float = 1.6) -> None:
+    """Draw a line and its band in the colour number `i`; nothing if there is no curve."""
     if curve is None:
         return
     color = COLORS[i % len(COLORS)]
@@ -136,7 +137,8 @@ def _draw(ax: Axes, curve: Curve | None, i: int, label: str, marker: str = "", w
     ax.fill_between(curve.x, curve.low, curve.high, color=color, alpha=0.18, lw=0)
 
 
-def _style(ax: Axes, xlabel: str, *, grid: bool = True) -> None:
+def style_axes(ax: Axes, xlabel: str, *, grid: bool = True) -> None:
+    """Give axes the look of all figures."""
     ax.set_xlabel(xlabel)
     ax.spines[["top", "right"]].set_visible(False)
     ax.tick_params(labelsize=8, colors=INK)

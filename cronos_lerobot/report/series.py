@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from cronos_lerobot.metrics import interpolate
 from cronos_lerobot.report.runs import Group, TrainingRun
 from cronos_lerobot.report.statistics import Rate
 
@@ -57,7 +58,7 @@ def mean_curve(curves: list[tuple[Any, Any]]) -> Curve:
     low, high = max(x.min() for x in xs), min(x.max() for x in xs)
     grid: Any = np.unique(np.concatenate(xs))
     grid = grid[(grid >= low) & (grid <= high)]
-    values = np.stack([np.interp(grid, x, y) for x, y in zip(xs, ys, strict=True)])
+    values = np.stack([interpolate(x, y, grid) for x, y in zip(xs, ys, strict=True)])
     mean = values.mean(0)
     spread = values.std(0, ddof=1) if len(values) > 1 else np.zeros(len(grid))
     return Curve(grid, mean, mean - spread, mean + spread, is_band_over_seeds=len(values) > 1)

@@ -1,0 +1,224 @@
+"""The paper's experiments as data: which runs make up each table and figure (Sections 6, B and G)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+INTERACTION_STEPS, INTERVENTIONS = "interaction_steps", "interventions"
+
+CURRICULUM_UNTIL, CURRICULUM_INTERVAL = 650_000, 320
+"""The paper's curriculum: T = 320 up to 0.65 M interaction steps (Table 1, Section 6.3)."""
+
+SHORT, LONG = 1_300_000, 2_900_000
+"""S of the paper's two kinds of run [interaction steps]: Sections 6.1-6.4 and 6.6, and "to ensure convergence"
+Sections 6.5 and 6.7."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One way of training: a row of the table, a line of the figure."""
+
+    interval: int
+    """T: control steps of one stream between two scene resets."""
+    end_effector_reset: bool = False
+    """EER: the arm goes home at every task switch."""
+    curriculum: bool = False
+    """CL: T = 320 at first."""
+    learned_reset: bool = False
+    """LSR: tasks alternate with learned reset tasks."""
+    heuristic_reset: bool = False
+    """HSR: bodies that left the workspace are put back."""
+    task_order: str = "heuristic"
+    """heuristic or random."""
+    num_configurations: int = 64
+    """Training configurations, 64 or 1."""
+
+    @property
+    def name(self) -> str:
+        """How `--rows` and the run's folder call it, such as `t1280_eer_cl_hsr`."""
+        words = [f"t{self.interval}", *(word.lower() for word in self.aids)]
+        if self.task_order != "heuristic":
+            words.append(self.task_order)
+        if self.num_configurations != 64:
+            words.append(f"{self.num_configurations}config")
+        return "_".join(words)
+
+    @property
+    def label(self) -> str:
+        """How figures call it, such as `T = 1280, EER, CL, HSR`."""
+        words = [f"T = {self.interval}", *self.aids]
+        if self.task_order != "heuristic":
+            words.append(f"{self.task_order} order")
+        if self.num_configurations != 64:
+            words.append(f"{self.num_configurations} configuration{'s' * (self.num_configurations > 1)}")
+        return ", ".join(words)
+
+    @property
+    def aids(self) -> list[str]:
+        """The abbreviations of Table 1's columns that are ticked."""
+        ticks = {
+            "EER": self.end_effector_reset,
+            "CL": self.curriculum,
+            "LSR": self.learned_reset,
+            "HSR": self.heuristic_reset,
+        }
+        return [name for name, ticked in ticks.items() if ticked]
+
+
+@dataclass(frozen=True)
+class CheckpointEvaluation:
+    """An evaluation by `cronos-eval`, on top of the periodic ones while training."""
+
+    suite: str
+    """independent or sequential."""
+    splits: tuple[str, ...]
+    """train, held_out or both."""
+    every_checkpoint: bool = False
+    """Every checkpoint of a run, for curves, or its last one only."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A table or figure of the paper."""
+
+    name: str
+    title: str
+    rows: tuple[Row, ...]
+    source: str
+    """Where the paper has it."""
+    steps: int = SHORT
+    """S [interaction steps, all streams together]."""
+    scene: str = "kitchen_2x2"
+    axes: tuple[str, ...] = (INTERACTION_STEPS, INTERVENTIONS)
+    """What the curves are drawn against."""
+    by_task: bool = False
+    """One panel for each task, or all tasks together."""
+    splits: tuple[str, ...] = ("train",)
+    """Configurations that the curves are measured on; those of held_out need `evaluations`."""
+    evaluations: tuple[CheckpointEvaluation, ...] = ()
+    budgets: tuple[int, ...] = (1000, 2000, 4000, 8000)
+    """Numbers of interventions, of a run with the paper's steps, at which success is given."""
+
+
+EPISODIC = Row(80)
+PERIODIC = Row(320, end_effector_reset=True)
+BEST = Row(1280, end_effector_reset=True, curriculum=True, heuristic_reset=True)
+"""The row that Sections 6.4 and 6.5 go on with."""
+TABLE1_ROWS = (
+    EPISODIC,
+    Row(1280),
+    Row(1280, end_effector_reset=True),
+    Row(1280, end_effector_reset=True, curriculum=True),
+    Row(1280, end_effector_reset=True, curriculum=True, learned_reset=True),
+    BEST,
+    Row(1280, end_effector_reset=True, curriculum=True, learned_reset=True, heuristic_reset=True),
+)
+ORDER_ROWS = (BEST, Row(1280, True, True, heuristic_reset=True, task_order="random"))
+BUDGET_ROWS = (EPISODIC, PERIODIC, BEST, Row(2560, True, True, heuristic_reset=True))
+CONFIGURATION_ROWS = (EPISODIC, PERIODIC, Row(80, num_configurations=1), Row(320, True, num_configurations=1))
+
+HELD_OUT_CURVE = CheckpointEvaluation("independent", ("held_out",), every_checkpoint=True)
+BOTH = ("train", "held_out")
+
+_ALL = (
+    Experiment(
+        "table1",
+        "Performance of RF-MTRL approaches",
+        TABLE1_ROWS,
+        "Table 1, Sections 6.1-6.3",
+        budgets=(1000, 1600, 2000, 6000),
+    ),
+    Experiment("figure2", "Impact of task ordering", ORDER_ROWS, "Figure 2, Section 6.4"),
+    Experiment(
+        "figure3",
+        "Learning efficiency under varying reset budgets",
+        BUDGET_ROWS,
+        "Figure 3, Section 6.5",
+        steps=LONG,
+        evaluations=(CheckpointEvaluation("sequential", ("train",)),),
+    ),
+    Experiment(
+        "figure4",
+        "Robustness to OOD object-receptacle configurations",
+        CONFIGURATION_ROWS,
+        "Figure 4, Section 6.6",
+        axes=(INTERACTION_STEPS,),
+        splits=BOTH,
+        evaluations=(HELD_OUT_CURVE,),
+    ),
+    Experiment(
+        "figure5",
+        "Robustness to OOD task sequences",
+        (EPISODIC, PERIODIC),
+        "Figure 5, Section 6.6",
+        evaluations=(CheckpointEvaluation("sequential", BOTH),),
+    ),
+    Experiment(
+        "figure7",
+        "Performance of a more complex task suite",
+        (EPISODIC, PERIODIC),
+        "Figure 7, Section 6.7",
+        steps=LONG,
+        scene="kitchen_3x3",
+        budgets=(2000, 4000, 9000),
+    ),
+    Experiment(
+        "figure8",
+        "Learning efficiency under varying reset budgets, another scene",
+        (EPISODIC, PERIODIC),
+        "Figure 8, Appendix B",
+        steps=LONG,
+        scene="playroom_2x2",
+    ),
+    Experiment(
+        "figure11",
+        "Learning efficiency under varying reset budgets, by task",
+        BUDGET_ROWS,
+        "Figure 11, Appendix G",
+        steps=LONG,
+        by_task=True,
+    ),
+    Experiment(
+        "figure12",
+        "Performance of RF-MTRL approaches, by task",
+        TABLE1_ROWS,
+        "Figure 12, Appendix G",
+        by_task=True,
+        splits=BOTH,
+        evaluations=(HELD_OUT_CURVE,),
+    ),
+    Experiment(
+        "figure13",
+        "Robustness to OOD object-receptacle configurations, by task",
+        CONFIGURATION_ROWS,
+        "Figure 13, Appendix G",
+        axes=(INTERACTION_STEPS,),
+        by_task=True,
+        splits=BOTH,
+        evaluations=(HELD_OUT_CURVE,),
+    ),
+    Experiment(
+        "figure14",
+        "Robustness to OOD task sequences, by task",
+        ORDER_ROWS,
+        "Figure 14, Appendix G",
+        by_task=True,
+        splits=BOTH,
+        evaluations=(HELD_OUT_CURVE,),
+    ),
+)
+EXPERIMENTS: dict[str, Experiment] = {experiment.name: experiment for experiment in _ALL}
+"""Experiments by name; a new one is added here. Runs with the same settings are shared between them."""
+
+
+def find_rows(experiment: Experiment, names: list[str]) -> tuple[Row, ...]:
+    """The rows called `names`, all of them if it is empty.
+
+    Raises:
+        ValueError: the experiment has no such row.
+    """
+    rows = {row.name: row for row in experiment.rows}
+    for name in names:
+        if name not in rows:
+            raise ValueError(f"{experiment.name} has no row {name!r}; it has {', '.join(rows)}")
+    return tuple(rows[name] for name in names) or experiment.rows

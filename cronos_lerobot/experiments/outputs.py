@@ -1,0 +1,239 @@
+"""Writes an experiment's tables and figures, finished or not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+from cronos_lerobot.experiments import plots, tables
+from cronos_lerobot.experiments.definitions import Experiment, Row
+from cronos_lerobot.experiments.plan import Options, base_policy
+from cronos_lerobot.experiments.results import ExperimentResult, RowResult, collect, paper_results
+from cronos_lerobot.metrics import Summary
+from cronos_lerobot.report.tables import write_csv
+from cronos_lerobot.training.logging import METRICS
+
+DPI = 150
+MISSING = "–"
+
+
+def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options, folder: Path) -> str:
+    """Write NAME.md, .json, .csv, .png and the like into `folder`; returns the page, as text for a terminal."""
+    result = collect(experiment, rows, options)
+    folder.mkdir(parents=True, exist_ok=True)
+    name = experiment.name
+    data = {
+        name: tables.main_rows(result),
+        f"{name}_curves": tables.curve_rows(result),
+        f"{name}_segments": tables.segment_rows(result),
+        f"{name}_sequential": tables.sequential_rows(result),
+    }
+    for file, table in data.items():
+        if table:
+            write_csv(folder / f"{file}.csv", table)
+    drawings = {
+        name: plots.curves_figure(result),
+        f"{name}_bars": plots.bars_figure(result),
+        f"{name}_segments": plots.segments_figure(result),
+        f"{name}_sequential": plots.sequential_figure(result),
+    }
+    drawn = []
+    for file, figure in drawings.items():
+        if figure is not None:
+            buffer = BytesIO()
+            figure.savefig(buffer, format="png", dpi=DPI)
+            (folder / f"{file}.png").write_bytes(buffer.getvalue())
+            drawn.append(f"{file}.png")
+    summary = _settings(result) | {"rows": data[name], "claims": tables.claim_rows(result)}
+    summary |= {"segments": data[f"{name}_segments"], "sequential": data[f"{name}_sequential"]}
+    (folder / f"{name}.json").write_text(json.dumps(summary, indent=2))
+    page = markdown(result, drawn)
+    (folder / f"{name}.md").write_text(page)
+    return f"{page}\nWritten to {folder}"
+
+
+def _settings(result: ExperimentResult) -> dict[str, Any]:
+    options, experiment = result.options, result.experiment
+    return {
+        "experiment": experiment.name,
+        "title": experiment.title,
+        "paper": {"where": experiment.source, "source": paper_results()["_source"]},
+        "scene": experiment.scene,
+        "obs_type": options.obs_type,
+        "scale": options.scale.name,
+        "steps": options.scale.steps[experiment.steps],
+        "paper_steps": experiment.steps,
+        "seeds": list(options.seeds),
+        "temperature": options.temperature,
+        "base_policy": base_policy(experiment.scene, options),
+        "extra_flags": list(options.extra),
+        "runs": [
+            {"run": seed.spec.name, "finished": seed.finished, "metrics": str(seed.spec.train_folder / METRICS)}
+            for row in result.rows
+            for seed in row.seeds
+        ],
+        "made_by_another_command": result.changed,
+    }
+
+
+def markdown(result: ExperimentResult, figures: Sequence[str]) -> str:
+    """The page: what was run, the table, what the paper's text says, the figures, what is missing."""
+    experiment, options = result.experiment, result.options
+    steps = options.scale.steps[experiment.steps]
+    lines = [f"# {experiment.title}", "", f"{experiment.source} of the paper, repeated by `cronos-reproduce`."]
+    lines += [
+        f"{experiment.scene}, {options.obs_type}, {steps:,} interaction steps ({options.scale.name} scale),"
+        f" sampling temperature {options.temperature} in evaluations.",
+        "",
+        *_table(_main_columns(result)),
+        "",
+        "Numbers are mean ± standard deviation (ddof = 1) over the seeds that are finished; in brackets the 95 %"
+        " percentile bootstrap interval of the mean over seeds. n: episodes of one seed's evaluation. D and C are"
+        " the areas between the curve and 1.0 over interaction steps and over interventions (Equations 3 and 4),"
+        " divided by the length of the axis: smaller is better.",
+        "",
+        f"The paper's numbers: {paper_results()['_source']} Another simulator, another policy and another base:"
+        " compare the order of the rows, not the numbers.",
+    ]
+    lines += _section("Success after so many interventions", _budget_columns(result))
+    lines += _section("What the text says", _claim_columns(tables.claim_rows(result)))
+    lines += _section("Sequences of tasks", _sequential_columns(tables.sequential_rows(result)))
+    lines += _section("Success while training, by segment since the last scene reset", _segment_columns(result))
+    for file in figures:
+        lines += ["", f"![{file}]({file})"]
+    lines += _unfinished(result)
+    return "\n".join(lines) + "\n"
+
+
+Columns = dict[str, list[str]]
+
+
+def _main_columns(result: ExperimentResult) -> Columns:
+    rows = tables.main_rows(result)
+    columns: Columns = {"T": [str(row["T"]) for row in rows]}
+    for aid in ("EER", "CL", "LSR", "HSR"):
+        if any(row[aid] for row in rows):
+            columns[aid] = [tables.TICK[row[aid]] for row in rows]
+    for name, title in (("task_order", "order"), ("configurations", "configurations")):
+        if len({row[name] for row in rows}) > 1:
+            columns[title] = [str(row[name]) for row in rows]
+    for split in result.experiment.splits:
+        suffix = "" if len(result.experiment.splits) == 1 else f", {split.replace('_', '-')}"
+        summaries = [row.success(split) for row in result.rows]
+        columns[f"success{suffix}"] = [_cell(summary) for summary in summaries]
+        columns[f"95 %{suffix}"] = [_interval(summary) for summary in summaries]
+        columns[f"n{suffix}"] = [str(row[f"n_{split}"] or MISSING) for row in rows]
+    columns["seeds"] = [f"{row['seeds']}/{row['seeds_wanted']}" for row in rows]
+    if any(row["paper_mean"] is not None for row in rows):
+        columns["paper"] = [f"{row['paper_mean']:.3f} ± {row['paper_std']:.3f}" for row in rows]
+    columns["base"] = [_number(row["base_success_mean"], 3) for row in rows]
+    columns["interventions"] = [_number(row["interventions_mean"], 0) for row in rows]
+    columns["D / steps"] = [_cell(row.gap("interaction_steps")) for row in result.rows]
+    columns["C / interventions"] = [_cell(row.gap("interventions")) for row in result.rows]
+    shared = rows[0]["shared_budget"] if rows else None
+    if shared:
+        title = f"C up to {shared:,}"
+        columns[title] = [_cell(row.gap("interventions", up_to=shared)) for row in result.rows]
+    return columns
+
+
+def _budget_columns(result: ExperimentResult) -> Columns:
+    columns: Columns = {"": [row.row.label for row in result.rows]}
+    for budget in tables.budgets(result):
+        cells = [_cell(row.success_at(budget)) for row in result.rows]
+        columns[f"{budget:,}"] = cells
+    has_any = any(cell != MISSING for title, cells in columns.items() if title for cell in cells)
+    return columns if has_any else {}
+
+
+def _claim_columns(claims: list[dict[str, Any]]) -> Columns:
+    if not claims:
+        return {}
+    digits = [2 if claim["paper"] < 1 else 0 for claim in claims]
+    return {
+        "": [claim["claim"] for claim in claims],
+        "paper": [_number(claim["paper"], n) for claim, n in zip(claims, digits, strict=True)],
+        "here": [_number(claim["ours"], n) for claim, n in zip(claims, digits, strict=True)],
+    }
+
+
+def _sequential_columns(rows: list[dict[str, Any]]) -> Columns:
+    if not rows:
+        return {}
+    columns: Columns = {"": [row["row"] for row in rows], "split": [row["split"] for row in rows]}
+    measures = [key.removesuffix("_mean") for key in rows[0] if key.endswith("_mean")]
+    for measure in measures:
+        columns[measure.replace("_", " ")] = [
+            _plus_minus(row[f"{measure}_mean"], row[f"{measure}_std"]) for row in rows
+        ]
+    columns["chains"] = [str(row["n"]) for row in rows]
+    columns["seeds"] = [str(row["seeds"]) for row in rows]
+    return columns
+
+
+def _segment_columns(result: ExperimentResult) -> Columns:
+    rates = {(row["row"], row["segment"]): row["success"] for row in tables.segment_rows(result)}
+    if not rates:
+        return {}
+    columns: Columns = {"": [row.row.label for row in result.rows]}
+    for segment in sorted({segment for _, segment in rates}):
+        columns[str(segment + 1)] = [_number(rates.get((row.row.name, segment)), 2) for row in result.rows]
+    return columns
+
+
+def _unfinished(result: ExperimentResult) -> list[str]:
+    lines = []
+    for row in result.rows:
+        for seed in row.seeds:
+            if not seed.finished:
+                lines.append(
+                    f"- {seed.spec.name}: {seed.run.last['interaction_steps']:,} of {seed.spec.steps:,} steps"
+                )
+        missing = row.wanted - len(row.seeds)
+        if missing:
+            lines.append(f"- {_group(result, row)}: {missing} of {row.wanted} seeds not begun")
+    if lines:
+        lines = [
+            "",
+            "## Not finished",
+            "",
+            "Unfinished runs are drawn only where a row has no finished one.",
+            "",
+            *lines,
+        ]
+    if result.changed:
+        lines += ["", "## Made by another command", "", *(f"- {text}" for text in result.changed)]
+    return lines
+
+
+def _group(result: ExperimentResult, row: RowResult) -> str:
+    return row.seeds[0].spec.group if row.seeds else row.row.name
+
+
+def _section(title: str, columns: Columns) -> list[str]:
+    return ["", f"## {title}", "", *_table(columns)] if columns else []
+
+
+def _table(columns: Columns) -> list[str]:
+    titles = list(columns)
+    lines = [titles, ["---"] * len(titles), *(list(cells) for cells in zip(*columns.values(), strict=True))]
+    return [f"| {' | '.join(line)} |" for line in lines]
+
+
+def _cell(summary: Summary | None) -> str:
+    return str(summary) if summary else MISSING
+
+
+def _plus_minus(mean: float | None, std: float | None) -> str:
+    return MISSING if mean is None else f"{mean:.3f}" if std is None else f"{mean:.3f} ± {std:.3f}"
+
+
+def _interval(summary: Summary | None) -> str:
+    return f"[{summary.ci95[0]:.3f}, {summary.ci95[1]:.3f}]" if summary and summary.ci95 else MISSING
+
+
+def _number(value: float | None, digits: int) -> str:
+    return MISSING if value is None else f"{value:,.{digits}f}"

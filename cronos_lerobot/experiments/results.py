@@ -1,0 +1,200 @@
+"""Reads what the runs of an experiment have come to, finished or not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cronos_lerobot.experiments.definitions import INTERVENTIONS, CheckpointEvaluation, Experiment, Row
+from cronos_lerobot.experiments.jobs import changed_flags, read_record
+from cronos_lerobot.experiments.plan import Options, RunSpec, run_specs, train_job
+from cronos_lerobot.metrics import Gap, Summary, performance_gap, success_at, summarise
+from cronos_lerobot.report.runs import Group, TrainingRun, read_training_run
+from cronos_lerobot.training.logging import METRICS
+
+RESULTS = "results.json"
+
+
+@dataclass(frozen=True)
+class Point:
+    """One evaluation on a curve."""
+
+    interaction_steps: int
+    interventions: int
+    success: float
+    n: int
+    ci95: tuple[float, float]
+
+    def x(self, axis: str) -> int:
+        """The point's place on `axis`, interaction_steps or interventions."""
+        return self.interventions if axis == INTERVENTIONS else self.interaction_steps
+
+
+@dataclass
+class SeedResult:
+    """One run of a row, and the evaluations of its checkpoints."""
+
+    spec: RunSpec
+    run: TrainingRun
+    finished: bool
+    evaluations: dict[tuple[str, str], dict[int, dict[str, Any]]] = field(default_factory=dict)
+    """What cronos-eval found: by suite and split, then by checkpoint [interaction steps]."""
+
+    def curve(self, split: str, task: str | None = None) -> list[Point]:
+        """Success of a task, or of all together, over the run: its own evaluations, or else cronos-eval's."""
+        own = [e for e in self.run.evaluations if e["split"] == split]
+        if own:
+            return [_point(e["interaction_steps"], e["interventions"], e, task) for e in own]
+        counts = {u["interaction_steps"]: u["interventions"] for u in self.run.updates}
+        found = self.evaluations.get(("independent", split), {})
+        return [_point(n, counts[n], result, task) for n, result in sorted(found.items()) if n in counts]
+
+    def final(self, split: str) -> Point | None:
+        """The evaluation at the end of the run; None before it."""
+        curve = self.curve(split)
+        return curve[-1] if curve and curve[-1].interaction_steps >= self.spec.steps else None
+
+
+@dataclass
+class RowResult:
+    """All runs of a row that have begun."""
+
+    row: Row
+    seeds: list[SeedResult]
+    wanted: int
+    """How many seeds the experiment has."""
+
+    @property
+    def finished(self) -> list[SeedResult]:
+        """The runs that came to their end."""
+        return [seed for seed in self.seeds if seed.finished]
+
+    @property
+    def drawn(self) -> list[SeedResult]:
+        """The runs that stand for the row: the finished ones, or all while there is none."""
+        return self.finished or self.seeds
+
+    @property
+    def group(self) -> Group:
+        """The same runs, for the functions of `cronos_lerobot.report`."""
+        return Group(self.row.label, [seed.run for seed in self.drawn])
+
+    def finals(self, split: str) -> list[Point]:
+        """The last evaluation of every finished run."""
+        return [point for seed in self.finished if (point := seed.final(split)) is not None]
+
+    def success(self, split: str) -> Summary | None:
+        """Success at the end, over the finished seeds."""
+        return summarise([point.success for point in self.finals(split)])
+
+    def gap(self, axis: str, split: str = "train", up_to: float | None = None) -> Summary | None:
+        """D or C, divided by the length of the axis, over the finished seeds."""
+        return summarise([gap.normalised for gap in self.gaps(axis, split, up_to)])
+
+    def gaps(self, axis: str, split: str = "train", up_to: float | None = None) -> list[Gap]:
+        """D or C of every finished seed."""
+        curves = [seed.curve(split) for seed in self.finished]
+        return [performance_gap(*_xy(curve, axis), up_to) for curve in curves if curve]
+
+    def success_at(self, interventions: float, split: str = "train") -> Summary | None:
+        """Success after so many interventions; None if a finished seed did not get there."""
+        curves = [seed.curve(split) for seed in self.finished]
+        return summarise([success_at(*_xy(curve, INTERVENTIONS), interventions) for curve in curves if curve])
+
+
+@dataclass
+class ExperimentResult:
+    """What there is of an experiment."""
+
+    experiment: Experiment
+    options: Options
+    rows: list[RowResult]
+    changed: list[str]
+    """Runs that were made by another command than the experiment's, which are left out or told apart."""
+
+    @property
+    def tasks(self) -> list[str]:
+        """The instructions, in the scene's order."""
+        for row in self.rows:
+            for seed in row.seeds:
+                if seed.run.evaluations:
+                    return list(seed.run.evaluations[0]["per_task"])
+        return []
+
+
+def collect(experiment: Experiment, rows: Iterable[Row], options: Options) -> ExperimentResult:
+    """Read every run of an experiment that has written a record."""
+    results, changed = [], []
+    for row in rows:
+        seeds = []
+        for spec in run_specs(experiment, options, [row]):
+            metrics = spec.train_folder / METRICS
+            if not metrics.is_file() or not metrics.read_bytes().count(b"\n"):
+                continue
+            if flags := _changed(spec):
+                changed.append(f"{spec.name}: {' '.join(flags)}")
+            seeds.append(_read_seed(spec, experiment.evaluations))
+        results.append(RowResult(row, seeds, len(options.seeds)))
+    return ExperimentResult(experiment, options, results, changed)
+
+
+def _changed(spec: RunSpec) -> list[str]:
+    return changed_flags(train_job(spec, None))
+
+
+def _read_seed(spec: RunSpec, evaluations: Iterable[CheckpointEvaluation]) -> SeedResult:
+    finished = read_record(train_job(spec, None)).get("status") == "done"
+    result = SeedResult(spec, read_training_run(spec.train_folder), finished)
+    for evaluation in evaluations:
+        for split in evaluation.splits:
+            found = result.evaluations.setdefault((evaluation.suite, split), {})
+            for checkpoint in spec.checkpoints:
+                path = spec.evaluation_folder(evaluation.suite, split, checkpoint) / RESULTS
+                if path.is_file():
+                    found[checkpoint] = json.loads(path.read_text())[evaluation.suite][split]
+    return result
+
+
+def _point(steps: int, interventions: int, record: dict[str, Any], task: str | None) -> Point:
+    rate = record["per_task"][task] if task else record
+    return Point(steps, interventions, rate["success"], rate["n"], tuple(rate["ci95"]))
+
+
+def _xy(curve: list[Point], axis: str) -> tuple[list[float], list[float]]:
+    return [point.x(axis) for point in curve], [point.success for point in curve]
+
+
+def sequential(row: RowResult, split: str) -> dict[str, Any] | None:
+    """SEQ 0-3 and the average chain length of a row's finished seeds at their last checkpoint.
+
+    Returns:
+        `positions`, a Summary for each, `chain_length`, a Summary, and `n`, chains of each seed; None if there is
+        no result.
+    """
+    found = [
+        results[seed.spec.steps]
+        for seed in row.finished
+        if seed.spec.steps in (results := seed.evaluations.get(("sequential", split), {}))
+    ]
+    if not found:
+        return None
+    rates = np.array([[position["success"] for position in result["positions"]] for result in found])
+    lengths = [result["average_chain_length"]["mean"] for result in found]
+    return {
+        "positions": [summarise(column) for column in rates.T],
+        "chain_length": summarise(lengths),
+        "n": found[0]["n"],
+    }
+
+
+@cache
+def paper_results() -> dict[str, Any]:
+    """The paper's numbers, with their sources."""
+    return json.loads((Path(str(files("cronos_lerobot.experiments"))) / "paper_results.json").read_text())

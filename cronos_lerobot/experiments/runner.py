@@ -1,0 +1,196 @@
+"""Runs jobs, several at a time, and stops them cleanly."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol
+
+from cronos_lerobot.experiments.jobs import Job, changed_flags, is_done, lock, read_record, write_record
+
+POLL_S = 0.5
+"""How often the running jobs are looked at [s]."""
+GRACE_S = 15.0
+"""How long a job may take to end after it was asked to [s]."""
+ELSEWHERE = "is being run by another process: waiting for it"
+DONE, FAILED, CHANGED, BLOCKED, STOPPED = "done", "failed", "changed", "blocked", "stopped"
+
+
+class Display(Protocol):
+    """Shows what happens."""
+
+    def event(self, job: Job, what: str) -> None:
+        """Something happened to a job: it was started, resumed, done, failed ..."""
+
+    def update(self, states: dict[str, str], running: Sequence[Job]) -> None:
+        """Called a few times a second; `states` has the jobs that are over."""
+
+
+@dataclass
+class _Child:
+    job: Job
+    process: subprocess.Popen
+    lock: int
+    started: float = field(default_factory=time.time)
+
+
+class Runner:
+    """Runs jobs whose needs are done, at most `parallel` at a time.
+
+    Jobs that are done are skipped, unfinished ones resumed, those that were made by another command left alone and
+    reported. What needs a job that is not done is blocked; everything else goes on.
+
+    Args:
+        jobs: each name once; needs come before those who need them.
+        parallel: how many run at once.
+        display: shows what happens.
+        environment: variables of the commands, besides those of this process.
+    """
+
+    def __init__(
+        self, jobs: Sequence[Job], parallel: int, display: Display, environment: dict[str, str] | None = None
+    ) -> None:
+        self.jobs = {job.name: job for job in jobs}
+        if len(self.jobs) < len(jobs):
+            raise ValueError("two jobs have the same name")
+        if parallel < 1:
+            raise ValueError(f"at least one job must run at a time, got {parallel}")
+        self.parallel, self.display = parallel, display
+        self.environment = os.environ | (environment or {})
+        self.states: dict[str, str] = {}
+        self._children: list[_Child] = []
+        self._elsewhere: set[str] = set()
+
+    def run(self) -> dict[str, str]:
+        """Run until nothing can run any more; returns the state of every job by name.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C or SIGTERM; the running jobs have been stopped and can be resumed.
+        """
+        previous = _raise_on_sigterm()
+        try:
+            for job in self.jobs.values():
+                self._look_up(job)
+            while len(self.states) < len(self.jobs):
+                self._collect()
+                self._start_what_can()
+                self.display.update(self.states, [child.job for child in self._children])
+                time.sleep(POLL_S)
+        finally:
+            self._stop()
+            if previous is not None:
+                signal.signal(signal.SIGTERM, previous)
+        self.display.update(self.states, [])
+        return self.states
+
+    def _look_up(self, job: Job) -> None:
+        if changed_flags(job):
+            self._finish(job, CHANGED)
+        elif is_done(job):
+            self.states[job.name] = DONE
+
+    def _start_what_can(self) -> None:
+        busy = {child.job.name for child in self._children}
+        for job in self.jobs.values():
+            if job.name in self.states or job.name in busy:
+                continue
+            needs = [self.states.get(name) for name in job.needs]
+            if any(state not in (None, DONE) for state in needs):
+                self._finish(job, BLOCKED)
+            elif all(state == DONE for state in needs) and len(self._children) < self.parallel:
+                self._start(job)
+
+    def _start(self, job: Job) -> None:
+        claim = lock(job)
+        if claim is None:
+            # Another process is at it: look again until it is through.
+            if job.name not in self._elsewhere:
+                self._elsewhere.add(job.name)
+                self.display.event(job, ELSEWHERE)
+            return
+        self._look_up(job)
+        if job.name in self.states:
+            os.close(claim)
+            return
+        record: dict[str, Any] = read_record(job)
+        resumed = job.resume() if record and job.output.exists() else None
+        if resumed is None:
+            job.remove_output()
+            record = {"command": list(job.command), "seconds": 0.0, "starts": 0}
+        record |= {"status": "running", "starts": record["starts"] + 1}
+        write_record(job, record)
+        command = resumed or list(job.command)
+        # A session of its own: Ctrl-C reaches us alone, and we stop it and whatever it has started.
+        with job.log.open("ab") as log:
+            log.write(f"$ {' '.join(command)}\n".encode())
+            log.flush()
+            process = subprocess.Popen(
+                [_program(command[0]), *command[1:]],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=self.environment,
+                start_new_session=True,
+                pass_fds=(claim,),
+            )
+        self._children.append(_Child(job, process, claim))
+        self.display.event(job, "resumed" if resumed else "started")
+
+    def _collect(self) -> None:
+        for child in list(self._children):
+            code = child.process.poll()
+            if code is not None:
+                self._end(child, DONE if code == 0 else FAILED, {"returncode": code})
+                self._finish(child.job, DONE if code == 0 else FAILED)
+
+    def _end(self, child: _Child, status: str, extra: dict[str, Any]) -> None:
+        record = read_record(child.job)
+        seconds = record["seconds"] + time.time() - child.started
+        write_record(child.job, record | {"status": status, "seconds": round(seconds, 1)} | extra)
+        os.close(child.lock)
+        self._children.remove(child)
+
+    def _finish(self, job: Job, state: str) -> None:
+        self.states[job.name] = state
+        self.display.event(job, state)
+
+    def _stop(self) -> None:
+        """End the children that still run: first as Ctrl-C does, then less and less kindly."""
+        for sent in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+            _signal_groups(self._children, sent)
+            deadline = time.monotonic() + GRACE_S
+            while any(child.process.poll() is None for child in self._children) and time.monotonic() < deadline:
+                time.sleep(0.05)
+        for child in list(self._children):
+            self._end(child, STOPPED, {"returncode": child.process.wait()})
+            self.display.event(child.job, STOPPED)
+
+
+def _signal_groups(children: Sequence[_Child], number: int) -> None:
+    for child in children:
+        if child.process.poll() is None:
+            os.killpg(child.process.pid, number)
+
+
+def _program(name: str) -> str:
+    """The script of the environment that this Python runs in, whatever PATH says."""
+    return sys.executable if name == "python" else str(Path(sys.executable).with_name(name))
+
+
+def _raise_on_sigterm() -> Any:
+    """Let SIGTERM end this process as Ctrl-C does; returns the handler before."""
+    if threading.current_thread() is not threading.main_thread():
+        return None
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    return signal.signal(signal.SIGTERM, interrupt)

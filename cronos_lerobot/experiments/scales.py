@@ -1,0 +1,104 @@
+"""How large an experiment is run, and the base policy that it starts from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from cronos_lerobot.experiments.definitions import LONG, SHORT
+
+STATE, PIXELS = "environment_state_agent_pos", "pixels_agent_pos"
+OBS_NAMES = {STATE: "state", PIXELS: "pixels"}
+"""Kinds of observation (`--env.obs_type`), and what folders call them."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How much of everything a run gets."""
+
+    name: str
+    steps: dict[int, int]
+    """S [interaction steps] for each S of the paper."""
+    seeds: int
+    """Runs of each row."""
+    num_envs: int
+    """Parallel streams."""
+    eval_freq: int
+    """Interaction steps between two evaluations, and between two checkpoints."""
+    eval_episodes: int
+    """Configurations for each task of a periodic evaluation."""
+    smoke: bool = False
+    """Whether it only shows that everything runs: the smallest base policy, few configurations and orderings."""
+
+
+SCALES: dict[str, Scale] = {
+    "paper": Scale("paper", {SHORT: SHORT, LONG: LONG}, seeds=5, num_envs=64, eval_freq=102_400, eval_episodes=64),
+    "small": Scale(
+        "small", {SHORT: 307_200, LONG: 614_400}, seeds=3, num_envs=64, eval_freq=51_200, eval_episodes=64
+    ),
+    "smoke": Scale(
+        "smoke",
+        {SHORT: 2_560, LONG: 2_560},
+        seeds=1,
+        num_envs=4,
+        eval_freq=1_280,
+        eval_episodes=1,
+        smoke=True,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class BaseRecipe:
+    """How the base policy is made; PPO learns from one that succeeds in .3 to .6 of the evaluation."""
+
+    demos: int
+    """Demonstrations of the scripted expert, all tasks together."""
+    clone_steps: int
+    """Gradient steps of behaviour cloning."""
+    checkpoint: int
+    """The step whose policy is the base; a divisor of `clone_steps`, or a multiple of `save_freq`."""
+    save_freq: int
+    """Steps between two checkpoints of the cloning."""
+    clone_batch: int = 256
+    """Frames of a gradient step."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.checkpoint <= self.clone_steps:
+            raise ValueError(
+                f"base.checkpoint must be 1 to base.clone_steps={self.clone_steps}, got {self.checkpoint}"
+            )
+
+
+BASE_RECIPES: dict[tuple[str, str], BaseRecipe] = {
+    ("kitchen_2x2", STATE): BaseRecipe(400, 320, checkpoint=320, save_freq=320),
+    ("playroom_2x2", STATE): BaseRecipe(400, 320, checkpoint=320, save_freq=320),
+    ("kitchen_3x3", STATE): BaseRecipe(900, 720, checkpoint=720, save_freq=720),
+    ("kitchen_2x2", PIXELS): BaseRecipe(800, 1200, checkpoint=900, save_freq=300),
+    ("playroom_2x2", PIXELS): BaseRecipe(800, 1200, checkpoint=900, save_freq=300),
+    ("kitchen_3x3", PIXELS): BaseRecipe(1800, 2700, checkpoint=2100, save_freq=300),
+}
+"""By scene and kind of observation. Those of kitchen_2x2 are measured (docs/results.md), the others have as many
+demonstrations and gradient steps for each task."""
+SMOKE_RECIPE = BaseRecipe(8, 5, checkpoint=5, save_freq=5, clone_batch=32)
+
+ALGORITHM_FLAGS = {
+    STATE: ("--algorithm.type=ppo",),
+    PIXELS: ("--policy.freeze_encoder=true", "--algorithm.type=ppo", "--algorithm.policy_lr=1e-4"),
+}
+"""Flags of `cronos-train` that learn from each kind of observation."""
+
+
+def base_recipe(scale: Scale, scene: str, obs_type: str) -> BaseRecipe:
+    """The recipe of a scene's base policy.
+
+    Raises:
+        ValueError: there is none; one can be given with --policy.path.
+    """
+    if scale.smoke:
+        return SMOKE_RECIPE
+    if (scene, obs_type) not in BASE_RECIPES:
+        known = ", ".join(f"{s}/{o}" for s, o in BASE_RECIPES)
+        raise ValueError(
+            f"no recipe for a base policy of {scene}/{obs_type}; there are {known}: use --policy.path"
+        )
+    return BASE_RECIPES[scene, obs_type]

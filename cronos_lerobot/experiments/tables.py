@@ -1,0 +1,169 @@
+"""The tables of an experiment, as plain data and as Markdown, the paper's numbers beside ours."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from cronos_lerobot.experiments.definitions import INTERACTION_STEPS, INTERVENTIONS
+from cronos_lerobot.experiments.results import ExperimentResult, RowResult, paper_results, sequential
+from cronos_lerobot.metrics import Summary, interpolate, summarise
+from cronos_lerobot.report.series import segment_rates
+
+Row = dict[str, Any]
+TICK = {True: "✓", False: "–"}
+
+
+def budgets(result: ExperimentResult) -> list[int]:
+    """Numbers of interventions at which success is given: the paper's, scaled as the steps are."""
+    steps = result.options.scale.steps[result.experiment.steps]
+    return [budget * steps // result.experiment.steps for budget in result.experiment.budgets]
+
+
+def main_rows(result: ExperimentResult) -> list[Row]:
+    """One row of each way of training: settings, success at the end, the paper's, interventions, D and C."""
+    shared = _shared_budget(result)
+    return [_main_row(result, row, shared) for row in result.rows]
+
+
+def _shared_budget(result: ExperimentResult) -> float | None:
+    """The interventions that every finished run has come to."""
+    spent = [seed.run.last["interventions"] for row in result.rows for seed in row.finished]
+    return min(spent, default=None)
+
+
+def _main_row(result: ExperimentResult, row: RowResult, shared: float | None) -> Row:
+    setting = row.row
+    cells: Row = {
+        "row": setting.name,
+        "T": setting.interval,
+        "EER": setting.end_effector_reset,
+        "CL": setting.curriculum,
+        "LSR": setting.learned_reset,
+        "HSR": setting.heuristic_reset,
+        "task_order": setting.task_order,
+        "configurations": setting.num_configurations,
+        "seeds": len(row.finished),
+        "seeds_wanted": row.wanted,
+    }
+    for split in result.experiment.splits:
+        cells |= _numbers(f"success_{split}", row.success(split))
+        cells[f"n_{split}"] = next((point.n for point in row.finals(split)), None)
+    paper = paper_results()["final_success"].get(result.experiment.name, {}).get(setting.name)
+    cells |= {"paper_mean": paper[0] if paper else None, "paper_std": paper[1] if paper else None}
+    starts = [seed.curve("train")[0] for seed in row.finished if seed.curve("train")]
+    cells |= _numbers(
+        "base_success", summarise([point.success for point in starts if not point.interaction_steps])
+    )
+    cells |= _numbers("interventions", summarise([seed.run.last["interventions"] for seed in row.finished]))
+    cells |= _numbers("D", summarise([gap.area for gap in row.gaps(INTERACTION_STEPS)]))
+    cells |= _numbers("D_normalised", row.gap(INTERACTION_STEPS))
+    cells |= _numbers("C", summarise([gap.area for gap in row.gaps(INTERVENTIONS)]))
+    cells |= _numbers("C_normalised", row.gap(INTERVENTIONS))
+    cells |= {"shared_budget": shared} | _numbers("C_normalised_shared", row.gap(INTERVENTIONS, up_to=shared))
+    for budget in budgets(result):
+        cells |= _numbers(f"success_at_{budget}", row.success_at(budget))
+    return cells
+
+
+def _numbers(name: str, summary: Summary | None) -> Row:
+    """Columns of a summary; empty where there is none."""
+    low, high = (summary.ci95 if summary else None) or (None, None)
+    return {
+        f"{name}_mean": summary.mean if summary else None,
+        f"{name}_std": summary.std if summary else None,
+        f"{name}_ci95_low": low,
+        f"{name}_ci95_high": high,
+    }
+
+
+def segment_rows(result: ExperimentResult) -> list[Row]:
+    """Success while training by segment since the last scene reset, in the last quarter of the runs."""
+    return [
+        {"row": row.row.name, "segment": segment, "success": rate.value, "successes": rate.successes, "n": rate.n}
+        for row in result.rows
+        for segment, rate in segment_rates(row.group).items()
+    ]
+
+
+def curve_rows(result: ExperimentResult) -> list[Row]:
+    """Every evaluation of every run, finished or not, for all tasks together and for each."""
+    rows = []
+    for row in result.rows:
+        for seed in row.seeds:
+            for split in result.experiment.splits:
+                for task in (None, *result.tasks):
+                    identity = {"row": row.row.name, "seed": seed.spec.seed, "finished": seed.finished}
+                    identity |= {"split": split, "task": task or "all tasks"}
+                    for point in seed.curve(split, task):
+                        cells = asdict(point)
+                        low, high = cells.pop("ci95")
+                        rows.append(identity | cells | {"ci95_low": low, "ci95_high": high})
+    return rows
+
+
+def sequential_rows(result: ExperimentResult) -> list[Row]:
+    """SEQ 0-3 and the average chain length of every row and split."""
+    rows = []
+    for evaluation in result.experiment.evaluations:
+        for split in evaluation.splits if evaluation.suite == "sequential" else ():
+            for row in result.rows:
+                if found := sequential(row, split):
+                    cells: Row = {
+                        "row": row.row.name,
+                        "split": split,
+                        "seeds": found["chain_length"].n,
+                        "n": found["n"],
+                    }
+                    for position, summary in enumerate(found["positions"]):
+                        cells |= _numbers(f"SEQ {position}", summary)
+                    rows.append(cells | _numbers("chain_length", found["chain_length"]))
+    return rows
+
+
+def claim_rows(result: ExperimentResult) -> list[Row]:
+    """Numbers in the paper's text, each beside our own, which is None where it is not known (yet)."""
+    name, paper = result.experiment.name, paper_results()
+    rows = {row.row.name: row for row in result.rows}
+    claims: list[Row] = []
+    for row, count in paper["interventions_at_the_end"].get(name, {}).items():
+        if row in rows:
+            spent = summarise([seed.run.last["interventions"] for seed in rows[row].finished])
+            claims.append(_claim(f"interventions of {row} at the end", count, spent.mean if spent else None))
+    if reach := paper["interventions_to_reach"].get(name):
+        goal = rows[reach["goal"]].success("train") if reach["goal"] in rows else None
+        for row, count in reach["rows"].items():
+            if row in rows:
+                ours = interventions_to_reach(rows[row], goal.mean) if goal else None
+                claims.append(_claim(f"interventions of {row} to reach the end of {reach['goal']}", count, ours))
+    if gap := paper["difference_at_interventions"].get(name):
+        steps = result.options.scale.steps[result.experiment.steps]
+        at = gap["interventions"] * steps // result.experiment.steps
+        better, worse = (
+            rows[row].success_at(at) if row in rows else None for row in (gap["better"], gap["worse"])
+        )
+        ours = better.mean - worse.mean if better and worse else None
+        text = f"{gap['better']} minus {gap['worse']} after {gap['interventions']} interventions"
+        text += "" if at == gap["interventions"] else f" (ours: {at})"
+        claims.append(_claim(text, gap["difference"], ours))
+    return claims
+
+
+def _claim(what: str, paper: float, ours: float | None) -> Row:
+    return {"claim": what, "paper": paper, "ours": ours}
+
+
+def interventions_to_reach(row: RowResult, goal: float) -> float | None:
+    """The first number of interventions at which the mean of the finished seeds is `goal`; None if it never is."""
+    curves = [seed.curve("train") for seed in row.finished if seed.curve("train")]
+    if not curves:
+        return None
+    xs = [[point.interventions for point in curve] for curve in curves]
+    grid = np.arange(max(x[0] for x in xs), min(x[-1] for x in xs) + 1)
+    if len(grid) == 0:
+        return None
+    mean = np.mean([interpolate(x, [p.success for p in c], grid) for x, c in zip(xs, curves, strict=True)], axis=0)
+    reached = np.flatnonzero(mean >= goal)
+    return float(grid[reached[0]]) if len(reached) else None

@@ -1,0 +1,229 @@
+"""`cronos-reproduce`: run the paper's tables and figures as experiments, and draw them.
+
+An experiment is a list of training runs of `cronos-train`, each with several seeds. Runs are real commands with a
+log file each, shared between experiments, skipped when done, and resumed from their last checkpoint when not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from cronos_lerobot.experiments.definitions import EXPERIMENTS, Experiment, Row, find_rows
+from cronos_lerobot.experiments.display import make_display
+from cronos_lerobot.experiments.jobs import Job, is_done
+from cronos_lerobot.experiments.plan import Options, make_jobs
+from cronos_lerobot.experiments.runner import DONE, Runner
+from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
+from cronos_lerobot.scripts.pipeline import command_line
+
+ROOT = Path("outputs/reproduce")
+RESERVED = (
+    "--steps",
+    "--seed",
+    "--output_dir",
+    "--num_envs",
+    "--policy.path",
+    "--env.scene",
+    "--resume",
+    "--config_path",
+)
+"""Flags of `cronos-train` that the experiment sets; a run with others would not be the one its folder says."""
+EPILOG = """\
+examples:
+  what there is
+      cronos-reproduce list
+  Table 1 at the size of a laptop: 7 rows, 3 seeds, 307,200 steps each
+      cronos-reproduce table1 --scale=small
+  two rows of it with the paper's 1.3 M steps, two runs at a time, one seed
+      cronos-reproduce table1 --scale=paper --rows t80 t1280_eer --seeds=1 --jobs=2
+  see the commands, run nothing
+      cronos-reproduce figure3 --dry_run
+  draw what there is so far
+      cronos-reproduce table1 --scale=small --report_only
+  from pixels, with a base policy and a setting of one's own
+      cronos-reproduce table1 --obs_type=pixels_agent_pos --policy.path=me/policy -- --algorithm.target_kl=0.02
+
+Ctrl-C stops the runs; the same command goes on from their last checkpoints.
+"""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The flags of `cronos-reproduce`."""
+    parser = argparse.ArgumentParser(
+        "cronos-reproduce",
+        usage="%(prog)s EXPERIMENT [flags] [-- flags of cronos-train]",
+        description=(__doc__ or "").split("`: ")[1].capitalize(),
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    names = [*EXPERIMENTS, "all", "list"]
+    parser.add_argument("experiment", choices=names, metavar="EXPERIMENT", help=", ".join(names))
+    parser.add_argument(
+        "--scale",
+        choices=SCALES,
+        default="small",
+        help="paper (1.3 M steps, 5 seeds), small (the default) or smoke",
+    )
+    parser.add_argument(
+        "--obs_type", default=STATE, choices=[*OBS_NAMES, *OBS_NAMES.values()], metavar="TYPE",
+        help=f"what the policy sees: {STATE} (the default; short: state) or pixels_agent_pos (short: pixels)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--seeds", metavar="N", help="how many seeds (1, 2, ... N), or a list of them: 2,5 (one alone: 2,)"
+    )
+    parser.add_argument("--rows", nargs="+", default=[], metavar="ROW", help="only these; `list` names them")
+    parser.add_argument("--jobs", type=int, help="runs at a time (default: cores / threads)")
+    parser.add_argument(
+        "--threads", type=int, default=1,
+        help="threads of each run (default: 1); results do not depend on --jobs, but they do on this",
+    )  # fmt: skip
+    parser.add_argument(
+        "--policy.path", dest="policy_path", metavar="PATH", help="base policy (default: make one)"
+    )
+    for name, text in (
+        ("demos", "demonstrations that the base policy is cloned from"),
+        ("clone_steps", "gradient steps of the cloning"),
+        ("checkpoint", "the step of the cloning whose policy is taken"),
+    ):
+        parser.add_argument(f"--base.{name}", dest=f"base_{name}", type=int, metavar="N", help=text)
+    parser.add_argument("--temperature", type=float, default=0.6, help="of every evaluation (default: 0.6)")
+    parser.add_argument(
+        "--root", type=Path, default=ROOT, help=f"holds base policies and runs, shared by all (default: {ROOT})"
+    )
+    parser.add_argument("--output_dir", type=Path, help="tables and figures (default: ROOT/EXPERIMENT_SCALE_OBS)")
+    parser.add_argument("--dry_run", action="store_true", help="print the commands and their state; run nothing")
+    parser.add_argument("--report_only", action="store_true", help="draw what there is; run nothing")
+    return parser
+
+
+def parse_seeds(text: str | None, default: int) -> tuple[int, ...]:
+    """`3` is 1, 2, 3; `3,` is 3 alone; `2,5` is 2 and 5.
+
+    Raises:
+        ValueError: it is none of these.
+    """
+    text = text or str(default)
+    try:
+        seeds = map(int, text.strip(",").split(",")) if "," in text else range(1, int(text) + 1)
+        found = tuple(dict.fromkeys(seeds))
+    except ValueError:
+        found = ()
+    if not found:
+        raise ValueError(f"--seeds must be a number or a list such as 1,4, got {text!r}")
+    return found
+
+
+def make_options(args: argparse.Namespace, extra: list[str]) -> Options:
+    """What the flags decide about every run.
+
+    Raises:
+        ValueError: a flag makes no sense.
+    """
+    taken = [flag for flag in extra if flag.split("=")[0] in RESERVED]
+    if taken:
+        raise ValueError(f"{taken[0]} is set by the experiment; it cannot be given after --")
+    if args.threads < 1:
+        raise ValueError(f"--threads must be at least 1, got {args.threads}")
+    scale = SCALES[args.scale]
+    obs_type = {short: name for name, short in OBS_NAMES.items()}.get(args.obs_type, args.obs_type)
+    changes = {
+        name: value for name in ("demos", "clone_steps", "checkpoint") if (value := getattr(args, f"base_{name}"))
+    }
+    if "clone_steps" in changes:
+        changes |= {"save_freq": changes.setdefault("checkpoint", changes["clone_steps"])}
+    elif "checkpoint" in changes:
+        changes |= {"save_freq": changes["checkpoint"]}
+    recipes = {
+        experiment.scene: replace(base_recipe(scale, experiment.scene, obs_type), **changes)
+        for experiment in EXPERIMENTS.values()
+    }
+    return Options(
+        scale,
+        obs_type,
+        parse_seeds(args.seeds, scale.seeds),
+        args.root,
+        args.threads,
+        args.temperature,
+        args.policy_path,
+        tuple(extra),
+        recipes,
+    )
+
+
+def print_list() -> None:
+    """Print the experiments and their rows."""
+    for experiment in EXPERIMENTS.values():
+        print(f"{experiment.name}: {experiment.title} ({experiment.source})")
+        print(f"    {experiment.scene}, {experiment.steps:,} steps at --scale=paper")
+        for row in experiment.rows:
+            print(f"    {row.name:<24} {row.label}")
+
+
+def print_plan(jobs: list[Job]) -> None:
+    """Print every command, those that are done as comments."""
+    for job in jobs:
+        if is_done(job):
+            print(f"# {job.name}: done ({job.output})")
+            continue
+        resumed = job.resume() if job.output.exists() else None
+        print(f"# {job.name}{': goes on' if resumed else ''}")
+        print(command_line(resumed or list(job.command)), end="\n\n")
+
+
+def run_jobs(jobs: list[Job], parallel: int, threads: int) -> bool:
+    """Run what is not done; returns whether all is done in the end."""
+    with make_display(len(jobs)) as display:
+        states = Runner(jobs, parallel, display, {"OMP_NUM_THREADS": str(threads)}).run()
+    counts = {state: list(states.values()).count(state) for state in dict.fromkeys(states.values())}
+    print("jobs: " + ", ".join(f"{number} {state}" for state, number in counts.items()))
+    return all(state == DONE for state in states.values())
+
+
+def write_reports(chosen: list[tuple[Experiment, tuple[Row, ...]]], options: Options, output: Path | None) -> None:
+    """Write the tables and figures of every experiment and print where they are."""
+    from cronos_lerobot.experiments.outputs import write_outputs
+
+    for experiment, rows in chosen:
+        scale, obs = options.scale.name, OBS_NAMES[options.obs_type]
+        folder = output or options.root / f"{experiment.name}_{scale}_{obs}"
+        print(write_outputs(experiment, rows, options, folder), flush=True)
+
+
+def main() -> None:
+    """Entry point of `cronos-reproduce`."""
+    parser = make_parser()
+    split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
+    args = parser.parse_args(sys.argv[1:split])
+    if args.experiment == "list":
+        print_list()
+        return
+    names = list(EXPERIMENTS) if args.experiment == "all" else [args.experiment]
+    if args.experiment == "all" and (args.output_dir or args.rows):
+        parser.error("--output_dir and --rows are for one experiment, not for all")
+    try:
+        options = make_options(args, sys.argv[split + 1 :])
+        chosen = [(EXPERIMENTS[name], find_rows(EXPERIMENTS[name], args.rows)) for name in names]
+    except ValueError as error:
+        sys.exit(f"error: {error}")
+    jobs = make_jobs(chosen, options)
+    if args.dry_run:
+        print_plan(jobs)
+        return
+    done = True
+    if not args.report_only:
+        parallel = args.jobs or max(1, (os.cpu_count() or 1) // args.threads)
+        try:
+            done = run_jobs(jobs, parallel, args.threads)
+        except KeyboardInterrupt:
+            sys.exit("\ninterrupted: the same command goes on from here")
+    write_reports(chosen, options, args.output_dir)
+    sys.exit(0 if done else 1)
+
+
+if __name__ == "__main__":
+    main()
