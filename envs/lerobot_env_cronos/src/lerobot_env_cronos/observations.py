@@ -75,15 +75,16 @@ class ObservationBuilder:
             spaces["pixels"] = gym.spaces.Dict(dict.fromkeys(self.cameras, image))
         return gym.spaces.Dict(spaces)
 
-    def observe(self) -> dict[str, Any]:
-        """Observation of all simulations, leading dimension n; arrays are fresh at every call."""
+    def observe(self, ids: np.ndarray) -> dict[str, Any]:
+        """Observation of simulations `ids`, leading dimension k; arrays are fresh at every call."""
         p, R = self.simulation.end_effector()
-        observation: dict[str, Any] = {"agent_pos": self._agent_pos(p, R)}
+        observation: dict[str, Any] = {"agent_pos": self._agent_pos(p, R)[ids]}
         if self.privileged:
-            observation["environment_state"] = self._environment_state(p)
+            observation["environment_state"] = self._environment_state(p)[ids]
         if self.pixels:
+            qpos = self.simulation.qpos[ids]
             observation["pixels"] = {
-                camera: self._renderer(self.size, camera).render(self.simulation.qpos) for camera in self.cameras
+                camera: self._renderer(self.size, camera).render(qpos) for camera in self.cameras
             }
         return observation
 
