@@ -4,7 +4,9 @@ from lerobot_env_cronos import gl as gl  # isort: skip  # chooses the OpenGL pla
 
 from lerobot_env_cronos.config import CronosEnvConfig, register_gymnasium
 from lerobot_env_cronos.episodic import CronosEnv, IndependentVectorEnv
+from lerobot_env_cronos.orderings import load_orderings
 from lerobot_env_cronos.scenes import CONTROL_HZ, SCENES, STEPS_PER_TASK, Scene, Task, get_scene
+from lerobot_env_cronos.sequential import SequentialVectorEnv
 from lerobot_env_cronos.vector_env import CronosVectorEnv
 
 register_gymnasium()
@@ -18,6 +20,8 @@ __all__ = [
     "CronosVectorEnv",
     "IndependentVectorEnv",
     "Scene",
+    "SequentialVectorEnv",
     "Task",
     "get_scene",
+    "load_orderings",
 ]

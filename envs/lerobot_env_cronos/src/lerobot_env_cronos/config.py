@@ -1,6 +1,7 @@
 """`--env.type=cronos`: the LeRobot configuration of the CRONOS scenes."""
 
 import logging
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -12,12 +13,14 @@ from lerobot.envs.utils import parse_camera_names
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from lerobot_env_cronos.configurations import SPLITS
-from lerobot_env_cronos.episodic import IndependentVectorEnv, LazyVectorEnv, find_task
+from lerobot_env_cronos.episodic import EpisodicVectorEnv, IndependentVectorEnv, LazyVectorEnv, find_task
 from lerobot_env_cronos.observations import AGENT_POS_NAMES, OBS_TYPES, environment_state_names
-from lerobot_env_cronos.scenes import CONTROL_HZ, SCENES, get_scene
+from lerobot_env_cronos.orderings import Ordering, load_orderings
+from lerobot_env_cronos.scenes import CONTROL_HZ, SCENES, Task, get_scene
+from lerobot_env_cronos.sequential import ADVANCES, SequentialVectorEnv
 from lerobot_env_cronos.simulation import ACTION_NAMES
 
-SUITES = ("independent",)
+SUITES = ("independent", "sequential")
 
 
 @EnvConfig.register_subclass("cronos")
@@ -26,15 +29,21 @@ class CronosEnvConfig(EnvConfig):
     """Shared-scene pick and place on the Bridge table (CRONOS, Section 4)."""
 
     task: str | None = None
-    """Instruction of the one task to evaluate; null for all tasks of the suite."""
+    """What to evaluate of the suite: an instruction (independent), or the number of an ordering, 0 to 9
+    (sequential); null for all."""
     fps: int = CONTROL_HZ
     """Control frequency [Hz]; fixed by the protocol."""
     scene: str = "kitchen_2x2"
-    """Scene: kitchen_2x2."""
+    """Scene: kitchen_2x2, kitchen_3x3, playroom_2x2, or a registered one."""
     suite: str = "independent"
-    """Evaluation suite: independent (every task from every configuration, 80 steps)."""
+    """Evaluation suite: independent (every task from every configuration, 80 steps), or sequential (chains of all
+    tasks without a reset in between, in ten orderings, 80 steps for each task)."""
     split: str = "train"
     """Configurations: train or held_out, 64 each."""
+    advance: str = "window"
+    """When a chain goes on to its next task: window (when the 80 steps are over) or on_success (at once)."""
+    end_effector_reset: bool = False
+    """Send the arm home between the tasks of a chain."""
     obs_type: str = "pixels_agent_pos"
     """pixels_agent_pos, or environment_state_agent_pos for the privileged state in place of pixels."""
     privileged_state: bool = False
@@ -65,10 +74,11 @@ class CronosEnvConfig(EnvConfig):
         scene = get_scene(self.scene)
         _check("suite", self.suite, SUITES)
         _check("split", self.split, SPLITS)
+        _check("advance", self.advance, ADVANCES)
         _check("obs_type", self.obs_type, OBS_TYPES)
         if self.fps != CONTROL_HZ:
             raise ValueError(f"env.fps is fixed at {CONTROL_HZ} Hz by the protocol, got {self.fps}")
-        find_task(self.scene, self.task)
+        self._chosen()
         pixels = self.obs_type == "pixels_agent_pos"
         self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),))}
         self.features["agent_pos"] = PolicyFeature(FeatureType.STATE, (len(AGENT_POS_NAMES),))
@@ -103,18 +113,33 @@ class CronosEnvConfig(EnvConfig):
         return {name: getattr(self, name) for name in names}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """One native vector env per task, built lazily; `use_async_envs` is not needed and ignored."""
-        scene = get_scene(self.scene)
-        task = find_task(self.scene, self.task)
-        envs: dict[int, gym.vector.VectorEnv] = {
-            i: LazyVectorEnv(
-                partial(IndependentVectorEnv, n_envs, self.scene, task=t, split=self.split, **self.gym_kwargs),
-                n_envs,
-            )
-            for i, t in enumerate(scene.tasks)
-            if task in (None, t)
-        }
+        """One native vector env per task or ordering, built lazily; `use_async_envs` is not needed and ignored."""
+        makers = {i: self._maker(n_envs, chosen) for i, chosen in self._chosen().items()}
+        envs: dict[int, gym.vector.VectorEnv] = {i: LazyVectorEnv(make, n_envs) for i, make in makers.items()}
         return {f"{self.suite}_{self.split}": envs}
+
+    def _chosen(self) -> Mapping[int, Task | Ordering]:
+        """The tasks or orderings of the suite that `task` chooses, by their number."""
+        if self.suite == "independent":
+            task = find_task(self.scene, self.task)
+            return {i: t for i, t in enumerate(get_scene(self.scene).tasks) if task in (None, t)}
+        orderings = dict(enumerate(load_orderings(self.scene)))
+        if self.task is None:
+            return orderings
+        chosen = {i: ordering for i, ordering in orderings.items() if str(i) == str(self.task)}
+        if not chosen:
+            valid = [str(i) for i in orderings]
+            raise ValueError(f"unknown ordering {self.task!r} of {self.scene}; valid orderings: {valid}")
+        return chosen
+
+    def _maker(self, n_envs: int, chosen: Task | Ordering) -> Callable[[], EpisodicVectorEnv]:
+        kwargs = {"split": self.split} | self.gym_kwargs
+        if isinstance(chosen, Task):
+            return partial(IndependentVectorEnv, n_envs, self.scene, task=chosen, **kwargs)
+        return partial(
+            SequentialVectorEnv, n_envs, self.scene, ordering=chosen,
+            advance=self.advance, end_effector_reset=self.end_effector_reset, **kwargs,
+        )  # fmt: skip
 
 
 def _check(name: str, value: str, valid: tuple[str, ...]) -> None:

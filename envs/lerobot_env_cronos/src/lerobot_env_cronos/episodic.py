@@ -14,7 +14,33 @@ from lerobot_env_cronos.scenes import STEPS_PER_TASK, Task, get_scene
 from lerobot_env_cronos.vector_env import CronosVectorEnv
 
 
-class IndependentVectorEnv(CronosVectorEnv):
+class EpisodicVectorEnv(CronosVectorEnv):
+    """Episodes that end, and are frozen from then on until the next `reset`.
+
+    What is over is neither simulated nor rendered any more: its observation stays the last one.
+
+    Attributes:
+        done: (n,) bool, the episodes that are over.
+    """
+
+    def __init__(self, num_envs: int, scene: str = "kitchen_2x2", *, split: str = "train", **kwargs):
+        if split not in SPLITS:
+            raise ValueError(f"unknown split {split!r}; valid splits: {list(SPLITS)}")
+        self.split = split
+        super().__init__(num_envs, scene, **kwargs)
+        self.done = np.zeros(num_envs, dtype=bool)
+        self._last: dict[str, Any] | None = None
+
+    def observe_running(self, running: np.ndarray) -> dict[str, Any]:
+        """The observation of all environments, made anew for `running` (k,) only; arrays are fresh."""
+        if self._last is None or len(running) == self.num_envs:
+            self._last = self.observe()
+        elif len(running):
+            _scatter(self._last, running, self.observe(running))
+        return _copy(self._last)
+
+
+class IndependentVectorEnv(EpisodicVectorEnv):
     """`num_envs` independent episodes of one task (paper, Section 4, "Independent-task evaluation").
 
     An episode starts from configuration `seed % 64` of `split` with the arm at home. It is `terminated` when the
@@ -36,12 +62,9 @@ class IndependentVectorEnv(CronosVectorEnv):
         split: str = "train",
         **kwargs,
     ):
-        if split not in SPLITS:
-            raise ValueError(f"unknown split {split!r}; valid splits: {list(SPLITS)}")
-        self.split, self.task = split, task
+        self.task = task
         self._max_episode_steps = STEPS_PER_TASK
-        super().__init__(num_envs, scene, **kwargs)
-        self.done = np.zeros(num_envs, dtype=bool)
+        super().__init__(num_envs, scene, split=split, **kwargs)
         self._elapsed = np.zeros(num_envs, dtype=int)
 
     def reset(self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None):
@@ -52,7 +75,7 @@ class IndependentVectorEnv(CronosVectorEnv):
         self.set_task(self._all, [self.task] * self.num_envs)
         self.done[:] = False
         self._elapsed[:] = 0
-        return self.observe(), self._info()
+        return self.observe_running(self._all), self._info()
 
     def step(self, actions: np.ndarray):
         """Step the unfinished episodes; see `CronosVectorEnv.step`."""
@@ -65,7 +88,7 @@ class IndependentVectorEnv(CronosVectorEnv):
         truncated = ~self.done & ~success & ((self._elapsed >= self._max_episode_steps) | diverged)
         self.done |= success | truncated
         info = {"is_success": success, "is_grasped": self.is_grasped.copy(), "diverged": diverged}
-        return self.observe(), reward, success.copy(), truncated, info
+        return self.observe_running(running), reward, success.copy(), truncated, info
 
 
 class LazyVectorEnv(gym.vector.VectorEnv):
@@ -188,6 +211,18 @@ def find_task(scene: str, instruction: str | None) -> Task | None:
     if instruction not in tasks:
         raise ValueError(f"unknown task {instruction!r} of {scene}; valid tasks: {list(tasks)}")
     return tasks[instruction]
+
+
+def _scatter(into: dict[str, Any], rows: np.ndarray, batch: dict[str, Any]) -> None:
+    for key, value in batch.items():
+        if isinstance(value, dict):
+            _scatter(into[key], rows, value)
+        else:
+            into[key][rows] = value
+
+
+def _copy(batch: dict[str, Any]) -> dict[str, Any]:
+    return {key: _copy(value) if isinstance(value, dict) else value.copy() for key, value in batch.items()}
 
 
 def _first(batch: dict[str, Any]) -> dict[str, Any]:
