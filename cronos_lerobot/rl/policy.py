@@ -23,6 +23,10 @@ class TrainablePolicy(Protocol):
     A policy whose first layers are frozen may also have `encode_observation(batch) -> Batch` (or None there),
     which replaces inputs by what those layers make of them. It is called once for each observation; what it
     returns is kept until the update and handed to the other methods in place of the batch.
+
+    `sample_actions` may also take `uniform`, numbers (B, A) in [0, 1) that are its randomness in place of a
+    generator. An evaluation then draws them for each episode and step, and an episode's actions do not depend on
+    which others share its batch.
     """
 
     def sample_actions(

@@ -10,7 +10,7 @@ import torch
 from lerobot.configs import FeatureType, NormalizationMode
 from lerobot.utils.constants import OBS_IMAGES
 
-from cronos_lerobot.rl.policy import Batch
+from cronos_lerobot.rl.policy import Batch, TrainablePolicy
 from cronos_lerobot.rl.rollout_buffer import Columns
 
 
@@ -79,6 +79,7 @@ def make_processors(policy: Any, preprocessor: Any, postprocessor: Any) -> Polic
     """Return the processors of a LeRobot policy that is on its device."""
     device = next(policy.parameters()).device
     mode = getattr(policy.config, "normalization_mapping", {}).get(FeatureType.VISUAL.value)
-    is_untouched = mode == NormalizationMode.IDENTITY
+    # Other LeRobot policies that do not normalise images scale them themselves, from [0, 1].
+    is_untouched = mode == NormalizationMode.IDENTITY and isinstance(policy, TrainablePolicy)
     encoder = getattr(policy, "encode_observation", None)
     return PolicyProcessors(preprocessor, postprocessor, device, uint8_images=is_untouched, encoder=encoder)

@@ -5,11 +5,9 @@ from __future__ import annotations
 import json
 import os
 import platform
-import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +15,11 @@ import numpy as np
 from tqdm import tqdm
 
 from cronos_lerobot.loop_state import Event, LoopState, SegmentEnd, Step
+from cronos_lerobot.provenance import git_commit, package_versions
 from cronos_lerobot.training.config import CronosTrainConfig
 
 METRICS = "metrics.jsonl"
 MANIFEST = "manifest.json"
-MANIFEST_PACKAGES = (
-    "cronos-lerobot", "lerobot_env_cronos", "lerobot_policy_pocketvla", "lerobot", "mujoco", "torch", "numpy",
-    "gymnasium",
-)  # fmt: skip
 
 
 class RolloutStatistics:
@@ -211,40 +206,14 @@ def write_manifest(config: CronosTrainConfig) -> None:
         "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "seed": config.seed,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": {"python": platform.python_version()} | _versions(),
-        "git_commit": _git_commit(),
+        "versions": {"python": platform.python_version()} | package_versions(),
+        "git_commit": git_commit(),
         "machine": {"platform": platform.platform(), "cpu_count": os.cpu_count()},
         "renderer": os.environ.get("MUJOCO_GL"),
         "policy_device": config.policy.device if config.policy else None,
         "config": config.to_dict(),
     }
     path.write_text(json.dumps({"starts": [*starts, start]}, indent=2))
-
-
-def _versions() -> dict[str, str]:
-    versions = {}
-    for package in MANIFEST_PACKAGES:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return versions
-
-
-def _git_commit() -> str | None:
-    """Return the commit of the checkout this package runs from, marked if it was changed, or None."""
-    folder = Path(__file__).resolve().parent
-    command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    try:
-        # An installed wheel inside someone else's repository is not ours.
-        tracked = subprocess.run(
-            ["git", "-C", str(folder), "ls-files", "--error-unmatch", __file__], capture_output=True
-        )
-        if tracked.returncode != 0:
-            return None
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return None
 
 
 def _jsonable(value: Any) -> Any:

@@ -121,6 +121,17 @@ def test_samples_have_the_frequencies_of_the_distribution():
     np.testing.assert_allclose(frequencies.numpy(), [1 / 8, 2 / 8, 5 / 8], atol=0.015)
 
 
+def test_uniform_numbers_are_quantiles_of_the_distribution():
+    # Bins of probability 1/8, 0, 2/8, 5/8, 0: those of probability 0 are never drawn.
+    probabilities = torch.tensor([1 / 8, 0.0, 2 / 8, 5 / 8, 0.0])
+    uniform = torch.tensor([[0.0], [0.124], [0.126], [0.374], [0.376], [1 - 2**-24]])
+    distribution = BinDistribution(probabilities.log().clamp(min=-1e4).expand(6, 1, 5))
+    assert distribution.sample(uniform=uniform).flatten().tolist() == [0, 0, 2, 2, 3, 3]
+    # At temperature 1/2 the probabilities are squared: 1/30, 0, 4/30, 25/30, 0.
+    assert distribution.sample(0.5, uniform=uniform).flatten().tolist() == [0, 2, 2, 3, 3, 3]
+    assert distribution.sample(0.0, uniform=uniform).flatten().tolist() == [3] * 6
+
+
 def test_temperature_zero_is_a_point_and_a_negative_one_is_refused():
     distribution = BinDistribution(torch.tensor([[[0.0, 1.0]], [[0.0, 1.0]]]))
     assert distribution.log_prob(torch.tensor([[1], [0]]), 0.0).tolist() == [0.0, -math.inf]

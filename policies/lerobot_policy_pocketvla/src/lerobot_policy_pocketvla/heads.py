@@ -43,13 +43,30 @@ class BinDistribution:
         """The likeliest bin of each dimension, shape (B, D)."""
         return self.logits.argmax(dim=-1)
 
-    def sample(self, temperature: float = 1.0, generator: torch.Generator | None = None) -> Tensor:
-        """Draw one bin per dimension, shape (B, D); temperature 0 is the mode."""
+    def sample(
+        self,
+        temperature: float = 1.0,
+        generator: torch.Generator | None = None,
+        uniform: Tensor | None = None,
+    ) -> Tensor:
+        """Draw one bin per dimension, shape (B, D); temperature 0 is the mode.
+
+        Args:
+            temperature: divides the logits.
+            generator: source of the randomness.
+            uniform: the randomness itself, numbers (B, D) in [0, 1), in place of a generator: the quantiles of the
+                distributions at which the bins are drawn.
+        """
         if temperature == 0:
             return self.mode()
         probs = self.log_probs(temperature).exp()
         batch, dims, bins = probs.shape
-        return torch.multinomial(probs.reshape(-1, bins), 1, generator=generator).reshape(batch, dims)
+        if uniform is None:
+            return torch.multinomial(probs.reshape(-1, bins), 1, generator=generator).reshape(batch, dims)
+        cumulative = probs.cumsum(dim=-1)
+        # The sum differs from 1 by rounding; without this, a number close to 1 would fall beyond the last bin.
+        threshold = uniform.to(cumulative.dtype) * cumulative[..., -1]
+        return torch.searchsorted(cumulative, threshold.unsqueeze(-1), right=True).squeeze(-1).clamp(max=bins - 1)
 
     def log_prob(self, tokens: Tensor, temperature: float = 1.0) -> Tensor:
         """Log-probability of bins (B, D), summed over the dimensions, shape (B,).

@@ -221,9 +221,21 @@ class PocketVLAPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def sample_actions(
-        self, batch: Batch, *, temperature: float = 1.0, generator: torch.Generator | None = None
+        self,
+        batch: Batch,
+        *,
+        temperature: float = 1.0,
+        generator: torch.Generator | None = None,
+        uniform: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """Draw actions with what is needed to learn from them.
+
+        Args:
+            batch: observations and `task`.
+            temperature: of the sampling, 0 is greedy.
+            generator: random source; None is torch's global one.
+            uniform: the randomness itself, (B, D) in [0, 1), in place of a generator: a sample then does not depend
+                on the others of its batch.
 
         Returns:
             `action` (B, D) float32, normalised; `tokens` (B, D) int64; `log_prob` (B,), summed over the
@@ -232,7 +244,7 @@ class PocketVLAPolicy(PreTrainedPolicy):
         with self._full_precision():
             features = self._features(batch)
             distribution = BinDistribution(self.head(features))
-            tokens = distribution.sample(temperature, generator)
+            tokens = distribution.sample(temperature, generator, uniform)
             return {
                 "action": tokens_to_actions(tokens, self.config.num_bins),
                 "tokens": tokens,
