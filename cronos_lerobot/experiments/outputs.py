@@ -98,6 +98,12 @@ def markdown(result: ExperimentResult, figures: Sequence[str]) -> str:
         f"The paper's numbers: {paper_results()['_source']} Another simulator, another policy and another base:"
         " compare the order of the rows, not the numbers.",
     ]
+    if steps != experiment.steps:
+        lines += [
+            "",
+            f"These runs have {steps:,} of the paper's {experiment.steps:,} steps and as many fewer interventions:"
+            f" multiply them by {experiment.steps / steps:.1f} to compare.",
+        ]
     lines += _section("Success after so many interventions", _budget_columns(result))
     lines += _section("What the text says", _claim_columns(tables.claim_rows(result)))
     lines += _section("Sequences of tasks", _sequential_columns(tables.sequential_rows(result)))
@@ -141,12 +147,11 @@ def _main_columns(result: ExperimentResult) -> Columns:
 
 
 def _budget_columns(result: ExperimentResult) -> Columns:
-    columns: Columns = {"": [row.row.label for row in result.rows]}
-    for budget in tables.budgets(result):
-        cells = [_cell(row.success_at(budget)) for row in result.rows]
-        columns[f"{budget:,}"] = cells
-    has_any = any(cell != MISSING for title, cells in columns.items() if title for cell in cells)
-    return columns if has_any else {}
+    rows = [row for row in result.rows if row.finished]
+    if not rows:
+        return {}
+    columns: Columns = {"": [row.row.label for row in rows]}
+    return columns | {f"{n:,}": [_cell(row.success_at(n)) for row in rows] for n in tables.budgets(result)}
 
 
 def _claim_columns(claims: list[dict[str, Any]]) -> Columns:
@@ -178,9 +183,10 @@ def _segment_columns(result: ExperimentResult) -> Columns:
     rates = {(row["row"], row["segment"]): row["success"] for row in tables.segment_rows(result)}
     if not rates:
         return {}
-    columns: Columns = {"": [row.row.label for row in result.rows]}
+    rows = [row for row in result.rows if row.seeds]
+    columns: Columns = {"": [row.row.label for row in rows]}
     for segment in sorted({segment for _, segment in rates}):
-        columns[str(segment + 1)] = [_number(rates.get((row.row.name, segment)), 2) for row in result.rows]
+        columns[str(segment + 1)] = [_number(rates.get((row.row.name, segment)), 2) for row in rows]
     return columns
 
 

@@ -163,8 +163,8 @@ class Runner:
         self.display.event(job, state)
 
     def _stop(self) -> None:
-        """End the children that still run: first as Ctrl-C does, then less and less kindly."""
-        for sent in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+        """End the children that still run. Not by SIGINT: whoever starts us in the background has it ignored."""
+        for sent in (signal.SIGTERM, signal.SIGKILL):
             _signal_groups(self._children, sent)
             deadline = time.monotonic() + GRACE_S
             while any(child.process.poll() is None for child in self._children) and time.monotonic() < deadline:
