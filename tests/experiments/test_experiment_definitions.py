@@ -1,0 +1,205 @@
+"""The declared runs are the paper's, written down here a second time by hand."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cronos_lerobot.experiments.definitions import EXPERIMENTS, find_rows
+from cronos_lerobot.experiments.plan import Options, make_jobs, run_specs, train_flags
+from cronos_lerobot.experiments.results import paper_results
+from cronos_lerobot.experiments.scales import PIXELS, SCALES, STATE, base_recipe
+from cronos_lerobot.protocol import ProtocolConfig
+from cronos_lerobot.task_orders import TASK_ORDERS
+
+TABLE1 = [
+    # T, EER, CL, LSR, HSR: the ticks of Table 1.
+    (80, 0, 0, 0, 0),
+    (1280, 0, 0, 0, 0),
+    (1280, 1, 0, 0, 0),
+    (1280, 1, 1, 0, 0),
+    (1280, 1, 1, 1, 0),
+    (1280, 1, 1, 0, 1),
+    (1280, 1, 1, 1, 1),
+]
+FIGURE3 = [(80, 0, 0, 0, 0), (320, 1, 0, 0, 0), (1280, 1, 1, 0, 1), (2560, 1, 1, 0, 1)]
+PAPER = {
+    # S in M, scene, rows, splits of the curves.
+    "table1": (1.3, "kitchen_2x2", TABLE1, ["train"]),
+    "figure2": (1.3, "kitchen_2x2", [(1280, 1, 1, 0, 1)] * 2, ["train"]),
+    "figure3": (2.9, "kitchen_2x2", FIGURE3, ["train"]),
+    "figure4": (1.3, "kitchen_2x2", [(80, 0, 0, 0, 0), (320, 1, 0, 0, 0)] * 2, ["train", "held_out"]),
+    "figure5": (1.3, "kitchen_2x2", [(80, 0, 0, 0, 0), (320, 1, 0, 0, 0)], ["train"]),
+    "figure7": (2.9, "kitchen_3x3", [(80, 0, 0, 0, 0), (320, 1, 0, 0, 0)], ["train"]),
+    "figure8": (2.9, "playroom_2x2", [(80, 0, 0, 0, 0), (320, 1, 0, 0, 0)], ["train"]),
+    "figure11": (2.9, "kitchen_2x2", FIGURE3, ["train"]),
+    "figure12": (1.3, "kitchen_2x2", TABLE1, ["train", "held_out"]),
+    "figure13": (1.3, "kitchen_2x2", [(80, 0, 0, 0, 0), (320, 1, 0, 0, 0)] * 2, ["train", "held_out"]),
+    "figure14": (1.3, "kitchen_2x2", [(1280, 1, 1, 0, 1)] * 2, ["train", "held_out"]),
+}
+
+
+def options(scale="paper", obs_type=STATE, root="out", **changes):
+    recipes = {e.scene: base_recipe(SCALES[scale], e.scene, obs_type) for e in EXPERIMENTS.values()}
+    seeds = tuple(range(1, SCALES[scale].seeds + 1))
+    return Options(SCALES[scale], obs_type, seeds, Path(root), recipes=recipes, **changes)
+
+
+def jobs_of(name, rows=(), **changes):
+    experiment = EXPERIMENTS[name]
+    return {j.name: j for j in make_jobs([(experiment, find_rows(experiment, list(rows)))], options(**changes))}
+
+
+def test_every_table_and_figure_with_results_is_there():
+    # Figures 1, 6, 9 and 10 are pictures.
+    assert list(EXPERIMENTS) == list(PAPER)
+
+
+@pytest.mark.parametrize("name", PAPER)
+def test_rows_are_the_papers(name):
+    million, scene, rows, splits = PAPER[name]
+    experiment = EXPERIMENTS[name]
+    assert (experiment.steps, experiment.scene, list(experiment.splits)) == (round(million * 1e6), scene, splits)
+    found = [
+        (row.interval, row.end_effector_reset, row.curriculum, row.learned_reset, row.heuristic_reset)
+        for row in experiment.rows
+    ]
+    assert found == rows
+
+
+def test_what_differs_beyond_the_resets():
+    assert [row.task_order for row in EXPERIMENTS["figure2"].rows] == ["heuristic", "random"]
+    assert [row.num_configurations for row in EXPERIMENTS["figure4"].rows] == [64, 64, 1, 1]
+    for figure, same in (
+        ("figure11", "figure3"),
+        ("figure12", "table1"),
+        ("figure13", "figure4"),
+        ("figure14", "figure2"),
+    ):
+        assert EXPERIMENTS[figure].rows == EXPERIMENTS[same].rows
+        assert EXPERIMENTS[figure].by_task
+    sequential = [(e.suite, e.splits, e.every_checkpoint) for e in EXPERIMENTS["figure5"].evaluations]
+    assert sequential == [("sequential", ("train", "held_out"), False)]
+
+
+@pytest.mark.parametrize("name", PAPER)
+def test_names_of_rows_are_unique(name):
+    names = [row.name for row in EXPERIMENTS[name].rows]
+    assert len(set(names)) == len(names)
+
+
+def test_paper_scale_is_the_papers():
+    scale = SCALES["paper"]
+    assert scale.steps == {1_300_000: 1_300_000, 2_900_000: 2_900_000}
+    assert (scale.seeds, scale.num_envs, scale.eval_episodes) == (5, 64, 64)
+
+
+def test_commands_of_table1():
+    jobs = jobs_of("table1")
+    assert len(jobs) == 2 + 7 * 5
+    base = "base/kitchen_2x2_state_400demos_320steps"
+    assert list(jobs)[:2] == [f"{base}/demos", f"{base}/clone"]
+    # One seed of every row before the second of any.
+    assert list(jobs)[2:10:7] == [f"kitchen_2x2_state_paper/t80_1300k/seed{seed}" for seed in (1, 2)]
+    hsr = jobs["kitchen_2x2_state_paper/t1280_eer_cl_hsr_1300k/seed3"]
+    assert hsr.needs == (f"{base}/clone",)
+    assert {
+        "cronos-train", "--env.scene=kitchen_2x2", "--seed=3", "--steps=1300000", "--num_envs=64",
+        "--protocol.scene_reset_interval=1280", "--protocol.end_effector_reset=true",
+        "--protocol.update_interval=160", "--protocol.curriculum=[[650000, 320]]", "--protocol.heuristic_reset=true", "--eval.n_episodes=64",
+        "--eval.temperature=0.6", "--eval_freq=102400", "--torch_threads=1", "--env.num_threads=1",
+        f"--policy.path=out/{base}/clone/checkpoints/000320/pretrained_model",
+    } <= set(hsr.command)  # fmt: skip
+    assert not any("learned_reset" in flag for flag in hsr.command)
+    t80 = jobs["kitchen_2x2_state_paper/t80_1300k/seed1"]
+    assert "--protocol.end_effector_reset=false" in t80.command
+    assert not any("curriculum" in flag for flag in t80.command)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("name", PAPER)
+def test_protocols_are_valid_and_mean_what_the_row_says(name, scale):
+    for spec in run_specs(EXPERIMENTS[name], options(scale)):
+        flags = dict(flag.removeprefix("--").split("=", 1) for flag in train_flags(spec))
+        values = {key.split(".")[1]: value for key, value in flags.items() if key.startswith("protocol.")}
+        assert values.pop("task_order") in TASK_ORDERS
+        protocol = ProtocolConfig(**{key: json.loads(value) for key, value in values.items()})
+        row, steps = spec.row, int(flags["steps"])
+        assert protocol.scene_reset_interval_at(steps) == row.interval
+        early = protocol.scene_reset_interval_at(steps // 5)
+        assert early == (320 if row.curriculum else row.interval)
+
+
+def test_curriculum_takes_the_same_share_of_a_smaller_run():
+    for scale, until in (("paper", 650_000), ("small", 153_600)):
+        spec = next(s for s in run_specs(EXPERIMENTS["table1"], options(scale)) if s.row.curriculum)
+        assert f"--protocol.curriculum=[[{until}, 320]]" in train_flags(spec)
+
+
+def test_runs_are_shared_between_experiments():
+    everything = make_jobs([(e, e.rows) for e in EXPERIMENTS.values()], options())
+    trains = [job for job in everything if job.command[0] == "cronos-train"]
+    # 1.3 M: seven of Table 1, random order, T = 320, two with one configuration; 2.9 M: four, and two in each of
+    # two other scenes.
+    assert len(trains) == 5 * (7 + 1 + 1 + 2 + 4 + 2 + 2)
+    assert len({job.name for job in everything}) == len(everything)
+    assert len({job.output for job in everything}) == len(everything)
+    # Three scenes, each with demonstrations and their cloning.
+    assert len([job for job in everything if job.name.startswith("base/")]) == 6
+
+
+def test_own_policy_needs_no_base():
+    jobs = jobs_of("figure5", policy_path="me/policy")
+    assert not any(name.startswith("base/") for name in jobs)
+    assert "--policy.path=me/policy" in jobs["kitchen_2x2_state_paper/t320_eer_1300k/seed5"].command
+
+
+def test_pixels():
+    jobs = jobs_of("figure7", rows=["t320_eer"], scale="small", obs_type=PIXELS)
+    demos, clone, *trains = jobs.values()
+    assert {"--dataset.video=false", "--env.privileged_state=true", "--env.scene=kitchen_3x3"} <= set(
+        demos.command
+    )
+    assert {"--policy.observation=image", "--policy.critic_observation=environment_state"} <= set(clone.command)
+    assert len(trains) == 3
+    assert {
+        "--policy.freeze_encoder=true",
+        "--algorithm.policy_lr=1e-4",
+        "--env.obs_type=pixels_agent_pos",
+    } <= set(trains[0].command)
+
+
+def test_evaluations_of_checkpoints():
+    figure4 = jobs_of("figure4", rows=["t80"])
+    evals = [job for job in figure4.values() if job.command[0] == "cronos-eval" and "/seed2/" in job.name]
+    # Every multiple of 102,400 up to 1,300,480, 1.3 M rounded up to whole updates, and that itself.
+    assert len(evals) == 13
+    run = "out/runs/kitchen_2x2_state_paper/t80_1300k/seed2"
+    assert evals[0].command[:4] == (
+        "cronos-eval",
+        f"--policy.path={run}/train/checkpoints/0102400/pretrained_model",
+        "--eval.suites=independent",
+        "--eval.splits=held_out",
+    )
+    assert f"--policy.path={run}/train/checkpoints/1300480/pretrained_model" in evals[-1].command
+    assert evals[0].needs == ("kitchen_2x2_state_paper/t80_1300k/seed2",)
+    figure5 = [job for job in jobs_of("figure5", rows=["t80"]).values() if job.command[0] == "cronos-eval"]
+    assert len(figure5) == 2 * 5
+
+
+def test_flags_given_last_replace_the_experiments():
+    jobs = jobs_of("table1", extra=("--eval.temperature=0", "--algorithm.target_kl=0.02"))
+    command = jobs["kitchen_2x2_state_paper/t80_1300k/seed1"].command
+    assert [flag for flag in command if flag.startswith("--eval.temperature")] == ["--eval.temperature=0"]
+    assert command[-1] == "--algorithm.target_kl=0.02"
+
+
+def test_unknown_row():
+    with pytest.raises(ValueError, match=r"table1 has no row 't81'; it has t80, t1280,"):
+        find_rows(EXPERIMENTS["table1"], ["t81"])
+
+
+def test_papers_numbers():
+    means = [paper_results()["final_success"]["table1"][row.name][0] for row in EXPERIMENTS["table1"].rows]
+    assert means == [0.897, 0.023, 0.326, 0.578, 0.580, 0.649, 0.631]
+    assert "Table 1" in paper_results()["_source"]

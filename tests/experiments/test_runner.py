@@ -1,0 +1,208 @@
+"""The runner with tiny real commands: order, skipping, resuming, failing, stopping."""
+
+import fcntl
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+from cronos_lerobot.experiments.display import LineDisplay
+from cronos_lerobot.experiments.jobs import Job, changed_flags, is_done, read_record
+from cronos_lerobot.experiments.runner import Runner
+
+
+class Tape:
+    """A display that remembers."""
+
+    def __init__(self):
+        self.events, self.most = [], 0
+
+    def event(self, job, what):
+        self.events.append((job.name, what))
+
+    def update(self, states, running):
+        self.most = max(self.most, len(running))
+
+
+def python_job(folder, name, code, **options):
+    """`code` runs with `out`, the job's folder, which it finds made."""
+    lines = (
+        f"import pathlib, sys, time\nout = pathlib.Path({str(folder / name)!r})\nout.mkdir(exist_ok=True)\n{code}"
+    )
+    return Job(name, ("python", "-c", lines), folder / name, **options)
+
+
+def count_job(folder, name, **options):
+    """Adds an x to a file for each time it runs."""
+    return python_job(folder, name, "(out / 'n').open('a').write('x')", **options)
+
+
+@pytest.fixture(autouse=True)
+def fast(monkeypatch):
+    monkeypatch.setattr("cronos_lerobot.experiments.runner.POLL_S", 0.02)
+
+
+def run(jobs, parallel=2):
+    tape = Tape()
+    return Runner(jobs, parallel, tape).run(), tape
+
+
+def test_needs_come_first_and_done_jobs_are_skipped(tmp_path):
+    needed = count_job(tmp_path, "a")
+    copy = python_job(
+        tmp_path, "b", f"(out / 'n').write_text(pathlib.Path({str(tmp_path / 'a/n')!r}).read_text())", needs=("a",)
+    )
+    states, tape = run([needed, copy])
+    assert states == {"a": "done", "b": "done"}
+    assert tape.events == [("a", "started"), ("a", "done"), ("b", "started"), ("b", "done")]
+    assert (tmp_path / "b/n").read_text() == "x"
+    states, tape = run([needed, copy])
+    assert (states, tape.events) == ({"a": "done", "b": "done"}, [])
+    assert (tmp_path / "a/n").read_text() == "x"
+    assert read_record(needed)["command"] == list(needed.command)
+
+
+def test_as_many_at_a_time_as_asked(tmp_path):
+    jobs = [python_job(tmp_path, name, "time.sleep(0.3)") for name in "abcde"]
+    assert run(jobs[:2], parallel=1)[1].most == 1
+    assert run(jobs[2:], parallel=3)[1].most == 3
+
+
+def test_failure_blocks_what_needs_it_and_nothing_else(tmp_path, capsys):
+    jobs = [
+        python_job(tmp_path, "a", "print('so far so good'); raise SystemExit('the disk is full')"),
+        count_job(tmp_path, "b", needs=("a",)),
+        count_job(tmp_path, "c", needs=("b",)),
+        count_job(tmp_path, "d"),
+    ]
+    states = Runner(jobs, 1, LineDisplay(4)).run()
+    assert states == {"a": "failed", "b": "blocked", "c": "blocked", "d": "done"}
+    out = capsys.readouterr().out
+    assert "so far so good\nthe disk is full" in out
+    assert not (tmp_path / "b").exists()
+    assert (read_record(jobs[0])["status"], read_record(jobs[0])["returncode"]) == ("failed", 1)
+
+
+def test_failed_job_is_resumed_where_it_can_be(tmp_path):
+    half = "(out / 'n').open('a').write('half'); raise SystemExit(1)"
+    rest = ["python", "-c", f"open({str(tmp_path / 'a/n')!r}, 'a').write(' and half')"]
+    job = python_job(tmp_path, "a", half, resume=lambda: rest)
+    assert run([job])[0] == {"a": "failed"}
+    states, tape = run([job])
+    assert (states, tape.events[0]) == ({"a": "done"}, ("a", "resumed"))
+    assert (tmp_path / "a/n").read_text() == "half and half"
+    record = read_record(job)
+    # It is still known as what it was begun as.
+    assert (record["command"], record["starts"]) == (list(job.command), 2)
+    assert job.log.read_text().count("$ python") == 2
+
+
+def test_failed_job_that_cannot_be_resumed_begins_anew(tmp_path):
+    fails_once = (
+        f"first = not pathlib.Path({str(tmp_path / 'once')!r}).exists(); (out / 'n').open('a').write('x')\n"
+    )
+    fails_once += f"pathlib.Path({str(tmp_path / 'once')!r}).touch(); sys.exit(first)"
+    job = python_job(tmp_path, "a", fails_once)
+    assert run([job])[0] == {"a": "failed"}
+    assert run([job])[0] == {"a": "done"}
+    assert (tmp_path / "a/n").read_text() == "x"
+
+
+def test_changed_command_is_reported_and_its_output_left_alone(tmp_path, capsys):
+    old = Job("a", ("python", "-c", "pass", "--seed=1", "--lr=1"), tmp_path / "a")
+    (tmp_path / "a").mkdir()
+    new = Job("a", ("python", "-c", "pass", "--seed=1", "--lr=2"), tmp_path / "a")
+    run([python_job(tmp_path, "a", "")])
+    record = json.loads(old.record.read_text()) | {"command": list(old.command)}
+    old.record.write_text(json.dumps(record))
+    assert is_done(old)
+    assert not is_done(new)
+    assert changed_flags(new) == ["---lr=1", "+--lr=2"]
+    states = Runner([new, count_job(tmp_path, "b", needs=("a",))], 1, LineDisplay(2)).run()
+    assert states == {"a": "changed", "b": "blocked"}
+    assert "+--lr=2" in capsys.readouterr().out
+    assert json.loads(old.record.read_text()) == record
+    # Once its output is out of the way it runs.
+    (tmp_path / "a").rmdir()
+    assert Runner([python_job(tmp_path, "a", "")], 1, LineDisplay(1)).run() == {"a": "done"}
+
+
+def test_lost_output_is_made_again(tmp_path):
+    job = count_job(tmp_path, "a")
+    run([job])
+    (tmp_path / "a/n").unlink()
+    (tmp_path / "a").rmdir()
+    assert run([job])[0] == {"a": "done"}
+    assert (tmp_path / "a/n").read_text() == "x"
+
+
+def test_job_of_another_process_is_waited_for(tmp_path):
+    job = count_job(tmp_path, "a")
+    (tmp_path / ".a.lock").touch()
+    with (tmp_path / ".a.lock").open() as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        release = subprocess.Popen(
+            [sys.executable, "-c", "import time; time.sleep(0.5)"], pass_fds=(held.fileno(),)
+        )
+    # This process has closed its end; the child holds on for half a second.
+    start = time.monotonic()
+    states, tape = run([job])
+    assert states == {"a": "done"}
+    assert time.monotonic() - start > 0.3
+    assert "another process" in tape.events[0][1]
+    assert release.wait() == 0
+
+
+def test_two_jobs_of_one_name(tmp_path):
+    with pytest.raises(ValueError, match="same name"):
+        Runner([count_job(tmp_path, "a"), count_job(tmp_path, "a")], 1, Tape())
+
+
+RUNNER = """
+import pathlib, sys
+from cronos_lerobot.experiments.display import LineDisplay
+from cronos_lerobot.experiments.jobs import Job
+from cronos_lerobot.experiments.runner import Runner
+out = pathlib.Path(sys.argv[1])
+code = (
+    "import pathlib, subprocess, sys, time; p = pathlib.Path(sys.argv[1]); p.mkdir(); "
+    "child = subprocess.Popen(['sleep', '60']); (p / 'pid').write_text(str(child.pid)); time.sleep(60)"
+)
+job = Job("a", ("python", "-c", code, str(out / "a")), out / "a")
+try:
+    Runner([job], 1, LineDisplay(1)).run()
+except KeyboardInterrupt:
+    sys.exit(7)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_stop_the_children_and_theirs(tmp_path, number):
+    # Some shells start background commands with SIGINT ignored; the test wants it as a terminal has it.
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(RUNNER), str(tmp_path)],
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    pid = tmp_path / "a/pid"
+    deadline = time.monotonic() + 60
+    while not (pid.exists() and pid.read_text()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(number)
+    assert process.wait(timeout=30) == 7
+    assert json.loads((tmp_path / "a.job.json").read_text())["status"] == "stopped"
+    time.sleep(0.2)
+    with pytest.raises(ProcessLookupError):
+        _raise_if_gone(int(pid.read_text()))
+
+
+def _raise_if_gone(pid):
+    os.kill(pid, 0)
+    # A zombie that nobody has waited for yet is gone too.
+    if f"{pid} (sleep) Z" in Path(f"/proc/{pid}/stat").read_text():
+        raise ProcessLookupError
