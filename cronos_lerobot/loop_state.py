@@ -44,6 +44,8 @@ class LoopState:
     """(N,) task switches since the last scene reset: 0 for the first segment after it."""
     succeeded: np.ndarray = field(init=False)
     """(N,) whether the current task has been complete at any step of its segment."""
+    found_complete: np.ndarray = field(init=False)
+    """(N,) whether the task was complete after the segment's first step: an earlier task left it so."""
     preceded_by: np.ndarray = field(init=False)
     """(N,) Intervention between the last step and the next one."""
     attempts: np.ndarray = field(init=False)
@@ -63,6 +65,7 @@ class LoopState:
         self.segment = np.zeros(n, np.int64)
         self.position = np.zeros(n, np.int64)
         self.succeeded = np.zeros(n, np.bool_)
+        self.found_complete = np.zeros(n, np.bool_)
         self.preceded_by = np.full(n, Intervention.NONE, np.int64)
         self.attempts = np.zeros((n, self.num_tasks + self.num_reset_tasks), np.int64)
         self.successes = np.zeros_like(self.attempts)
@@ -109,6 +112,8 @@ class LoopState:
         """Count one control step of every stream; `cut` is (N,) bool, where the stream's piece ends here."""
         self.t += 1
         self.succeeded |= success
+        # No task can be done in one step.
+        self.found_complete = np.where(self.preceded_by != Intervention.NONE, success, self.found_complete)
         self.segment += cut
         self.preceded_by = np.full(self.num_streams, Intervention.NONE, np.int64)
 
@@ -121,7 +126,7 @@ class LoopState:
 
     def end_segment(self) -> SegmentEnd:
         """Close the segment of every stream and return what it came to."""
-        end = SegmentEnd(task=self.task, position=self.position.copy(), success=self.succeeded)
+        end = SegmentEnd(self.task, self.position.copy(), self.succeeded, self.found_complete)
         streams = np.arange(self.num_streams)
         self.attempts[streams, self.task] += 1
         self.successes[streams, self.task] += self.succeeded
@@ -191,6 +196,8 @@ class SegmentEnd:
     """(N,) how many segments came before it since the last scene reset."""
     success: np.ndarray
     """(N,) bool, complete at any step of the segment."""
+    found_complete: np.ndarray
+    """(N,) bool, a success for which nothing had to be done: an earlier task had left it complete."""
 
 
 Event = Step | Update | SegmentEnd

@@ -28,8 +28,10 @@ from cronos_lerobot.task_orders import TaskSet, make_task_order
 
 def success_by_segment(
     env: Any, agent: Spectator, protocol: ProtocolConfig, num_segments: int, seed: int = 0
-) -> np.ndarray:
-    """Run streams and return their outcomes, (num_segments, num_streams) bool.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Run streams and return which segments were a success, and which of these had been complete from the start.
+
+    Both are (num_segments, num_streams) bool.
 
     Args:
         env: the streams.
@@ -42,7 +44,7 @@ def success_by_segment(
     task_set = TaskSet.of(env.scene, protocol)
     loop = task_set.new_loop(env.num_envs)
     total_steps = num_segments * protocol.task_switch_interval * env.num_envs
-    outcomes = []
+    ends: list[SegmentEnd] = []
     with tqdm(total=total_steps, unit="step", unit_scale=True, disable=None) as bar:
         agent.begin_segment()
         for event in rf_mtrl(
@@ -52,9 +54,9 @@ def success_by_segment(
             if isinstance(event, Step):
                 bar.update(env.num_envs)
             elif isinstance(event, SegmentEnd):
-                outcomes.append(event.success)
+                ends.append(event)
                 agent.begin_segment()
-    return np.stack(outcomes)
+    return np.stack([end.success for end in ends]), np.stack([end.found_complete for end in ends])
 
 
 def main() -> None:
@@ -73,21 +75,22 @@ def main() -> None:
     env_config, agent = make_spectator(args.policy_path, args.device)
     env = CronosVectorEnv(args.num_streams, env_config.scene, **env_config.gym_kwargs)
     protocol = ProtocolConfig(scene_reset_interval=None, end_effector_reset=not args.no_end_effector_reset)
-    outcomes = success_by_segment(env, agent, protocol, args.num_segments, args.seed)
+    outcomes, found = success_by_segment(env, agent, protocol, args.num_segments, args.seed)
     env.close()
     rows = [
-        [i, int(row.sum()), len(row), *wilson_interval(int(row.sum()), len(row))] for i, row in enumerate(outcomes)
+        [i, int(row.sum()), len(row), *wilson_interval(int(row.sum()), len(row)), int(already.sum())]
+        for i, (row, already) in enumerate(zip(outcomes, found, strict=True))
     ]
-    print("segment  success  95 % interval  n")
-    for i, k, n, low, high in rows:
-        print(f"{i:7d}  {k / n:7.3f}  {low:.3f}-{high:.3f}    {n}")
+    print("segment  success  95 % interval  n    complete from the start")
+    for i, k, n, low, high, already in rows:
+        print(f"{i:7d}  {k / n:7.3f}  {low:.3f}-{high:.3f}    {n:<4d} {already / n:.3f}")
     total = outcomes.size
     print(f"   mean  {outcomes.mean():7.3f}  ({int(outcomes.sum())} of {total} segments)")
     if args.output is not None:
         args.output.parent.mkdir(parents=True, exist_ok=True)
         with args.output.open("w", newline="") as file:
             writer = csv.writer(file)
-            writer.writerow(["segment", "successes", "n", "ci95_low", "ci95_high"])
+            writer.writerow(["segment", "successes", "n", "ci95_low", "ci95_high", "found_complete"])
             writer.writerows(rows)
 
 

@@ -35,14 +35,27 @@ def make_env() -> CronosVectorEnv:
 
 
 def test_outcomes_are_those_of_each_segment_and_stream():
-    outcomes = success_by_segment(make_env(), Idle(), PROTOCOL, 2)
+    outcomes, found = success_by_segment(make_env(), Idle(), PROTOCOL, 2)
     assert outcomes.shape == (2, 4)
     assert not outcomes.any()
+    assert not found.any()
 
 
 def test_the_experts_segments_succeed_and_the_idle_ones_do_not():
     env = make_env()
-    outcomes = success_by_segment(env, ExpertEverySecondSegment(env), PROTOCOL, 4)
+    outcomes, found = success_by_segment(env, ExpertEverySecondSegment(env), PROTOCOL, 4)
     # Two tasks lie between two working segments, none of them done in passing.
     assert outcomes.all(axis=1).tolist() == [True, False, True, False]
     assert not outcomes[[1, 3]].any()
+    assert not found.any()
+
+
+def test_a_task_left_complete_is_found_so_when_its_turn_comes_again():
+    class Once(ExpertEverySecondSegment):
+        def choose(self, o_t, tau):
+            return ExpertSpectator.choose(self, o_t, tau) if self.segment == 0 else Idle().choose(o_t, tau)
+
+    env = make_env()
+    outcomes, found = success_by_segment(env, Once(env), PROTOCOL, 5)
+    assert outcomes.all(axis=1).tolist() == [True, False, False, False, True]
+    assert found.all(axis=1).tolist() == [False, False, False, False, True]

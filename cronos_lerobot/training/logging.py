@@ -42,16 +42,19 @@ class RolloutStatistics:
             self._transitions += len(event.reward)
             self._diverged += int(event.diverged.sum())
         elif isinstance(event, SegmentEnd):
-            for task, position, success in zip(event.task, event.position, event.success, strict=True):
+            segments = zip(event.task, event.position, event.success, event.found_complete, strict=True)
+            for task, position, success, found in segments:
                 self._count(self._by_task, self.instructions[task], success)
                 if task < self.num_tasks:
                     self._count(self._by_position, str(position), success)
+                    self._count(self._found_by_position, str(position), found)
 
     def pop(self) -> dict[str, Any]:
         """Return the statistics since the last `pop`, and begin anew.
 
         `success_by_segment` has one [successes, n] for each number of task switches since the scene reset,
         `success_by_task` one for each instruction. Learned reset tasks are in the latter only.
+        `found_complete_by_segment` has [successes for which nothing had to be done, n].
         """
         segments = np.array(list(self._by_position.values()) or [[0, 0]]).sum(axis=0)
         all_segments = sum(n for _, n in self._by_task.values())
@@ -60,6 +63,9 @@ class RolloutStatistics:
             "success": float(segments[0] / segments[1]) if segments[1] else None,
             "segments": int(segments[1]),
             "success_by_segment": dict(positions),
+            "found_complete_by_segment": {
+                position: self._found_by_position[position] for position, _ in positions
+            },
             "success_by_task": {task: self._by_task[task] for task in self.instructions if task in self._by_task},
             "reward_per_segment": self._reward / all_segments if all_segments else None,
             "diverged": self._diverged,
@@ -73,6 +79,7 @@ class RolloutStatistics:
         self._diverged = 0
         self._by_task: dict[str, list[int]] = {}
         self._by_position: dict[str, list[int]] = {}
+        self._found_by_position: dict[str, list[int]] = {}
 
     @staticmethod
     def _count(table: dict[str, list[int]], key: str, success: bool) -> None:
@@ -234,7 +241,7 @@ def _scalars(values: dict[str, Any], prefix: str = "") -> dict[str, float]:
         key = f"{prefix}{name}"
         if isinstance(value, dict):
             scalars |= _scalars(value, f"{key}/")
-        elif isinstance(value, list) and prefix.startswith("success_by") and value[1]:
+        elif isinstance(value, list) and "_by_" in prefix and value[1]:
             scalars[key] = value[0] / value[1]
         elif isinstance(value, int | float | np.number) and np.isfinite(value):
             scalars[key] = float(value)
