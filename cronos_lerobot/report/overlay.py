@@ -40,6 +40,10 @@ class Status:
     """What happened just now."""
     outcomes: list[bool] = field(default_factory=list)
     """Success of the segments that are over."""
+    caption: str | None = None
+    """In place of the number of the segment and of the interventions."""
+    message: str = ""
+    """In place of `notice`."""
 
 
 def draw_status(frame: np.ndarray, status: Status) -> np.ndarray:
@@ -57,13 +61,14 @@ def draw_status(frame: np.ndarray, status: Status) -> np.ndarray:
     if status.succeeded:
         _draw_check(draw, width - margin - 20 * unit, bar / 2, unit)
     counts = f"segment {status.segment + 1}/{status.num_segments}   interventions {status.interventions}"
-    draw.text((margin, height - bar / 2), counts, WHITE, small, anchor="lm")
-    if status.notice != Intervention.NONE:
+    caption = counts if status.caption is None else status.caption
+    draw.text((margin, height - bar / 2), caption, WHITE, small, anchor="lm")
+    if message := status.message or NOTICES.get(status.notice):
         place = (margin, height - bar - round(16 * unit))
-        left, top, right, bottom = draw.textbbox(place, NOTICES[status.notice], small, anchor="lm")
+        left, top, right, bottom = draw.textbbox(place, message, small, anchor="lm")
         pad = 6 * unit
         draw.rounded_rectangle((left - pad, top - pad, right + pad, bottom + pad), radius=pad, fill=BAR)
-        draw.text(place, NOTICES[status.notice], NOTICE, small, anchor="lm")
+        draw.text(place, message, NOTICE, small, anchor="lm")
     _draw_outcomes(draw, status, width - margin, height - bar / 2, unit)
     return np.asarray(Image.alpha_composite(image, layer).convert("RGB"))
 

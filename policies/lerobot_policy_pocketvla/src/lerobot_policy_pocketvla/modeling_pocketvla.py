@@ -234,8 +234,8 @@ class PocketVLAPolicy(PreTrainedPolicy):
             batch: observations and `task`.
             temperature: of the sampling, 0 is greedy.
             generator: random source; None is torch's global one.
-            uniform: the randomness itself, (B, D) in [0, 1), in place of a generator: a sample then does not depend
-                on the others of its batch.
+            uniform: the randomness itself, (B, D) in [0, 1), in place of a generator: a sample then does not
+                depend on the others of its batch.
 
         Returns:
             `action` (B, D) float32, normalised; `tokens` (B, D) int64; `log_prob` (B,), summed over the

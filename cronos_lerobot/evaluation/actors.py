@@ -1,0 +1,166 @@
+"""Who acts in an evaluation: a policy that samples, any other LeRobot policy, or the scripted expert."""
+
+from __future__ import annotations
+
+import inspect
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from lerobot.utils.constants import ACTION
+from lerobot.utils.random_utils import set_seed
+from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos.expert import ScriptedExpert
+
+from cronos_lerobot.data.schema import observation_columns
+from cronos_lerobot.rl.policy import TrainablePolicy
+from cronos_lerobot.rl.processing import PolicyProcessors, make_processors
+
+
+class Actor(Protocol):
+    """Chooses actions for some of the environments."""
+
+    is_memoryless: bool
+    """Whether an action depends on nothing but the observation; if not, `act` is always asked for all."""
+
+    def seed(self, seed: int) -> None:
+        """Start all randomness that is not handed to `act` anew."""
+        ...
+
+    def begin(self, ids: np.ndarray, running: np.ndarray) -> None:
+        """A new task begins in environments `ids` (k,), of those that are `running`."""
+        ...
+
+    def act(
+        self, observation: dict[str, Any], instructions: list[str], uniform: np.ndarray, ids: np.ndarray
+    ) -> np.ndarray:
+        """Return actions (k, 7) in physical units.
+
+        Args:
+            observation: raw, k rows.
+            instructions: the k current ones.
+            uniform: (k, 7) float32 in [0, 1), the randomness to use.
+            ids: (k,) the environments.
+        """
+        ...
+
+
+class SamplingPolicy:
+    """A `TrainablePolicy`, sampled at a temperature.
+
+    If its `sample_actions` takes `uniform`, what a chain does depends on the seed and on itself only, not on the
+    chains beside it (up to the rounding of a batch of another size). If not, a generator is drawn from in turn.
+    """
+
+    is_memoryless = True
+
+    def __init__(self, policy: Any, processors: PolicyProcessors, temperature: float) -> None:
+        self._policy, self._processors, self._temperature = policy.eval(), processors, temperature
+        self._takes_uniform = "uniform" in inspect.signature(policy.sample_actions).parameters
+        self._generator = torch.Generator(device=processors.device)
+        self._autocast = _autocast(policy, processors)
+
+    def seed(self, seed: int) -> None:
+        """See `Actor`."""
+        self._generator.manual_seed(seed)
+
+    def begin(self, ids: np.ndarray, running: np.ndarray) -> None:
+        """Nothing to forget."""
+
+    @torch.inference_mode()
+    def act(
+        self, observation: dict[str, Any], instructions: list[str], uniform: np.ndarray, ids: np.ndarray
+    ) -> np.ndarray:
+        """See `Actor`."""
+        batch = self._processors.batch(observation_columns(observation), instructions)
+        randomness: dict[str, Any] = {"generator": self._generator}
+        if self._takes_uniform:
+            randomness = {"uniform": torch.from_numpy(uniform).to(self._processors.device)}
+        with self._autocast():
+            sample = self._policy.sample_actions(batch, temperature=self._temperature, **randomness)
+        return self._processors.physical_actions(sample["action"])
+
+
+class SelectingPolicy:
+    """Any LeRobot policy through `select_action`, prepared and asked as `lerobot-eval` does.
+
+    It may queue chunks of actions or look back, and has one memory for the whole batch, which LeRobot can only
+    clear for all at once. So its chains start together, and the memory is cleared whenever a new task begins in
+    all chains that still run: at every switch with `advance=window`.
+
+    Args:
+        policy: on its device.
+        processors: its pre- and postprocessor.
+        env_processors: LeRobot's processors between environment and policy, (before, after).
+    """
+
+    is_memoryless = False
+
+    def __init__(self, policy: Any, processors: PolicyProcessors, env_processors: tuple[Any, Any]) -> None:
+        self._policy, self._processors = policy.eval(), processors
+        before, self._after_policy = env_processors
+        policy_preprocessor = processors.preprocessor
+        self._processors.preprocessor = lambda batch: policy_preprocessor(before(batch))
+        self._autocast = _autocast(policy, processors)
+
+    def seed(self, seed: int) -> None:
+        """Seed the global generators, from which LeRobot's policies draw."""
+        set_seed(seed)
+
+    def begin(self, ids: np.ndarray, running: np.ndarray) -> None:
+        """Forget chunks and history, if the task is new for all."""
+        if len(ids) == len(running):
+            self._policy.reset()
+
+    @torch.inference_mode()
+    def act(
+        self, observation: dict[str, Any], instructions: list[str], uniform: np.ndarray, ids: np.ndarray
+    ) -> np.ndarray:
+        """See `Actor`."""
+        batch = self._processors.batch(observation_columns(observation), instructions)
+        with self._autocast():
+            action = self._processors.postprocessor(self._policy.select_action(batch))
+        return self._after_policy({ACTION: action})[ACTION].to("cpu", torch.float32).numpy()
+
+
+class ExpertActor:
+    """The scripted expert, which looks at the simulation's state: the ceiling of every policy."""
+
+    is_memoryless = True
+
+    def __init__(self, env: CronosVectorEnv) -> None:
+        self._expert = ScriptedExpert(env)
+
+    def seed(self, seed: int) -> None:
+        """It is deterministic."""
+
+    def begin(self, ids: np.ndarray, running: np.ndarray) -> None:
+        """Look at the scene anew."""
+        self._expert.reset(ids)
+
+    def act(
+        self, observation: dict[str, Any], instructions: list[str], uniform: np.ndarray, ids: np.ndarray
+    ) -> np.ndarray:
+        """See `Actor`."""
+        return self._expert.act()[ids]
+
+
+def make_actor(
+    policy: Any, processors: tuple[Any, Any], temperature: float, env_processors: tuple[Any, Any]
+) -> SamplingPolicy | SelectingPolicy:
+    """Return the actor for a LeRobot policy, with its (pre-, postprocessor) and the environment's."""
+    wrapped = make_processors(policy, *processors)
+    if isinstance(policy, TrainablePolicy):
+        return SamplingPolicy(policy, wrapped, temperature)
+    return SelectingPolicy(policy, wrapped, env_processors)
+
+
+def _autocast(policy: Any, processors: PolicyProcessors) -> Any:
+    """What `lerobot-eval` does for `--policy.use_amp`: makes a context for each inference."""
+
+    def make() -> AbstractContextManager:
+        uses_amp = getattr(policy.config, "use_amp", False)
+        return torch.autocast(processors.device.type) if uses_amp else nullcontext()
+
+    return make

@@ -1,0 +1,187 @@
+"""Runs chains of tasks through a fixed number of environments; a chain that ends makes room for the next one.
+
+An independent episode is a chain of one task, so both suites go through here.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from lerobot_env_cronos import SequentialVectorEnv, Task
+from lerobot_env_cronos.sequential import ChainStep
+from lerobot_env_cronos.simulation import ACTION_NAMES
+
+from cronos_lerobot.evaluation.actors import Actor
+
+
+@dataclass(frozen=True)
+class Chain:
+    """What is to be done."""
+
+    number: int
+    """Of the ordering, or of the task in an independent evaluation."""
+    tasks: tuple[Task, ...]
+    configuration: int
+    """Index into the split."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """What happened, T steps and the start; a video is drawn from it."""
+
+    qpos: np.ndarray
+    """(T + 1, nq) float32, joint positions."""
+    position: np.ndarray
+    """(T + 1,) int, number of the task at hand."""
+    is_complete: np.ndarray
+    """(T + 1,) bool, whether that task has been complete."""
+
+
+@dataclass(frozen=True)
+class ChainResult:
+    """How a chain ended."""
+
+    chain: Chain
+    length: int
+    """Tasks completed; the first that failed is the one after them."""
+    steps: int
+    """Control steps."""
+    trajectory: Trajectory
+
+    @property
+    def is_success(self) -> bool:
+        """Whether all tasks were completed."""
+        return self.length == len(self.chain.tasks)
+
+
+Noise = Callable[[Chain], np.ndarray]
+"""The randomness of a chain's actions: uniform numbers in [0, 1), (steps, action dimensions) float32."""
+
+
+def chain_noise(window: int, *key: int) -> Noise:
+    """Randomness that depends on `key` and on a chain's number and configuration, and on nothing else.
+
+    Args:
+        window: control steps for each task.
+        key: non-negative integers: the evaluation's seed, suite and split.
+    """
+
+    def draw(chain: Chain) -> np.ndarray:
+        rng = np.random.default_rng([*key, chain.number, chain.configuration])
+        return rng.random((window * len(chain.tasks), len(ACTION_NAMES)), dtype=np.float32)
+
+    return draw
+
+
+@dataclass
+class _Run:
+    """A chain that is running, and its past."""
+
+    index: int
+    chain: Chain
+    noise: np.ndarray
+    qpos: list[np.ndarray] = field(default_factory=list)
+    position: list[int] = field(default_factory=list)
+    is_complete: list[bool] = field(default_factory=list)
+
+    def record(self, qpos: np.ndarray, position: int, is_complete: bool) -> None:
+        self.qpos.append(qpos.astype(np.float32))
+        self.position.append(position)
+        self.is_complete.append(is_complete)
+
+    @property
+    def steps(self) -> int:
+        return len(self.qpos) - 1
+
+    def result(self, length: int) -> ChainResult:
+        trajectory = Trajectory(np.stack(self.qpos), np.array(self.position), np.array(self.is_complete))
+        return ChainResult(self.chain, length, self.steps, trajectory)
+
+
+class ChainRunner:
+    """Runs chains with one actor.
+
+    Args:
+        env: the environments; what it decides (window, advance, split, ...) holds for all chains.
+        actor: chooses the actions.
+    """
+
+    def __init__(self, env: SequentialVectorEnv, actor: Actor) -> None:
+        self.env, self.actor = env, actor
+        self._everyone = np.arange(env.num_envs)
+        self._runs: dict[int, _Run] = {}
+        self._results: dict[int, ChainResult] = {}
+
+    def run(
+        self, chains: Sequence[Chain], noise: Noise, on_end: Callable[[ChainResult], None] = lambda result: None
+    ) -> list[ChainResult]:
+        """Run `chains` and return their results, in the same order.
+
+        Args:
+            chains: in the order in which they get a free environment.
+            noise: the randomness of each of them.
+            on_end: called with each result as it comes in.
+        """
+        waiting = deque(enumerate(chains))
+        self._runs, self._results = {}, {}
+        self.env.done[:] = True
+        began = np.zeros(0, dtype=int)
+        while True:
+            began = np.union1d(began, self._fill(waiting, noise))
+            running = self._everyone[~self.env.done]
+            if not len(running):
+                return [self._results[i] for i in range(len(chains))]
+            self.actor.begin(began, running)
+            step = self.env.apply(self._choose(running))
+            for index in self._record(step, running):
+                on_end(self._results[index])
+            began = self._everyone[step.switched]
+
+    def _fill(self, waiting: deque[tuple[int, Chain]], noise: Noise) -> np.ndarray:
+        """Start waiting chains in free environments; returns those (k,).
+
+        A policy that remembers has one memory for the whole batch, which can only be cleared for all: its chains
+        are started together.
+        """
+        free = self._everyone[self.env.done][: len(waiting)]
+        if not len(free) or not (self.actor.is_memoryless or self.env.done.all()):
+            return np.zeros(0, dtype=int)
+        started = [waiting.popleft() for _ in free]
+        tasks = [chain.tasks for _, chain in started]
+        self.env.start(free, tasks, np.array([chain.configuration for _, chain in started]))
+        for i, (index, chain) in zip(free, started, strict=True):
+            self._runs[int(i)] = _Run(index, chain, noise(chain))
+            self._runs[int(i)].record(self.env.simulation.qpos[i], 0, False)
+        return free
+
+    def _choose(self, running: np.ndarray) -> np.ndarray:
+        """Actions (n, 7), zero for those that are not running."""
+        env = self.env
+        if self.actor.is_memoryless:
+            ids, observation = running, env.observe(running)
+        else:
+            ids, observation = self._everyone, env.observe_running(running)
+        uniform = np.zeros((len(ids), len(ACTION_NAMES)), np.float32)
+        for row, i in enumerate(ids):
+            if not env.done[i]:
+                uniform[row] = self._runs[int(i)].noise[self._runs[int(i)].steps]
+        instructions = env.instructions
+        actions = np.zeros((env.num_envs, len(ACTION_NAMES)))
+        actions[ids] = self.actor.act(observation, [instructions[i] for i in ids], uniform, ids)
+        return actions
+
+    def _record(self, step: ChainStep, running: np.ndarray) -> Iterable[int]:
+        """Note what a step did; returns the indices of the chains that ended."""
+        ended = []
+        for i in map(int, running):
+            run = self._runs[i]
+            position = int(step.position[i])
+            was_complete = run.is_complete[-1] and run.position[-1] == position
+            run.record(self.env.simulation.qpos[i], position, bool(step.task_success[i]) or was_complete)
+            if self.env.done[i]:
+                self._results[run.index] = self._runs.pop(i).result(int(self.env.chain_length[i]))
+                ended.append(run.index)
+        return ended

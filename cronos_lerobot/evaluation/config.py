@@ -1,0 +1,238 @@
+"""The configuration of `cronos-eval`, LeRobot's way."""
+
+from __future__ import annotations
+
+import datetime as dt
+import hashlib
+import json
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import draccus
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
+from lerobot_env_cronos import CronosEnvConfig, configurations, load_orderings, orderings
+from lerobot_env_cronos.configurations import NUM_CONFIGURATIONS, SPLITS
+from lerobot_env_cronos.model import CAMERAS
+from lerobot_env_cronos.scenes import SCENES
+
+from cronos_lerobot.evaluation.plan import SUITES
+
+QUICK_CONFIGURATIONS, QUICK_ORDERINGS = 16, 3
+EXPERT = "scripted expert"
+
+
+@dataclass
+class SuitesConfig:
+    """What is evaluated."""
+
+    suites: str = "independent,sequential"
+    """Suites, comma-separated: independent, sequential."""
+    splits: str = "train,held_out"
+    """Splits of the configurations, comma-separated: train, held_out."""
+    n_episodes: int | None = None
+    """Configurations of each split, the first ones, for every task and ordering; null for all 64 (quick: 16)."""
+    orderings: int | None = None
+    """Orderings of the sequential suite, the first ones; null for all 10 (quick: 3)."""
+    temperature: float = 0.6
+    """Sampling temperature of policies that have one (`sample_actions`); 0 takes the likeliest action."""
+    batch_size: int = 64
+    """Parallel environments."""
+    videos: int = 1
+    """Good chains to film, and bad ones, for every suite and split; 0 films none."""
+
+    def __post_init__(self) -> None:
+        for name, valid in (("suites", SUITES), ("splits", SPLITS)):
+            value = getattr(self, name)
+            chosen = _words(value)
+            if not chosen or set(chosen) - set(valid) or len(set(chosen)) < len(chosen):
+                raise ValueError(f"eval.{name} must be of {list(valid)}, comma-separated, got {value!r}")
+        if self.n_episodes is not None and not 1 <= self.n_episodes <= NUM_CONFIGURATIONS:
+            raise ValueError(f"eval.n_episodes must be 1 to {NUM_CONFIGURATIONS}, got {self.n_episodes}")
+        for name, least in (("orderings", 1), ("temperature", 0), ("batch_size", 1), ("videos", 0)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ValueError(f"eval.{name} must be at least {least}, got {value}")
+
+
+@dataclass
+class CronosEvalConfig:
+    """Evaluate a policy on single tasks and on chains of tasks.
+
+    After a kill, run the same command again: it goes on from there.
+    """
+
+    env: EnvConfig = field(default_factory=CronosEnvConfig)
+    """Scene and observations. What is not given follows from the policy: the scene that it was trained in, and the
+    images or the state that it takes."""
+    policy: PreTrainedConfig | None = None
+    """The policy: --policy.path=<checkpoint or Hub id>."""
+    eval: SuitesConfig = field(default_factory=SuitesConfig)
+    """Suites, splits, and how much of them."""
+    advance: str = "window"
+    """When a chain goes on to its next task: window (the task's 80 steps are over) or on_success (at once)."""
+    end_effector_reset: bool = False
+    """Send the arm home between the tasks of a chain."""
+    quick: bool = False
+    """Fewer configurations and orderings: 16 and 3."""
+    expert: bool = False
+    """Evaluate the scripted expert, the ceiling, in place of a policy."""
+    seed: int = 1000
+    """Seed of the action sampling; configurations and orderings are the same at any seed."""
+    output_dir: Path | None = None
+    """Folder for results.json, videos/ and parts/; a new one in outputs/eval by default. Finished parts of the
+    same evaluation in it are kept."""
+    rename_map: dict[str, str] = field(default_factory=dict)
+    """Observations to rename for the policy, as in lerobot-eval."""
+    torch_threads: int | None = None
+    """Threads of PyTorch on the CPU; null leaves PyTorch's default."""
+
+    def validate(self) -> None:
+        """Resolve the policy and what follows from it.
+
+        Raises:
+            ValueError: a value is not valid, or there is nothing to evaluate.
+        """
+        if not isinstance(self.env, CronosEnvConfig):
+            raise ValueError(f"cronos-eval evaluates --env.type=cronos, got {self.env.type!r}")
+        if self.seed < 0:
+            raise ValueError(f"seed must be at least 0, got {self.seed}")
+        given = {flag.split("=")[0] for flag in parser.get_cli_overrides("env") or []}
+        for name, other in (("suite", "eval.suites"), ("split", "eval.splits"), ("task", "eval.orderings")):
+            if f"--{name}" in given:
+                raise ValueError(f"--env.{name} is of lerobot-eval; here it is --{other}")
+        for name in ("advance", "end_effector_reset"):
+            if f"--{name}" in given:
+                raise ValueError(f"--env.{name} is of lerobot-eval; here it is --{name}")
+        self._load_policy()
+        self._derive_env({name.removeprefix("--") for name in given})
+        self.env.advance, self.env.end_effector_reset = self.advance, self.end_effector_reset
+        self.env.__post_init__()
+        if self.output_dir is None:
+            name = "expert" if self.policy is None else self.policy.type
+            self.output_dir = Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_cronos_{name}"
+
+    def _load_policy(self) -> None:
+        path = parser.get_path_arg("policy")
+        if self.expert:
+            if path or self.policy is not None:
+                raise ValueError("--expert=true and --policy.path exclude each other")
+            return
+        if path:
+            overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
+            self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+            self.policy.pretrained_path = Path(path)
+        if self.policy is None or not self.policy.pretrained_path:
+            raise ValueError("choose a policy: --policy.path=<checkpoint or Hub id> (or --expert=true)")
+
+    def _derive_env(self, given: set[str]) -> None:
+        """Set what no flag of --env gives: the scene of the training, and what the policy observes."""
+        env = self.env
+        assert isinstance(env, CronosEnvConfig)
+        if "--config_path" in {argument.split("=")[0] for argument in sys.argv[1:]}:
+            return
+        derived: dict[str, Any] = {}
+        if self.policy is None:
+            derived["obs_type"] = "environment_state_agent_pos"
+        else:
+            derived = _observations(self.policy) | _trained_scene(self.policy.pretrained_path)
+        for name, value in derived.items():
+            if name not in given:
+                setattr(env, name, value)
+
+    @property
+    def suites(self) -> list[str]:
+        """Suites to evaluate."""
+        return _words(self.eval.suites)
+
+    @property
+    def splits(self) -> list[str]:
+        """Splits to evaluate on."""
+        return _words(self.eval.splits)
+
+    @property
+    def num_configurations(self) -> int:
+        """Configurations of each split."""
+        return self.eval.n_episodes or (QUICK_CONFIGURATIONS if self.quick else NUM_CONFIGURATIONS)
+
+    @property
+    def num_orderings(self) -> int:
+        """Orderings of the sequential suite."""
+        assert isinstance(self.env, CronosEnvConfig)
+        most = len(load_orderings(self.env.scene))
+        return min(most, self.eval.orderings or (QUICK_ORDERINGS if self.quick else most))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The config as JSON values."""
+        return draccus.encode(self)
+
+    def identity(self) -> dict[str, Any]:
+        """Everything that decides the result of a chain, as JSON values."""
+        env = self.env
+        assert isinstance(env, CronosEnvConfig)
+        decisive = (
+            "scene", "obs_type", "privileged_state", "observation_height", "observation_width", "camera_name"
+        )  # fmt: skip
+        return {
+            "policy": EXPERT if self.policy is None else fingerprint(self.policy),
+            "env": {name: getattr(env, name) for name in decisive},
+            "versions": {"configurations": configurations.VERSION, "orderings": orderings.VERSION},
+            "n_episodes": self.num_configurations,
+            "orderings": self.num_orderings,
+            "temperature": self.eval.temperature,
+            "batch_size": self.eval.batch_size,
+            "advance": self.advance,
+            "end_effector_reset": self.end_effector_reset,
+            "seed": self.seed,
+            "rename_map": self.rename_map,
+        }
+
+    @classmethod
+    def __get_path_fields__(cls) -> list[str]:
+        """Fields that take `--<field>.path`."""
+        return ["policy"]
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def _observations(policy: PreTrainedConfig) -> dict[str, Any]:
+    """Fields of `CronosEnvConfig` that show a policy what it takes."""
+    images = policy.image_features
+    takes_state = OBS_ENV_STATE in (policy.input_features or {})
+    if not images:
+        return {"obs_type": "environment_state_agent_pos"} if takes_state else {}
+    derived: dict[str, Any] = {"obs_type": "pixels_agent_pos", "privileged_state": takes_state}
+    cameras = [name for name in CAMERAS if f"{OBS_IMAGES}.{name}" in images]
+    if cameras:
+        derived["camera_name"] = ",".join(cameras)
+    # LeRobot passes images of another size on without a word.
+    _, height, width = next(iter(images.values())).shape
+    return derived | {"observation_height": height, "observation_width": width}
+
+
+def _trained_scene(path: Path | None) -> dict[str, str]:
+    """The scene that a checkpoint of `cronos-train` was trained in."""
+    file = Path(path or "") / TRAIN_CONFIG_NAME
+    if not file.is_file():
+        return {}
+    scene = (json.loads(file.read_text()).get("env") or {}).get("scene")
+    return {"scene": scene} if scene in SCENES else {}
+
+
+def fingerprint(policy: PreTrainedConfig) -> str:
+    """A policy's config and weights as a short hash, of its path too where the weights are not local files."""
+    config = {name: value for name, value in draccus.encode(policy).items() if name != "pretrained_path"}
+    digest = hashlib.sha256(json.dumps(config, sort_keys=True, default=str).encode())
+    files = sorted(Path(policy.pretrained_path or "").glob("*.safetensors"))
+    if not files:
+        digest.update(str(policy.pretrained_path).encode())
+    for file in files:
+        with file.open("rb") as weights:
+            digest.update(hashlib.file_digest(weights, "sha256").digest())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,100 @@
+"""The output folder of an evaluation: finished parts, written at once or not at all."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cronos_lerobot.evaluation.chains import ChainResult, Trajectory
+
+IDENTITY = "evaluation.json"
+RESULTS = "results.json"
+
+
+class ResultStore:
+    """Parts of one evaluation in a folder.
+
+    Args:
+        folder: made if it is not there.
+        identity: everything that decides a chain's result, as JSON values; a folder is of one identity.
+
+    Raises:
+        FileExistsError: the folder holds something else.
+        ValueError: the folder is of another evaluation.
+    """
+
+    def __init__(self, folder: Path, identity: dict[str, Any]) -> None:
+        self.folder = folder
+        path = folder / IDENTITY
+        if path.is_file():
+            self._compare(json.loads(path.read_text()), identity)
+        elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise FileExistsError(f"{folder} is not empty and not of an evaluation; choose another --output_dir")
+        else:
+            write_json(path, identity)
+
+    def _compare(self, there: dict[str, Any], here: dict[str, Any]) -> None:
+        here = json.loads(json.dumps(here))
+        names = [name for name in sorted(there | here) if there.get(name) != here.get(name)]
+        if names:
+            changes = "; ".join(f"{name}: {there.get(name)} there, {here.get(name)} now" for name in names)
+            raise ValueError(f"{self.folder} holds another evaluation ({changes}); choose another --output_dir")
+
+    def read(self, name: str) -> dict[str, Any] | None:
+        """Return a finished part, or None."""
+        path = self._path(name)
+        return json.loads(path.read_text()) if path.is_file() else None
+
+    def write(self, name: str, content: dict[str, Any], trajectories: dict[str, Trajectory]) -> None:
+        """Keep a part: its content, and the trajectories from which videos may be drawn, by any name."""
+        arrays = {}
+        for key, t in trajectories.items():
+            arrays |= {f"{key}.qpos": t.qpos, f"{key}.position": t.position, f"{key}.is_complete": t.is_complete}
+        path = self._path(name).with_suffix(".npz")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(f".{path.name}")
+        with partial.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+        partial.replace(path)
+        # Written last: a part is finished when it is there.
+        write_json(self._path(name), content)
+
+    def read_trajectory(self, name: str, key: str) -> Trajectory | None:
+        """Return a trajectory that `write` kept, or None."""
+        with np.load(self._path(name).with_suffix(".npz")) as arrays:
+            if f"{key}.qpos" not in arrays:
+                return None
+            return Trajectory(arrays[f"{key}.qpos"], arrays[f"{key}.position"], arrays[f"{key}.is_complete"])
+
+    def _path(self, name: str) -> Path:
+        return self.folder / "parts" / f"{name}.json"
+
+
+def chain_key(record: dict[str, int]) -> str:
+    """A chain's name within its suite and split."""
+    return f"{record['number']}_{record['configuration']}"
+
+
+def chain_records(results: Sequence[ChainResult]) -> list[dict[str, int]]:
+    """Outcomes as JSON values: `number` (ordering or task), `configuration`, `length`, `steps`."""
+    return [
+        {
+            "number": r.chain.number,
+            "configuration": r.chain.configuration,
+            "length": r.length,
+            "steps": r.steps,
+        }
+        for r in results
+    ]
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write a file at once or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}")
+    partial.write_text(json.dumps(content, indent=2) + "\n")
+    partial.replace(path)
