@@ -14,7 +14,8 @@ import numpy as np
 
 from cronos_lerobot.experiments.definitions import INTERVENTIONS, CheckpointEvaluation, Experiment, Row
 from cronos_lerobot.experiments.jobs import changed_flags, read_record
-from cronos_lerobot.experiments.plan import Options, RunSpec, run_specs, train_job
+from cronos_lerobot.experiments.plan import train_job
+from cronos_lerobot.experiments.specs import Options, RunSpec, base_evaluation_folder, run_specs
 from cronos_lerobot.metrics import Gap, Summary, performance_gap, success_at, summarise
 from cronos_lerobot.report.runs import Group, TrainingRun, read_training_run
 from cronos_lerobot.training.logging import METRICS
@@ -45,14 +46,14 @@ class SeedResult:
     run: TrainingRun
     finished: bool
     evaluations: dict[tuple[str, str], dict[int, dict[str, Any]]] = field(default_factory=dict)
-    """What cronos-eval found: by suite and split, then by checkpoint [interaction steps]."""
+    """What cronos-eval found: by suite and split, then by checkpoint [interaction steps], the base policy at 0."""
 
     def curve(self, split: str, task: str | None = None) -> list[Point]:
         """Success of a task, or of all together, over the run: its own evaluations, or else cronos-eval's."""
         own = [e for e in self.run.evaluations if e["split"] == split]
         if own:
             return [_point(e["interaction_steps"], e["interventions"], e, task) for e in own]
-        counts = {u["interaction_steps"]: u["interventions"] for u in self.run.updates}
+        counts = {0: 0} | {u["interaction_steps"]: u["interventions"] for u in self.run.updates}
         found = self.evaluations.get(("independent", split), {})
         return [_point(n, counts[n], result, task) for n, result in sorted(found.items()) if n in counts]
 
@@ -155,10 +156,11 @@ def _read_seed(spec: RunSpec, evaluations: Iterable[CheckpointEvaluation]) -> Se
     for evaluation in evaluations:
         for split in evaluation.splits:
             found = result.evaluations.setdefault((evaluation.suite, split), {})
-            for checkpoint in spec.checkpoints:
-                path = spec.evaluation_folder(evaluation.suite, split, checkpoint) / RESULTS
-                if path.is_file():
-                    found[checkpoint] = json.loads(path.read_text())[evaluation.suite][split]
+            folders = {n: spec.evaluation_folder(evaluation.suite, split, n) for n in spec.checkpoints}
+            folders[0] = base_evaluation_folder(spec.scene, evaluation.suite, split, spec.options)
+            for checkpoint, folder in folders.items():
+                if (folder / RESULTS).is_file():
+                    found[checkpoint] = json.loads((folder / RESULTS).read_text())[evaluation.suite][split]
     return result
 
 

@@ -15,9 +15,10 @@ from pathlib import Path
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Experiment, Row, find_rows
 from cronos_lerobot.experiments.display import make_display
 from cronos_lerobot.experiments.jobs import Job, is_done
-from cronos_lerobot.experiments.plan import Options, make_jobs
+from cronos_lerobot.experiments.plan import make_jobs
 from cronos_lerobot.experiments.runner import DONE, Runner
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
+from cronos_lerobot.experiments.specs import Options
 from cronos_lerobot.scripts.pipeline import command_line
 
 ROOT = Path("outputs/reproduce")

@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, find_rows
-from cronos_lerobot.experiments.plan import Options, make_jobs, run_specs, train_flags
+from cronos_lerobot.experiments.plan import make_jobs, train_flags
 from cronos_lerobot.experiments.results import paper_results
 from cronos_lerobot.experiments.scales import PIXELS, SCALES, STATE, base_recipe
+from cronos_lerobot.experiments.specs import Options, run_specs
 from cronos_lerobot.protocol import ProtocolConfig
 from cronos_lerobot.task_orders import TASK_ORDERS
 
@@ -104,12 +105,23 @@ def test_commands_of_table1():
     hsr = jobs["kitchen_2x2_state_paper/t1280_eer_cl_hsr_1300k/seed3"]
     assert hsr.needs == (f"{base}/clone",)
     assert {
-        "cronos-train", "--env.scene=kitchen_2x2", "--seed=3", "--steps=1300000", "--num_envs=64",
-        "--protocol.scene_reset_interval=1280", "--protocol.end_effector_reset=true",
-        "--protocol.update_interval=160", "--protocol.curriculum=[[650000, 320]]", "--protocol.heuristic_reset=true", "--eval.n_episodes=64",
-        "--eval.temperature=0.6", "--eval_freq=102400", "--torch_threads=1", "--env.num_threads=1",
+        "cronos-train",
+        "--env.scene=kitchen_2x2",
+        "--seed=3",
+        "--steps=1300000",
+        "--num_envs=64",
+        "--protocol.scene_reset_interval=1280",
+        "--protocol.end_effector_reset=true",
+        "--protocol.update_interval=160",
+        "--protocol.curriculum=[[650000, 320]]",
+        "--protocol.heuristic_reset=true",
+        "--eval.n_episodes=64",
+        "--eval.temperature=0.6",
+        "--eval_freq=102400",
+        "--torch_threads=1",
+        "--env.num_threads=1",
         f"--policy.path=out/{base}/clone/checkpoints/000320/pretrained_model",
-    } <= set(hsr.command)  # fmt: skip
+    } <= set(hsr.command)
     assert not any("learned_reset" in flag for flag in hsr.command)
     t80 = jobs["kitchen_2x2_state_paper/t80_1300k/seed1"]
     assert "--protocol.end_effector_reset=false" in t80.command
@@ -144,8 +156,8 @@ def test_runs_are_shared_between_experiments():
     assert len(trains) == 5 * (7 + 1 + 1 + 2 + 4 + 2 + 2)
     assert len({job.name for job in everything}) == len(everything)
     assert len({job.output for job in everything}) == len(everything)
-    # Three scenes, each with demonstrations and their cloning.
-    assert len([job for job in everything if job.name.startswith("base/")]) == 6
+    # Three scenes, each with demonstrations and their cloning, and the evaluation where held-out curves begin.
+    assert len([job for job in everything if job.name.startswith("base/")]) == 6 + 1
 
 
 def test_own_policy_needs_no_base():
@@ -175,12 +187,16 @@ def test_evaluations_of_checkpoints():
     # Every multiple of 102,400 up to 1,300,480, 1.3 M rounded up to whole updates, and that itself.
     assert len(evals) == 13
     run = "out/runs/kitchen_2x2_state_paper/t80_1300k/seed2"
-    assert evals[0].command[:4] == (
-        "cronos-eval",
+    assert evals[0].command[0] == "cronos-eval"
+    assert {
         f"--policy.path={run}/train/checkpoints/0102400/pretrained_model",
+        "--env.scene=kitchen_2x2",
         "--eval.suites=independent",
         "--eval.splits=held_out",
-    )
+        "--eval.temperature=0.6",
+    } <= set(evals[0].command)
+    base = "base/kitchen_2x2_state_400demos_320steps"
+    assert figure4[f"{base}/independent_held_out"].needs == (f"{base}/clone",)
     assert f"--policy.path={run}/train/checkpoints/1300480/pretrained_model" in evals[-1].command
     assert evals[0].needs == ("kitchen_2x2_state_paper/t80_1300k/seed2",)
     figure5 = [job for job in jobs_of("figure5", rows=["t80"]).values() if job.command[0] == "cronos-eval"]
