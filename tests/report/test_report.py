@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 import pytest
-from synthetic import INSTRUCTIONS, write_evaluation, write_training_run
+from synthetic_runs import INSTRUCTIONS, write_evaluation, write_training_run
 
 from cronos_lerobot.report.page import write_report
 from cronos_lerobot.report.runs import find_runs, group_runs

@@ -1,0 +1,266 @@
+"""Tables and figures say what the runs' files say, the paper's numbers beside them."""
+
+import csv
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib.image
+import pytest
+from synthetic_runs import INSTRUCTIONS, write_training_run
+
+from cronos_lerobot.experiments import plots, tables
+from cronos_lerobot.experiments.definitions import EXPERIMENTS, LONG, SHORT
+from cronos_lerobot.experiments.jobs import write_record
+from cronos_lerobot.experiments.outputs import write_outputs
+from cronos_lerobot.experiments.plan import train_job
+from cronos_lerobot.experiments.results import collect
+from cronos_lerobot.experiments.scales import SCALES, STATE, base_recipe
+from cronos_lerobot.experiments.specs import Options, base_evaluation_folder, run_specs
+
+# 8 streams x 8 updates x 160 steps, as the made-up runs have; evaluated at 0, 5120 and 10240.
+TINY = replace(SCALES["small"], steps={SHORT: 10_240, LONG: 10_240}, num_envs=8, eval_freq=5_120)
+RESETS = {80: 128, 320: 32, 1280: 8}
+"""Scene resets of 8 streams in 1280 steps each."""
+
+
+@pytest.fixture
+def options(tmp_path):
+    recipes = {e.scene: base_recipe(TINY, e.scene, STATE) for e in EXPERIMENTS.values()}
+    return Options(TINY, STATE, (1, 2), tmp_path / "root", recipes=recipes)
+
+
+def make_run(options, name, row, seed, successes, status="done", updates=8):
+    """A run whose evaluations had so many successes of 8, in each of the four tasks."""
+    specs = run_specs(EXPERIMENTS[name], options)
+    (spec,) = [s for s in specs if (s.row.name, s.seed) == (row, seed)]
+    write_training_run(
+        spec.train_folder, seed=seed, interval=spec.row.interval, successes=successes, updates=updates
+    )
+    job = train_job(spec, None)
+    write_record(job, {"command": list(job.command), "status": status, "seconds": 1.0, "starts": 1})
+    return spec
+
+
+def results(options, name):
+    return collect(EXPERIMENTS[name], EXPERIMENTS[name].rows, options)
+
+
+def by_row(rows):
+    return {row["row"]: row for row in rows}
+
+
+def read_csv(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_main_table(options):
+    make_run(options, "table1", "t80", 1, (2, 4, 5))
+    make_run(options, "table1", "t80", 2, (2, 4, 7))
+    make_run(options, "table1", "t1280_eer", 1, (2, 2, 3))
+    row = by_row(tables.main_rows(results(options, "table1")))
+    t80 = row["t80"]
+    assert (t80["success_train_mean"], t80["n_train"], t80["seeds"]) == (0.75, 32, 2)
+    assert t80["success_train_std"] == pytest.approx(0.25 / 2**0.5)
+    assert (t80["success_train_ci95_low"], t80["success_train_ci95_high"]) == (5 / 8, 7 / 8)
+    assert (t80["paper_mean"], t80["paper_std"]) == (0.897, 0.027)
+    assert (t80["base_success_mean"], t80["interventions_mean"]) == (0.25, RESETS[80])
+    # Gaps .75, .5, .375 and .75, .5, .125 at three evaluations equally far apart.
+    assert t80["D_normalised_mean"] == pytest.approx((1.0625 + 0.9375) / 2 / 2)
+    assert t80["D_mean"] == pytest.approx(10_240 * t80["D_normalised_mean"])
+    # One scene reset in 80 steps of each stream: the same shape over interventions.
+    assert t80["C_normalised_mean"] == pytest.approx(t80["D_normalised_mean"])
+    assert t80["C_mean"] == pytest.approx(RESETS[80] * t80["C_normalised_mean"])
+    # T = 1280 comes to 8 interventions; T = 80 has then gone from .25 to .25 + .25 * 8 / 64.
+    assert t80["shared_budget"] == 8
+    assert t80["C_normalised_shared_mean"] == pytest.approx((0.75 + 0.71875) / 2)
+    one = row["t1280_eer"]
+    assert (one["success_train_mean"], one["success_train_std"], one["success_train_ci95_low"]) == (
+        0.375,
+        None,
+        None,
+    )
+    assert row["t1280"]["success_train_mean"] is None
+    assert row["t1280"]["seeds"] == 0
+
+
+def test_success_at_interventions_is_that_of_the_curve(options):
+    make_run(options, "figure3", "t80", 1, (2, 4, 6))
+    make_run(options, "figure3", "t320_eer", 1, (2, 6, 8))
+    result = results(options, "figure3")
+    # 1000, 2000, 4000 and 8000 of 2.9 M steps, in 10,240.
+    assert tables.budgets(result) == [3, 7, 14, 28]
+    rows = by_row(tables.main_rows(result))
+    assert rows["t80"]["success_at_28_mean"] == pytest.approx(0.25 + 0.25 * 28 / 64)
+    assert rows["t320_eer"]["success_at_28_mean"] == pytest.approx(0.75 + 0.25 * 12 / 16)
+    (claim,) = tables.claim_rows(result)
+    assert claim["paper"] == 0.38
+    assert claim["ours"] == pytest.approx(0.9375 - 0.359375)
+
+
+def test_nothing_is_extrapolated(options):
+    make_run(options, "table1", "t1280_eer", 1, (2, 2, 3))
+    (row,) = [r for r in tables.main_rows(results(options, "table1")) if r["row"] == "t1280_eer"]
+    # 1000, 1600, 2000, 6000 of 1.3 M: 7, 12, 15, 47; the run came to 8.
+    assert row["success_at_7_mean"] is not None
+    assert [row[f"success_at_{n}_mean"] for n in (12, 15, 47)] == [None] * 3
+
+
+def test_interventions_to_reach(options):
+    make_run(options, "table1", "t1280_eer", 1, (2, 2, 3))
+    make_run(options, "table1", "t1280_eer_cl", 1, (2, 4, 6))
+    claims = {claim["claim"]: claim for claim in tables.claim_rows(results(options, "table1"))}
+    goal = "to reach the end of t1280_eer"
+    assert (
+        claims[f"interventions of t1280_eer {goal}"]["paper"],
+        claims[f"interventions of t1280_eer_cl {goal}"]["paper"],
+    ) == (1000, 1600)
+    # 3/8 at the end of T = 1280, after all its 8 resets; half way from .25 to .5 for the other, which has none
+    # before its first evaluation at 5120 steps (640 of each stream): the vertical part at 0 already passes it.
+    assert claims[f"interventions of t1280_eer {goal}"]["ours"] == 8
+    assert claims[f"interventions of t1280_eer_cl {goal}"]["ours"] == 0
+    assert claims["interventions of t1280_eer_cl_hsr at the end"] == {
+        "claim": "interventions of t1280_eer_cl_hsr at the end",
+        "paper": 6000,
+        "ours": None,
+    }
+
+
+def test_unfinished_run_is_drawn_but_not_counted(options, tmp_path):
+    make_run(options, "table1", "t80", 1, (2, 4, 6))
+    make_run(options, "table1", "t80", 2, (2, 4, 8), status="running")
+    make_run(options, "table1", "t1280", 1, (2, 4, 8), status="stopped")
+    result = results(options, "table1")
+    row = by_row(tables.main_rows(result))
+    assert (row["t80"]["success_train_mean"], row["t80"]["seeds"], row["t80"]["seeds_wanted"]) == (0.75, 1, 2)
+    assert row["t1280"]["success_train_mean"] is None
+    curve = plots.row_curve(result.rows[1], "train", "interaction_steps")
+    assert curve.y.tolist() == [0.25, 0.5, 1.0]
+    assert plots.row_label(result.rows[1]) == "T = 1280 (1 seed, unfinished)"
+    text = write_outputs(EXPERIMENTS["table1"], EXPERIMENTS["table1"].rows, options, tmp_path / "out")
+    assert "t80_10k/seed2: 10,240 of 10,240 steps" in text
+    assert "t1280_eer_cl: 2 of 2 seeds not begun" in text
+
+
+def test_run_of_another_command_is_named(options):
+    make_run(options, "table1", "t80", 1, (2, 4, 6))
+    other = replace(options, extra=("--algorithm.target_kl=0.02",))
+    (text,) = results(other, "table1").changed
+    assert "t80_10k/seed1" in text
+    assert "+--algorithm.target_kl=0.02" in text
+
+
+def evaluation(success, n=8):
+    rate = {"success": success, "n": n, "ci95": [0.0, 1.0]}
+    return rate | {"per_task": dict.fromkeys(INSTRUCTIONS, rate)}
+
+
+def write_results(folder, suite, split, content):
+    folder.mkdir(parents=True)
+    (folder / "results.json").write_text(json.dumps({suite: {split: content}}))
+
+
+def test_held_out_curve_is_cronos_evals(options, tmp_path):
+    spec = make_run(options, "figure4", "t320_eer", 1, (2, 4, 6))
+    for checkpoint, success in ((5_120, 0.5), (10_240, 0.625)):
+        write_results(
+            spec.evaluation_folder("independent", "held_out", checkpoint),
+            "independent", "held_out", evaluation(success),
+        )  # fmt: skip
+    base = base_evaluation_folder("kitchen_2x2", "independent", "held_out", options)
+    write_results(base, "independent", "held_out", evaluation(0.125))
+    result = results(options, "figure4")
+    (seed,) = result.rows[1].seeds
+    points = [(p.interaction_steps, p.interventions, p.success) for p in seed.curve("held_out", INSTRUCTIONS[0])]
+    assert points == [(0, 0, 0.125), (5_120, 16, 0.5), (10_240, 32, 0.625)]
+    row = by_row(tables.main_rows(result))["t320_eer"]
+    assert (row["success_train_mean"], row["success_held_out_mean"]) == (0.75, 0.625)
+    text = write_outputs(EXPERIMENTS["figure4"], EXPERIMENTS["figure4"].rows, options, tmp_path / "out")
+    assert "success, held-out" in text
+
+
+def test_sequences(options, tmp_path):
+    rates = {1: [0.75, 0.5, 0.25, 0.0], 2: [0.25, 0.5, 0.25, 0.0]}
+    for seed, successes in rates.items():
+        spec = make_run(options, "figure5", "t320_eer", seed, (2, 4, 6))
+        content = {
+            "n": 640,
+            "positions": [{"success": s, "std": 0.1, "n": 640, "ci95": [0, 1]} for s in successes],
+            "average_chain_length": {"mean": sum(successes), "std": 0.1, "ci95": [0, 4]},
+        }
+        write_results(spec.evaluation_folder("sequential", "held_out", 10_240), "sequential", "held_out", content)
+    (row,) = tables.sequential_rows(results(options, "figure5"))
+    assert (row["row"], row["split"], row["n"], row["seeds"]) == ("t320_eer", "held_out", 640, 2)
+    assert [row[f"SEQ {i}_mean"] for i in range(4)] == [0.5, 0.5, 0.25, 0.0]
+    assert row["SEQ 0_std"] == pytest.approx(0.5 / 2**0.5)
+    assert row["chain_length_mean"] == 1.25
+    text = write_outputs(EXPERIMENTS["figure5"], EXPERIMENTS["figure5"].rows, options, tmp_path / "out")
+    assert "| 0.500 ± 0.354 | 0.500 ± 0.000 | 0.250 ± 0.000 | 0.000 ± 0.000 | 1.250 ± 0.354 | 640 | 2 |" in text
+    assert (tmp_path / "out/figure5_sequential.png").exists()
+
+
+def test_files_of_table1(options, tmp_path):
+    for seed in (1, 2):
+        make_run(options, "table1", "t80", seed, (2, 4, 4 + seed))
+    text = write_outputs(EXPERIMENTS["table1"], EXPERIMENTS["table1"].rows, options, tmp_path / "out")
+    out = tmp_path / "out"
+    line = next(line for line in text.splitlines() if line.startswith("| 80 |"))
+    cells = [cell.strip() for cell in line.split("|")][1:-1]
+    assert cells[:11] == [
+        "80", "–", "–", "–", "–", "0.688 ± 0.088", "[0.625, 0.750]", "32", "2/2", "0.897 ± 0.027", "0.250",
+    ]  # fmt: skip
+    assert (out / "table1.md").read_text() in text
+    curves = read_csv(out / "table1_curves.csv")
+    # Two seeds, three evaluations, all tasks together and four single ones.
+    assert len(curves) == 2 * 3 * 5
+    last = [c for c in curves if (c["seed"], c["interaction_steps"], c["task"]) == ("2", "10240", "all tasks")]
+    assert [(c["success"], c["n"], c["interventions"]) for c in last] == [("0.75", "32", "128")]
+    data = json.loads((out / "table1.json").read_text())
+    assert data["rows"][0]["success_train_mean"] == 0.6875
+    assert (data["seeds"], data["steps"], data["paper_steps"]) == ([1, 2], 10_240, 1_300_000)
+    assert "OpenVLA" in data["paper"]["source"]
+    segments = read_csv(out / "table1_segments.csv")
+    assert {(s["row"], s["segment"]) for s in segments} == {("t80", "0")}
+    for name in ("table1", "table1_bars", "table1_segments"):
+        picture = matplotlib.image.imread(out / f"{name}.png")
+        # Something is drawn, in more than one colour.
+        assert len({tuple(pixel) for pixel in picture[::7, ::7, :3].reshape(-1, 3).tolist()}) > 5
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_is_drawn_and_without_runs_only_says_so(name, options, tmp_path):
+    experiment = EXPERIMENTS[name]
+    text = write_outputs(experiment, experiment.rows, options, tmp_path / "empty")
+    assert "2 of 2 seeds not begun" in text
+    assert not list((tmp_path / "empty").glob("*.png"))
+    for row in experiment.rows[:2]:
+        make_run(options, name, row.name, 1, (2, 4, 6))
+    write_outputs(experiment, experiment.rows, options, tmp_path / "out")
+    assert (tmp_path / f"out/{name}.png").exists()
+
+
+def test_panels(options):
+    for row in EXPERIMENTS["figure12"].rows[:2]:
+        make_run(options, "figure12", row.name, 1, (2, 4, 6))
+    figure = plots.curves_figure(results(options, "figure12"))
+    # Two splits by two axes, four tasks; held-out has no points yet.
+    assert len(figure.axes) == 16
+    assert [len(ax.lines) for ax in figure.axes] == [2] * 8 + [0] * 8
+    assert [ax.get_title(loc="left").split(",")[0] for ax in figure.axes[:4]] == INSTRUCTIONS
+    figure = plots.curves_figure(results(options, "table1"))
+    assert [ax.get_xlabel() for ax in figure.axes] == list(plots.AXIS_LABELS.values())
+
+
+def test_report_only_from_the_command_line(options, tmp_path):
+    small = replace(options, scale=SCALES["small"], seeds=(1, 2, 3))
+    spec = next(s for s in run_specs(EXPERIMENTS["table1"], small) if s.row.name == "t80")
+    write_training_run(spec.train_folder, interval=80, successes=(2, 4, 6))
+    command = [sys.executable, "-m", "cronos_lerobot.scripts.reproduce", "table1", "--report_only"]
+    command += [f"--root={options.root}", f"--output_dir={tmp_path / 'out'}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "t80_307k/seed1: 10,240 of 307,200 steps" in done.stdout
+    assert Path(tmp_path / "out/table1.png").exists()
