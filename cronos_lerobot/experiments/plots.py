@@ -14,6 +14,8 @@ from cronos_lerobot.report.figures import COLORS, INK, draw_curve, style_axes
 from cronos_lerobot.report.series import Curve, mean_curve, segment_rates
 
 AXIS_LABELS = {INTERACTION_STEPS: "interaction steps, all streams", "interventions": "interventions, all streams"}
+Panel = tuple[str, str, str | None]
+"""Split, axis and task (None: all together) of one set of axes."""
 SPLIT_LABELS = {"train": "training configurations", "held_out": "held-out configurations"}
 
 
@@ -36,32 +38,34 @@ def row_label(row: RowResult) -> str:
 
 
 def curves_figure(result: ExperimentResult) -> Figure | None:
-    """Success over the run: a column for each axis, or for each task; a row for each split, or split and axis."""
+    """Success over the run, a panel for each split, axis and, where the paper has it so, task."""
     experiment = result.experiment
-    lines = [(split, axis) for split in experiment.splits for axis in experiment.axes]
-    columns: list[str | None] = list(result.tasks) if experiment.by_task else [None]
-    if not experiment.by_task:
-        return _grid(result, [[(split, axis, None) for axis in experiment.axes] for split in experiment.splits])
-    return _grid(result, [[(split, axis, task) for task in columns] for split, axis in lines]) if columns else None
+    panels: list[list[Panel]]
+    if experiment.by_task:
+        lines = [(split, axis) for split in experiment.splits for axis in experiment.axes]
+        panels = [[(split, axis, task) for task in result.tasks] for split, axis in lines]
+    elif len(experiment.axes) == 1:
+        panels = [[(split, experiment.axes[0], None) for split in experiment.splits]]
+    else:
+        panels = [[(split, axis, None) for axis in experiment.axes] for split in experiment.splits]
+    return _grid(result, panels) if panels[0] else None
 
 
-def _grid(result: ExperimentResult, panels: list[list[tuple[str, str, str | None]]]) -> Figure | None:
+def _grid(result: ExperimentResult, panels: list[list[Panel]]) -> Figure | None:
     height, width = len(panels), len(panels[0])
-    figure = Figure(
-        figsize=(max(6.4, min(5.2 * width, 3.4 * width + 2)), 3.1 * height + 0.9), layout="constrained"
-    )
+    size = (max(6.4, min(5.2 * width, 3.4 * width + 2)), 3.1 * height + 0.9)
+    figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(height, width, squeeze=False, sharey=True)
-    for line, row_axes in zip(panels, axes, strict=True):
-        for (split, axis, task), ax in zip(line, row_axes, strict=True):
+    for line, line_axes in zip(panels, axes, strict=True):
+        for (split, axis, task), ax in zip(line, line_axes, strict=True):
             for i, row in enumerate(result.rows):
-                draw_curve(ax, row_curve(row, split, axis, task), i, row_label(row), marker="o", width=1.5)
+                curve = row_curve(row, split, axis, task)
+                draw_curve(ax, curve, i, row_label(row), marker="o", width=1.5, marker_size=3)
             style_axes(ax, AXIS_LABELS[axis])
             ax.set_ylim(0, 1.02)
-            title = ", ".join(
-                part for part in (task, SPLIT_LABELS[split] if len(panels) > 1 or not task else "") if part
-            )
-            ax.set_title(title, fontsize=8 if task else 9, color=INK, loc="left")
-        row_axes[0].set_ylabel("success")
+            ax.set_title(task or SPLIT_LABELS[split], fontsize=9, color=INK, loc="left")
+        split, _, task = line[0]
+        line_axes[0].set_ylabel(f"success, {SPLIT_LABELS[split]}" if task else "success")
     if not any(ax.lines for ax in axes.flat):
         return None
     _legend_below(figure, list(axes.flat))

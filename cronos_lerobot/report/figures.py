@@ -128,12 +128,21 @@ def _label(group: Group) -> str:
     return group.label if len(group.runs) == 1 else f"{group.label} ({len(group.runs)} seeds)"
 
 
-def draw_curve(ax: Axes, curve: Curve | None, i: int, label: str, marker: str = "", width: float = 1.6) -> None:
+def draw_curve(
+    ax: Axes,
+    curve: Curve | None,
+    i: int,
+    label: str,
+    *,
+    marker: str = "",
+    width: float = 1.6,
+    marker_size: float = 4,
+) -> None:
     """Draw a line and its band in the colour number `i`; nothing if there is no curve."""
     if curve is None:
         return
     color = COLORS[i % len(COLORS)]
-    ax.plot(curve.x, curve.y, color=color, lw=width, marker=marker, ms=4, label=label)
+    ax.plot(curve.x, curve.y, color=color, lw=width, marker=marker, ms=marker_size, label=label)
     ax.fill_between(curve.x, curve.low, curve.high, color=color, alpha=0.18, lw=0)
 
 
