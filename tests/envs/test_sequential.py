@@ -11,6 +11,7 @@ from lerobot_env_cronos import SCENES, CronosEnvConfig, SequentialVectorEnv, get
 from lerobot_env_cronos.configurations import load_configurations
 from lerobot_env_cronos.expert import ScriptedExpert
 from lerobot_env_cronos.orderings import draw_orderings
+from scripted_env import ScriptedEnv
 
 STATE = "environment_state_agent_pos"
 TASKS = get_scene("kitchen_2x2").tasks
@@ -41,26 +42,6 @@ def test_ten_distinct_permutations_the_first_one_is_the_training_cycle(scene):
 
 def test_a_scene_of_two_tasks_has_all_two_orderings():
     assert draw_orderings(2) == [[0, 1], [1, 0]]
-
-
-class ScriptedEnv(SequentialVectorEnv):
-    """No physics: task j of chain i is complete `script[i][j]` steps after it begins, or never (None)."""
-
-    def __init__(self, script, diverge_at=(), **kwargs):
-        self.script, self.diverge_at, self.homed, self.clock, self.stepped = script, diverge_at, [], 0, []
-        super().__init__(len(script), ordering=TASKS, obs_type=STATE, **kwargs)
-
-    def _step_physics(self, actions, ids):
-        self.clock += 1
-        self.stepped.append(ids.tolist())
-        due = [self.script[i][TASKS.index(self.tasks[i])] for i in range(self.num_envs)]
-        # Held for this one step only: that is enough, whatever happens to the object afterwards.
-        self.is_success = np.array([when == n + 1 for when, n in zip(due, self._elapsed, strict=True)])
-        diverged = np.array([(self.clock, i) in self.diverge_at for i in range(self.num_envs)])
-        return np.zeros(self.num_envs, np.float32), diverged
-
-    def end_effector_reset(self, ids):
-        self.homed.append((self.clock, list(ids)))
 
 
 def play(env):

@@ -1,0 +1,243 @@
+"""`cronos-eval` and `lerobot-eval` on the real scenes with tiny policies, and the scripted expert."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.policies.factory import make_policy_config
+from lerobot.scripts.lerobot_eval import eval_policy, rollout
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot_env_cronos import CronosEnvConfig, IndependentVectorEnv, SequentialVectorEnv, get_scene
+from scripted_env import ScriptedEnv
+
+from cronos_lerobot.evaluation.actors import make_actor
+from cronos_lerobot.evaluation.chains import Chain, ChainRunner, chain_noise
+from cronos_lerobot.evaluation.config import CronosEvalConfig
+from cronos_lerobot.evaluation.runner import Evaluation
+from cronos_lerobot.evaluation.store import RESULTS
+from cronos_lerobot.scripts import eval as script
+
+STATE = {"obs_type": "environment_state_agent_pos"}
+SMALL = ("--eval.n_episodes=2", "--eval.orderings=3", "--eval.splits=held_out", "--eval.batch_size=4")
+
+
+def save_policy(folder: Path, kind: str, env_options: dict, **options) -> Path:
+    """An untrained policy as a checkpoint."""
+    register_third_party_plugins()
+    env_config = CronosEnvConfig(**env_options)
+    config = make_policy_config(kind, device="cpu", push_to_hub=False, **options)
+    policy = make_policy(config, env_cfg=env_config)
+    policy.save_pretrained(folder)
+    for processor in make_pre_post_processors(config):
+        processor.save_pretrained(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pocketvla(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("pocketvla")
+    return save_policy(folder, "pocketvla", STATE, hidden_width=16, hidden_depth=1)
+
+
+def cronos_eval(monkeypatch, *arguments) -> None:
+    monkeypatch.setattr(sys, "argv", ["cronos-eval", *map(str, arguments)])
+    script.main()
+
+
+def outcomes(folder: Path) -> dict:
+    return {path.name: json.loads(path.read_text())["chains"] for path in sorted(folder.glob("parts/*.json"))}
+
+
+def test_everything_in_one_go_then_again_after_a_kill(pocketvla, tmp_path, monkeypatch, capsys):
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    flags = (f"--policy.path={pocketvla}", *SMALL)
+    cronos_eval(monkeypatch, *flags, f"--output_dir={whole}")
+    output = capsys.readouterr().out
+    for text in ("put the ketchup bottle on the cloth", "SEQ 3", "chain length", "held_out (n=6)"):
+        assert text in output
+    results = json.loads((whole / RESULTS).read_text())
+    assert {"format": 1, "scene": "kitchen_2x2", "obs_type": STATE["obs_type"], "temperature": 0.6}.items() <= (
+        results.items()
+    )
+    assert results["independent"]["held_out"]["n"] == 4 * 2
+    assert [p["n"] for p in results["sequential"]["held_out"]["positions"]] == [6] * 4
+    assert len(results["sequential"]["held_out"]["per_ordering"]) == 3
+    # Killed in the second part: what is finished is kept, the rest comes out as if nothing had happened.
+    run_part, ran = Evaluation._run_part, []
+
+    def killed(self, part, bar):
+        if len(ran) == 1:
+            raise KeyboardInterrupt
+        ran.append(part.name)
+        run_part(self, part, bar)
+
+    monkeypatch.setattr(Evaluation, "_run_part", killed)
+    with pytest.raises(SystemExit, match="goes on from here"):
+        cronos_eval(monkeypatch, *flags, f"--output_dir={broken}")
+    assert list(outcomes(broken)) == ["independent_held_out.json"]
+    assert not (broken / RESULTS).exists()
+    first = (broken / "parts/independent_held_out.json").stat().st_mtime_ns
+    monkeypatch.setattr(Evaluation, "_run_part", run_part)
+    cronos_eval(monkeypatch, *flags, f"--output_dir={broken}")
+    assert (broken / "parts/independent_held_out.json").stat().st_mtime_ns == first
+    assert outcomes(broken) == outcomes(whole)
+    again = json.loads((broken / RESULTS).read_text())
+    assert [again[suite] for suite in ("independent", "sequential")] == [
+        results[suite] for suite in ("independent", "sequential")
+    ]
+
+
+def test_an_output_folder_is_of_one_evaluation(pocketvla, tmp_path, monkeypatch):
+    flags = (f"--policy.path={pocketvla}", "--eval.n_episodes=1", "--eval.suites=independent", "--eval.videos=0")
+    flags += ("--eval.splits=train", f"--output_dir={tmp_path / 'out'}")
+    cronos_eval(monkeypatch, *flags)
+    with pytest.raises(SystemExit, match=r"temperature: 0.6 there, 1.0 now"):
+        cronos_eval(monkeypatch, *flags, "--eval.temperature=1")
+
+
+def test_the_expert_is_near_the_ceiling_and_its_chains_are_filmed(tmp_path, monkeypatch):
+    folder = tmp_path / "expert"
+    flags = ("--expert=true", "--eval.n_episodes=4", "--eval.orderings=2", "--eval.splits=train")
+    cronos_eval(monkeypatch, *flags, "--env.render_size=[120, 160]", f"--output_dir={folder}")
+    results = json.loads((folder / RESULTS).read_text())
+    # 16 episodes and 8 chains; the expert fails about one task in fifty.
+    assert results["independent"]["train"]["success"] >= 14 / 16
+    assert results["sequential"]["train"]["positions"][3]["success"] >= 6 / 8
+    assert results["sequential"]["train"]["average_chain_length"]["mean"] >= 3.4
+    assert (results["policy"], results["temperature"]) == ("scripted expert", None)
+    good = next(v for v in results["videos"] if (v["suite"], v["kind"]) == ("sequential", "good"))
+    with av.open(str(folder / good["path"])) as video:
+        frames = sum(1 for _ in video.decode(video=0))
+        assert (video.streams.video[0].height, video.streams.video[0].width) == (120, 160)
+    assert frames == good["steps"] + 1 + 30
+
+
+ACT = {
+    "chunk_size": 10, "n_action_steps": 10, "dim_model": 16, "n_heads": 2, "dim_feedforward": 32,
+    "n_encoder_layers": 1, "n_decoder_layers": 1, "use_vae": False, "pretrained_backbone_weights": None,
+}  # fmt: skip
+"""The smallest ACT: it has no sample_actions, and queues chunks of actions for the whole batch."""
+
+
+def test_a_lerobot_policy_with_action_chunks(tmp_path, monkeypatch):
+    checkpoint = save_policy(tmp_path / "act", "act", STATE, **ACT)
+    folder = tmp_path / "out"
+    flags = (f"--policy.path={checkpoint}", "--eval.videos=0", *SMALL, f"--output_dir={folder}")
+    cronos_eval(monkeypatch, *flags)
+    results = json.loads((folder / RESULTS).read_text())
+    assert results["temperature"] is None
+    assert results["sequential"]["held_out"]["n"] == 6
+    assert results["obs_type"] == STATE["obs_type"]
+
+
+def test_a_lerobot_policy_does_what_it_does_in_lerobot_eval(tmp_path):
+    """The same observations, processors and resets: the same motion, step by step."""
+    checkpoint = save_policy(tmp_path / "act", "act", STATE, **ACT)
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    config.pretrained_path = checkpoint
+    policy: Any = make_policy(config, env_cfg=CronosEnvConfig(**STATE))
+    processors = make_pre_post_processors(config, str(checkpoint))
+    tasks = get_scene("kitchen_2x2").tasks
+    theirs = IndependentVectorEnv(3, task=tasks[1], **STATE)
+    env_processors = CronosEnvConfig().get_env_processors()
+    rollout(theirs, policy, *env_processors, *processors, seeds=[4, 5, 6])
+    ours = SequentialVectorEnv(3, ordering=tasks, **STATE)
+    chains = [Chain(1, (tasks[1],), configuration) for configuration in (4, 5, 6)]
+    results = ChainRunner(ours, make_actor(policy, processors, 0.6, env_processors)).run(
+        chains, chain_noise(80, 0)
+    )
+    assert [result.steps for result in results] == [80] * 3
+    np.testing.assert_array_equal(ours.simulation.qpos, theirs.simulation.qpos)
+    start, end = results[0].trajectory.qpos[[0, -1]]
+    assert np.abs(start[:6] - end[:6]).max() > 0.05  # it has moved
+
+
+def test_observations_and_scene_follow_from_the_policy(tmp_path, monkeypatch):
+    options = {"scene": "playroom_2x2", "observation_height": 64, "observation_width": 96}
+    checkpoint = save_policy(tmp_path / "policy", "pocketvla", options, hidden_width=16, hidden_depth=1)
+    # cronos-train leaves its config beside the weights.
+    (checkpoint / "train_config.json").write_text(json.dumps({"env": {"scene": "playroom_2x2"}}))
+    folder = tmp_path / "out"
+    cronos_eval(
+        monkeypatch, f"--policy.path={checkpoint}", "--eval.n_episodes=1", "--eval.splits=train",
+        "--eval.suites=independent", "--eval.videos=0", f"--output_dir={folder}",
+    )  # fmt: skip
+    results = json.loads((folder / RESULTS).read_text())
+    assert (results["scene"], results["obs_type"]) == ("playroom_2x2", "pixels_agent_pos")
+    env = results["identity"]["env"]
+    assert (env["observation_height"], env["observation_width"]) == (64, 96)
+    assert not env["privileged_state"]
+    instructions = [task.instruction for task in get_scene("playroom_2x2").tasks]
+    assert list(results["independent"]["train"]["per_task"]) == instructions
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ((), "--policy.path"),
+        (("--expert=true", "--env.suite=sequential"), "--eval.suites"),
+        (("--expert=true", "--env.advance=window"), "--advance"),
+        (("--expert=true", "--advance=never"), "'never'.*on_success"),
+        (("--expert=true", "--eval.suites=independent,chains"), "independent,chains"),
+        (("--expert=true", "--eval.splits=test"), "held_out.*'test'"),
+        (("--expert=true", "--eval.n_episodes=65"), "1 to 64, got 65"),
+        (("--expert=true", "--eval.batch_size=0"), "batch_size must be at least 1, got 0"),
+        (("--expert=true", "--seed=-1"), "seed must be at least 0"),
+        (("--expert=true", "--env.scene=garage"), "garage.*kitchen_2x2"),
+    ],
+)
+def test_command_line_errors_name_the_bad_value_and_the_valid_ones(flags, message, tmp_path, monkeypatch):
+    with pytest.raises(SystemExit, match=message):
+        cronos_eval(monkeypatch, *flags, f"--output_dir={tmp_path / 'out'}")
+
+
+def test_help_teaches(monkeypatch, capsys):
+    with pytest.raises(SystemExit) as end:
+        cronos_eval(monkeypatch, "--help")
+    assert end.value.code == 0
+    output = capsys.readouterr().out
+    for text in ("examples:", "--eval.suites", "--advance", "--quick", "on_success"):
+        assert text in output
+
+
+def test_quick_is_less():
+    config, quick = CronosEvalConfig(), CronosEvalConfig(quick=True)
+    assert (config.num_configurations, config.num_orderings) == (64, 10)
+    assert (quick.num_configurations, quick.num_orderings) == (16, 3)
+
+
+def test_lerobot_reads_the_chain_length_as_the_sum_of_rewards(pocketvla):
+    """LeRobot's own evaluation of chains with known outcomes: its numbers are those of the suite."""
+    config = PreTrainedConfig.from_pretrained(pocketvla)
+    config.pretrained_path = pocketvla
+    policy = make_policy(config, env_cfg=CronosEnvConfig(**STATE))
+    never = 81
+    env = ScriptedEnv([[5, 80, 1, 40], [5, never, 1, 1], [never, 1, 1, 1], [80, 80, 80, never]])
+    preprocessor, postprocessor = make_pre_post_processors(config, str(pocketvla))
+    before, after = CronosEnvConfig().get_env_processors()
+    info = eval_policy(env, policy, before, after, preprocessor, postprocessor, n_episodes=4, start_seed=0)
+    assert [episode["sum_reward"] for episode in info["per_episode"]] == [4, 1, 0, 3]
+    assert [episode["success"] for episode in info["per_episode"]] == [True, False, False, False]
+    assert info["aggregated"]["avg_sum_reward"] == 2.0
+
+
+def test_lerobot_eval_command(pocketvla, tmp_path):
+    program = Path(sys.executable).with_name("lerobot-eval")
+    command = [program, f"--policy.path={pocketvla}", "--policy.device=cpu", "--env.type=cronos"]
+    command += ["--env.suite=sequential", "--env.split=held_out", "--env.obs_type=environment_state_agent_pos"]
+    command += ["--eval.n_episodes=2", "--eval.batch_size=2", f"--output_dir={tmp_path / 'out'}"]
+    one = subprocess.run([*command, "--env.task=3"], capture_output=True, text=True)
+    assert one.returncode == 0, one.stderr[-2000:]
+    info = json.loads((tmp_path / "out/eval_info.json").read_text())
+    (entry,) = info["per_task"]
+    assert (entry["task_group"], entry["task_id"]) == ("sequential_held_out", 3)
+    assert len(entry["metrics"]["sum_rewards"]) == 2
+    assert set(entry["metrics"]["sum_rewards"]) <= {0, 1, 2, 3, 4}
+    assert info["per_group"]["sequential_held_out"]["n_episodes"] == 2
