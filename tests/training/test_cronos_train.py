@@ -1,6 +1,11 @@
 """`cronos-train` on the real scene with the real policy, far too short to learn anything."""
 
+import json
+import os
+import re
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -59,6 +64,29 @@ def test_checkpoint_is_a_lerobot_policy(tmp_path, monkeypatch):
     observation = {"observation.state": torch.zeros(3, 13), "observation.environment_state": torch.zeros(3, 48)}
     action = postprocessor(policy.select_action(preprocessor(observation | {"task": ["put it there"] * 3})))
     assert action.shape == (3, 7)
+
+
+def test_strategy_and_order_of_the_docs(tmp_path):
+    """The example of docs/extending.md, word for word, as a package of a user's."""
+    docs = (Path(__file__).parents[2] / "docs/extending.md").read_text()
+    code = re.search(r"```python\n(import numpy.*?register_reset.*?)```", docs, re.DOTALL)
+    assert code is not None
+    package = tmp_path / "my_protocol"
+    package.mkdir()
+    (package / "__init__.py").write_text(code[1])
+    output = tmp_path / "run"
+    command = [
+        "cronos-train", *SMALL, *OBSERVATIONS["state"], "--protocol.discover_packages_path=my_protocol",
+        "--protocol.extra_resets=[stuck]", "--protocol.task_order=weakest_first",
+        "--protocol.scene_reset_interval=null", "--protocol.heuristic_reset=true", f"--output_dir={output}",
+        "--steps=48",
+    ]  # fmt: skip
+    script = str(Path(sys.executable).with_name(command[0]))
+    subprocess.run([script, *command[1:]], check=True, env=os.environ | {"PYTHONPATH": str(tmp_path)})
+    last = json.loads((output / "metrics.jsonl").read_text().splitlines()[-1])
+    # Two streams of 24 steps: six segments, all failed, so that the last three switches reset both.
+    assert last["interventions_by_kind"]["scene_reset"] == 6
+    assert last["interventions_by_kind"]["task_switch"] == 12
 
 
 def test_policy_of_another_kind_is_refused(tmp_path, monkeypatch):
