@@ -1,4 +1,7 @@
-"""Independent evaluation: scene reset, one task, 80 steps, success if complete at any step."""
+"""Independent evaluation while training: scene reset, one task, 80 steps, success if complete at any step.
+
+`cronos-eval` (`cronos_lerobot.evaluation`) runs the same episodes with other random numbers.
+"""
 
 from __future__ import annotations
 
@@ -9,23 +12,10 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot_env_cronos import STEPS_PER_TASK
-from lerobot_env_cronos.statistics import wilson_interval
 
 from cronos_lerobot.data.schema import observation_columns
+from cronos_lerobot.evaluation.rates import SuccessRate
 from cronos_lerobot.rl.processing import PolicyProcessors
-
-
-@dataclass(frozen=True)
-class SuccessRate:
-    """Successes of n episodes."""
-
-    successes: int
-    n: int
-
-    def to_dict(self) -> dict[str, Any]:
-        """Rate, n and the ends of the 95 % interval."""
-        low, high = wilson_interval(self.successes, self.n)
-        return {"success": self.successes / self.n, "n": self.n, "ci95": [low, high]}
 
 
 @dataclass(frozen=True)
