@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import platform
 import time
@@ -80,12 +81,14 @@ class Evaluation:
     def _run_part(self, part: Part, bar: tqdm) -> None:
         lengths: list[int] = []
 
+        def summary() -> str:
+            first = f"{np.mean([n > 0 for n in lengths]):.2f}"
+            is_chain = part.suite == "sequential"
+            return f"SEQ 0 {first}, chain length {np.mean(lengths):.2f}" if is_chain else f"success {first}"
+
         def show(result: ChainResult) -> None:
             lengths.append(result.length)
-            text = f"{np.mean([n > 0 for n in lengths]):.2f}"
-            if part.suite == "sequential":
-                text = f"SEQ 0 {text}, length {np.mean(lengths):.2f}"
-            bar.set_postfix_str(f"{part.suite} {part.split}: {text}", refresh=False)
+            bar.set_postfix_str(f"{part.suite} {part.split}: {summary()}", refresh=False)
             bar.update()
 
         start = time.perf_counter()
@@ -110,6 +113,8 @@ class Evaluation:
             if record in to_film
         }
         self.store.write(part.name, content, kept)
+        if bar.disable:
+            logging.info(f"{part.name}: {len(records)} chains, {summary()}, {content['seconds']:.0f} s")
 
     # Who acts where ---------------------------------------------------------------------------------------
 

@@ -43,6 +43,7 @@ def evaluate(config: CronosEvalConfig) -> None:
     except (ValueError, FileExistsError) as error:
         sys.exit(f"error: {error}")
     init_logging()
+    logging.getLogger("lerobot.configs.video").setLevel(logging.WARNING)
     if config.torch_threads is not None:
         torch.set_num_threads(config.torch_threads)
     set_seed(config.seed)

@@ -160,7 +160,7 @@ def test_the_expert_completes_chains_and_a_policy_that_does_nothing_none(advance
     while not env.done.all():
         env.step(expert.act())
         steps += 1
-    # SEQ 3 of the expert is .98 (docs/evaluation.md): of eight chains at most one is lost.
+    # The expert fails about one task in a hundred: of eight chains at most one is lost.
     assert (env.chain_length == 4).sum() >= n - 1
     assert (240 < steps <= 320) if advance == "window" else (40 < steps <= 320)
     env.reset(seed=0)
