@@ -9,18 +9,22 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Experiment, Row, find_rows
 from cronos_lerobot.experiments.display import make_display
 from cronos_lerobot.experiments.jobs import Job, is_done
-from cronos_lerobot.experiments.plan import make_jobs
 from cronos_lerobot.experiments.runner import DONE, Runner
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
-from cronos_lerobot.experiments.specs import Options
 from cronos_lerobot.scripts.pipeline import command_line
 
+if TYPE_CHECKING:
+    from cronos_lerobot.experiments.specs import Options
+
+# Modules that bring PyTorch are imported where they are needed: they take seconds, and mistakes are told before.
 ROOT = Path("outputs/reproduce")
 RESERVED = (
     "--steps",
@@ -89,7 +93,7 @@ def make_parser() -> argparse.ArgumentParser:
     for name, text in (
         ("demos", "demonstrations that the base policy is cloned from"),
         ("clone_steps", "gradient steps of the cloning"),
-        ("checkpoint", "the step of the cloning whose policy is taken"),
+        ("checkpoint", "the step of the cloning whose policy is taken: a quarter, half, 3/4 or all of them"),
     ):
         parser.add_argument(f"--base.{name}", dest=f"base_{name}", type=int, metavar="N", help=text)
     parser.add_argument("--temperature", type=float, default=0.6, help="of every evaluation (default: 0.6)")
@@ -119,8 +123,8 @@ def parse_seeds(text: str | None, default: int) -> tuple[int, ...]:
     return found
 
 
-def make_options(args: argparse.Namespace, extra: list[str]) -> Options:
-    """What the flags decide about every run.
+def make_options(args: argparse.Namespace, extra: list[str], scenes: Iterable[str]) -> Options:
+    """What the flags decide about every run; `scenes` are those that need a base policy.
 
     Raises:
         ValueError: a flag makes no sense.
@@ -136,17 +140,15 @@ def make_options(args: argparse.Namespace, extra: list[str]) -> Options:
         name: value for name in ("demos", "clone_steps", "checkpoint") if (value := getattr(args, f"base_{name}"))
     }
     if "clone_steps" in changes:
-        changes |= {"save_freq": changes.setdefault("checkpoint", changes["clone_steps"])}
-    elif "checkpoint" in changes:
-        changes |= {"save_freq": changes["checkpoint"]}
-    recipes = {
-        experiment.scene: replace(base_recipe(scale, experiment.scene, obs_type), **changes)
-        for experiment in EXPERIMENTS.values()
-    }
+        changes.setdefault("checkpoint", changes["clone_steps"])
+    recipes = {scene: replace(base_recipe(scale, scene, obs_type), **changes) for scene in scenes}
+    seeds = parse_seeds(args.seeds, scale.seeds)
+    from cronos_lerobot.experiments.specs import Options
+
     return Options(
         scale,
         obs_type,
-        parse_seeds(args.seeds, scale.seeds),
+        seeds,
         args.root,
         args.threads,
         args.temperature,
@@ -207,10 +209,12 @@ def main() -> None:
     if args.experiment == "all" and (args.output_dir or args.rows):
         parser.error("--output_dir and --rows are for one experiment, not for all")
     try:
-        options = make_options(args, sys.argv[split + 1 :])
         chosen = [(EXPERIMENTS[name], find_rows(EXPERIMENTS[name], args.rows)) for name in names]
+        options = make_options(args, sys.argv[split + 1 :], {experiment.scene for experiment, _ in chosen})
     except ValueError as error:
         sys.exit(f"error: {error}")
+    from cronos_lerobot.experiments.plan import make_jobs
+
     jobs = make_jobs(chosen, options)
     if args.dry_run:
         print_plan(jobs)

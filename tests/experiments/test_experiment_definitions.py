@@ -169,9 +169,12 @@ def test_own_policy_needs_no_base():
 def test_pixels():
     jobs = jobs_of("figure7", rows=["t320_eer"], scale="small", obs_type=PIXELS)
     demos, clone, *trains = jobs.values()
-    assert {"--dataset.video=false", "--env.privileged_state=true", "--env.scene=kitchen_3x3"} <= set(
-        demos.command
-    )
+    assert {
+        "--dataset.num_episodes=1800",
+        "--dataset.video=false",
+        "--env.privileged_state=true",
+        "--env.scene=kitchen_3x3",
+    } <= set(demos.command)
     assert {"--policy.observation=image", "--policy.critic_observation=environment_state"} <= set(clone.command)
     assert len(trains) == 3
     assert {

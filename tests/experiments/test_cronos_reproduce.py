@@ -1,0 +1,123 @@
+"""`cronos-reproduce` as one types it: two rows of Table 1 at their smallest, and its command line."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from cronos_lerobot.scripts import reproduce as script
+
+ROWS = ("t80", "t1280_eer_cl_hsr")
+
+
+def reproduce(*flags):
+    command = [sys.executable, "-m", "cronos_lerobot.scripts.reproduce", *map(str, flags)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_two_rows_of_table1_end_to_end(tmp_path):
+    flags = ["table1", "--scale=smoke", f"--root={tmp_path}", "--rows", *ROWS, "--jobs=2"]
+    done = reproduce(*flags)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    assert "jobs: 4 done" in done.stdout
+    data = json.loads((tmp_path / "table1_smoke_state/table1.json").read_text())
+    evaluations = {}
+    for row, cells in zip(ROWS, data["rows"], strict=True):
+        metrics = tmp_path / f"runs/kitchen_2x2_state_smoke/{row}_3k/seed1/train/metrics.jsonl"
+        records = [json.loads(line) for line in metrics.read_text().splitlines()]
+        evaluations[row] = [record for record in records if record["kind"] == "evaluation"]
+        last = evaluations[row][-1]
+        assert (cells["row"], cells["success_train_mean"], cells["n_train"]) == (row, last["success"], last["n"])
+        assert cells["interventions_mean"] == last["interventions"]
+        assert last["interaction_steps"] == 2_560
+    # 4 streams of 640 steps, every scene reset in each 80.
+    assert data["rows"][0]["interventions_mean"] == 32
+    text = (tmp_path / "table1_smoke_state/table1.md").read_text()
+    assert "0.897 ± 0.027" in text
+    assert "0.649 ± 0.090" in text
+
+    # As a kill after the first checkpoint leaves it.
+    train = tmp_path / "runs/kitchen_2x2_state_smoke/t80_3k/seed1/train"
+    shutil.rmtree(train / "checkpoints/002560")
+    (train / "checkpoints/last").unlink()
+    (train / "checkpoints/last").symlink_to("001280")
+    record = train.with_name("train.job.json")
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"status": "running"}))
+    again = reproduce(*flags)
+    assert again.returncode == 0, again.stdout[-3000:]
+    happened = [line for line in again.stdout.splitlines() if line.startswith(("base/", "kitchen_2x2_"))]
+    assert happened == [f"kitchen_2x2_state_smoke/t80_3k/seed1: {what}" for what in ("resumed", "done")]
+    records = [json.loads(line) for line in (train / "metrics.jsonl").read_text().splitlines()]
+    resumed = [record for record in records if record["kind"] == "evaluation"]
+    assert [r["per_task"] for r in resumed] == [r["per_task"] for r in evaluations["t80"]]
+
+
+def call(monkeypatch, *flags):
+    """The same in this process, which has PyTorch at hand."""
+    monkeypatch.setattr(sys, "argv", ["cronos-reproduce", *map(str, flags)])
+    script.main()
+
+
+def test_dry_run_prints_commands_that_can_be_copied(tmp_path, monkeypatch, capsys):
+    root = tmp_path / "root"
+    flags = ["figure5", "--scale=paper", f"--root={root}", "--seeds=4,", "--rows", "t80", "--dry_run"]
+    call(monkeypatch, *flags, "--", "--algorithm.target_kl=0.02")
+    shell = capsys.readouterr().out
+    for program in ("cronos-record-demos", "lerobot-train", "cronos-train", "cronos-eval"):
+        shell = shell.replace(f"\n{program} ", f"\necho {program} ")
+    listing = subprocess.run(["bash"], input=shell, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert [line.split()[0] for line in listing] == [
+        "cronos-record-demos", "lerobot-train", "cronos-train", "cronos-eval", "cronos-eval",
+    ]  # fmt: skip
+    assert "--seed=4 --steps=1300000" in listing[2]
+    assert listing[2].endswith("--algorithm.target_kl=0.02")
+    assert not root.exists()
+
+
+def test_list_names_every_row(monkeypatch, capsys):
+    call(monkeypatch, "list")
+    out = capsys.readouterr().out
+    assert "t1280_eer_cl_lsr_hsr" in out
+    assert "figure14: Robustness to OOD task sequences, by task (Figure 14, Appendix G)" in out
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["table1", "--rows", "t81"], "no row 't81'; it has t80, t1280"),
+        (["table1", "--seeds=x"], "--seeds must be a number or a list such as 1,4, got 'x'"),
+        (["table1", "--threads=0"], "--threads must be at least 1, got 0"),
+        (["table1", "--base.checkpoint=400"], "base.checkpoint must be one of [80, 160, 240, 320], got 400"),
+        (["table1", "--", "--steps=3"], "--steps=3 is set by the experiment"),
+        (["table2"], "invalid choice: 'table2'"),
+        (["all", "--rows", "t80"], "for one experiment"),
+    ],
+)
+def test_mistakes_are_explained(flags, message, monkeypatch, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        call(monkeypatch, *flags)
+    assert stopped.value.code
+    assert message in f"{stopped.value} {capsys.readouterr().err}"
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"), [("3", (1, 2, 3)), ("3,", (3,)), ("2,5", (2, 5)), (None, (1, 2)), ("4,4", (4,))]
+)
+def test_seeds(text, seeds):
+    assert script.parse_seeds(text, default=2) == seeds
+
+
+def test_own_recipe_of_the_base_policy():
+    args = script.make_parser().parse_args(["table1", "--base.demos=200", "--base.clone_steps=600"])
+    recipe = script.make_options(args, [], ["kitchen_2x2"]).recipes["kitchen_2x2"]
+    assert (recipe.demos, recipe.clone_steps, recipe.checkpoint, recipe.save_freq) == (200, 600, 600, 150)
+    args = script.make_parser().parse_args(["table1", "--base.checkpoint=160"])
+    recipe = script.make_options(args, [], ["kitchen_2x2"]).recipes["kitchen_2x2"]
+    assert (recipe.demos, recipe.clone_steps, recipe.checkpoint, recipe.save_freq) == (400, 320, 160, 80)
+
+
+def test_starting_to_explain_takes_no_pytorch():
+    code = "import sys; import cronos_lerobot.scripts.reproduce; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
