@@ -11,6 +11,7 @@ from lerobot_env_cronos.visuals.meshes import VISUAL_GROUP, loft, prism, rectang
 from lerobot_env_cronos.visuals.objects import LOOKS
 
 SCENE = SCENES["kitchen_2x2"]
+BODIES_OF_SCENES = [(scene, body) for scene in SCENES for body in SCENES[scene].bodies]
 DYNAMIC_FIELDS = (
     "body_mass",
     "body_inertia",
@@ -23,8 +24,13 @@ DYNAMIC_FIELDS = (
 
 
 @pytest.fixture(scope="module")
-def dressed() -> mujoco.MjModel:
-    return build_model(SCENE)
+def models() -> dict[str, mujoco.MjModel]:
+    return {name: build_model(scene) for name, scene in SCENES.items()}
+
+
+@pytest.fixture(scope="module")
+def dressed(models) -> mujoco.MjModel:
+    return models[SCENE.name]
 
 
 def visual_vertices(model: mujoco.MjModel, body: str) -> np.ndarray:
@@ -39,9 +45,11 @@ def visual_vertices(model: mujoco.MjModel, body: str) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def test_changes_no_dynamics(dressed, monkeypatch):
+@pytest.mark.parametrize("scene", SCENES)
+def test_changes_no_dynamics(models, scene, monkeypatch):
+    dressed = models[scene]
     monkeypatch.setattr(model_module.visuals, "dress", lambda spec, bodies: None)
-    bare = build_model(SCENE)
+    bare = build_model(SCENES[scene])
     for field in DYNAMIC_FIELDS:
         np.testing.assert_array_equal(getattr(dressed, field), getattr(bare, field), err_msg=field)
     collides = dressed.geom_contype != 0
@@ -52,9 +60,9 @@ def test_changes_no_dynamics(dressed, monkeypatch):
     assert (dressed.geom_group[~collides] == VISUAL_GROUP).all()
 
 
-@pytest.mark.parametrize("name", SCENE.bodies)
-def test_body_fills_its_bounding_box_and_stays_inside(dressed, name):
-    vertices, half = visual_vertices(dressed, name), np.array(BODIES[name].size) / 2
+@pytest.mark.parametrize(("scene", "name"), BODIES_OF_SCENES)
+def test_body_fills_its_bounding_box_and_stays_inside(models, scene, name):
+    vertices, half = visual_vertices(models[scene], name), np.array(BODIES[name].size) / 2
     assert (np.abs(vertices) <= half + 1e-4).all()
     # At least 90 % of the published extent is visible in every direction.
     assert (np.ptp(vertices, axis=0) >= 0.9 * 2 * half).all()
@@ -72,11 +80,13 @@ def test_fingers_end_where_the_pads_end(dressed, side, sign):
     assert (sign * vertices[:, 1]).min() == pytest.approx(PAD_POS[1] - PAD_HALF_SIZE[1], abs=1e-4)
 
 
-def test_few_geoms_and_triangles(dressed):
+@pytest.mark.parametrize(("scene", "triangles"), [("kitchen_2x2", 2000), ("kitchen_3x3", 2300)])
+def test_few_geoms_and_triangles(models, scene, triangles):
+    dressed = models[scene]
     visual = dressed.geom_group == VISUAL_GROUP
     robot = visual & np.array(["link" in dressed.geom(g).name for g in range(dressed.ngeom)])
     assert robot.sum() <= 35
-    assert dressed.nmeshface <= 2000
+    assert dressed.nmeshface <= triangles
 
 
 def project(model: mujoco.MjModel, camera: str, points: np.ndarray) -> np.ndarray:

@@ -2,10 +2,11 @@
 
 from lerobot_env_cronos import gl as gl  # isort: skip  # chooses the OpenGL platform before mujoco is imported
 
-from lerobot_env_cronos.config import CronosEnvConfig, register_gymnasium
+from lerobot_env_cronos.config import CronosEnvConfig
 from lerobot_env_cronos.episodic import CronosEnv, IndependentVectorEnv
 from lerobot_env_cronos.orderings import load_orderings
-from lerobot_env_cronos.scenes import CONTROL_HZ, SCENES, STEPS_PER_TASK, Scene, Task, get_scene
+from lerobot_env_cronos.registry import gymnasium_id, register_gymnasium, register_scene
+from lerobot_env_cronos.scenes import CONTROL_HZ, SCENES, STEPS_PER_TASK, Body, Scene, Task, get_scene
 from lerobot_env_cronos.sequential import SequentialVectorEnv
 from lerobot_env_cronos.vector_env import CronosVectorEnv
 
@@ -15,6 +16,7 @@ __all__ = [
     "CONTROL_HZ",
     "SCENES",
     "STEPS_PER_TASK",
+    "Body",
     "CronosEnv",
     "CronosEnvConfig",
     "CronosVectorEnv",
@@ -23,5 +25,7 @@ __all__ = [
     "SequentialVectorEnv",
     "Task",
     "get_scene",
+    "gymnasium_id",
     "load_orderings",
+    "register_scene",
 ]

@@ -44,15 +44,18 @@ class SceneBoxes:
 
     def corners(self, body: int) -> np.ndarray:
         """The corners (8 k, 3) of one body's k boxes in its own frame."""
-        signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
-        return self.surface(body, signs)
+        return self.surface(body, np.inf)
 
-    def surface(self, body: int, grid: np.ndarray) -> np.ndarray:
-        """Points (k * len(grid), 3) of one body's k boxes, from coordinates in [-1, 1]^3."""
-        mine = self.body == body
-        local = grid[None] * self.half[mine][:, None]
-        points = np.einsum("mij,mgj->mgi", self.rotation[mine], local) + self.centre[mine][:, None]
-        return points.reshape(-1, 3)
+    def surface(self, body: int, spacing: float) -> np.ndarray:
+        """Points (p, 3) on one body's boxes in its own frame, edges included, at most `spacing` apart [m]."""
+        points = []
+        for m in np.flatnonzero(self.body == body):
+            counts = np.ceil(2 * self.half[m] / spacing).astype(int) + 1
+            axes = [np.linspace(-1, 1, max(count, 2)) for count in counts]
+            grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+            grid = grid[(np.abs(grid) == 1).any(1)]
+            points.append((grid * self.half[m]) @ self.rotation[m].T + self.centre[m])
+        return np.concatenate(points)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ from lerobot_env_cronos.configurations import SPLITS
 from lerobot_env_cronos.episodic import EpisodicVectorEnv, IndependentVectorEnv, LazyVectorEnv, find_task
 from lerobot_env_cronos.observations import AGENT_POS_NAMES, OBS_TYPES, environment_state_names
 from lerobot_env_cronos.orderings import Ordering, load_orderings
-from lerobot_env_cronos.scenes import CONTROL_HZ, SCENES, Task, get_scene
+from lerobot_env_cronos.registry import gymnasium_id
+from lerobot_env_cronos.scenes import CONTROL_HZ, Task, get_scene
 from lerobot_env_cronos.sequential import ADVANCES, SequentialVectorEnv
 from lerobot_env_cronos.simulation import ACTION_NAMES
 
@@ -101,7 +102,7 @@ class CronosEnvConfig(EnvConfig):
     @property
     def gym_id(self) -> str:
         """Gymnasium id of the single-environment form."""
-        return f"lerobot_env_cronos/{self.scene}-v0"
+        return gymnasium_id(self.scene)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -145,13 +146,3 @@ class CronosEnvConfig(EnvConfig):
 def _check(name: str, value: str, valid: tuple[str, ...]) -> None:
     if value not in valid:
         raise ValueError(f"unknown env.{name} {value!r}; valid values: {list(valid)}")
-
-
-def register_gymnasium() -> None:
-    """Register `lerobot_env_cronos/<scene>-v0` for every scene."""
-    for name in SCENES:
-        gym.register(
-            id=f"lerobot_env_cronos/{name}-v0",
-            entry_point="lerobot_env_cronos.episodic:CronosEnv",
-            kwargs={"scene": name},
-        )

@@ -69,12 +69,13 @@ def _load_splits(scene: Scene, path: Path | None) -> dict[str, np.ndarray]:
 
 
 def _check_content(scene: Scene, content: dict, source: object) -> None:
-    if tuple(content["bodies"]) != scene.bodies or content["version"] != VERSION:
-        found = f"v{content['version']} of bodies {content['bodies']}"
+    version, bodies, splits = (content.get(key) for key in ("version", "bodies", "splits"))
+    if tuple(bodies or ()) != scene.bodies or version != VERSION:
+        found = f"v{version} of bodies {bodies}"
         raise ValueError(f"{source} is {found}; {scene.name} needs v{VERSION} of bodies {list(scene.bodies)}")
     shape = (NUM_CONFIGURATIONS, len(scene.bodies), 7)
     for split in SPLITS:
-        if np.shape(content["splits"].get(split)) != shape:
+        if np.shape((splits or {}).get(split, ())) != shape:
             raise ValueError(f"split {split} of {source} must be of shape {shape}")
 
 

@@ -1,7 +1,9 @@
 """A scripted expert: pick and place from the privileged state, for all streams at once.
 
 It looks at the state at every step and derives what to do from it, so that it retries by itself after a miss, a
-slip or a perturbed action. It remembers only which grasp and which free spot it chose.
+slip or a perturbed action. It remembers only which grasp and which free spot it chose, and which object it is
+clearing away: one that lies on top of the object to move, or that takes up the last room on its receptacle, is put
+on the table first.
 """
 
 from typing import NamedTuple
@@ -13,6 +15,7 @@ from lerobot_env_cronos.grasping import (
     PAD_BELOW_EE,
     TIP_CLEARANCE,
     choose_grasps,
+    find_blocker,
     grasp_candidates,
 )
 from lerobot_env_cronos.kinematics import (
@@ -21,7 +24,7 @@ from lerobot_env_cronos.kinematics import (
     quaternion_to_matrix,
 )
 from lerobot_env_cronos.placement import Held, choose_places
-from lerobot_env_cronos.robot import FINGERTIP_REACH
+from lerobot_env_cronos.robot import FINGERTIP_REACH, PAD_HALF_SIZE
 from lerobot_env_cronos.simulation import ACTION_HIGH, ACTION_LOW, NUM_ARM_JOINTS
 from lerobot_env_cronos.vector_env import CronosVectorEnv
 
@@ -44,6 +47,14 @@ RETREAT_HEIGHT = 0.13
 """Height at which the hand waits once the task is complete [m]."""
 NUM_FAILED, MAX_VAIN_STEPS = 3, 5
 """Failed grasps that are remembered, and steps at a grasp after which it has failed."""
+MAX_CLEARED, MAX_CLEARING_STEPS = 3, 40
+"""Objects that are cleared away for one task, and steps after which clearing one is given up."""
+NEARBY = 0.09
+"""Distance at which the open hand may run into a tall object on its way down [m]."""
+PRESSING = 0.010
+"""Height of the hand above its target from which it stands on something [m]."""
+TOUCHING = 0.004
+"""Distance at which something keeps a hand that does not get down to its grasp from it [m]."""
 STALE_DISTANCE, STALE_ANGLE = 0.015, 0.2
 """An object or receptacle that moved further than this is looked at again [m, rad]."""
 
@@ -75,7 +86,8 @@ class ScriptedExpert:
         self._candidates = {i: grasp_candidates(self._boxes, i) for i in range(len(self.scene.objects))}
         self._corners = {i: self._boxes.corners(i) for i in range(len(self.scene.objects))}
         self._is_support = np.array([name in self.scene.receptacles for name in bodies])
-        self._goal = np.full((n, 2), -2)
+        # Indices of the object to move and of where to (-1: the table): by the task, and what is done first.
+        self._task, self._goal = np.full((n, 2), -2), np.full((n, 2), -2)
         self._grasp_known, self._place_known = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         self._grasp_point, self._grasp_axis, self._grasp_floor = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
         self._grasp_pose = np.zeros((n, 7))
@@ -83,9 +95,16 @@ class ScriptedExpert:
         self._failed, self._vain = np.full((n, NUM_FAILED, 3), np.inf), np.zeros(n, dtype=int)
         self._was_holding = np.zeros(n, dtype=bool)
         self._place_xy, self._place_anchor, self._place_closing = (np.zeros((n, 2)) for _ in range(3))
+        # The object that is being cleared away (-1: none), whether it has been in the hand, since when, how often.
+        self._clear, self._clear_held = np.full(n, -1), np.zeros(n, dtype=bool)
+        self._clear_steps, self._num_cleared = np.zeros(n, dtype=int), np.zeros(n, dtype=int)
 
     def reset(self, ids: np.ndarray) -> None:
-        """Forget the chosen grasps and places of streams `ids` (a new segment or episode)."""
+        """Forget everything about streams `ids` (a new segment or episode)."""
+        self._forget_choices(ids)
+        self._clear[ids], self._num_cleared[ids] = -1, 0
+
+    def _forget_choices(self, ids: np.ndarray) -> None:
         self._grasp_known[ids] = self._place_known[ids] = self._was_holding[ids] = False
         self._failed[ids], self._vain[ids] = np.inf, 0
 
@@ -123,6 +142,8 @@ class ScriptedExpert:
             (bodies.index(t.object), bodies.index(t.receptacle) if t.receptacle else -1) for t in self.env.tasks
         ]
         goal = np.array(tasks)
+        self.reset(np.flatnonzero((goal != self._task).any(1)))
+        self._task = goal.copy()
         i = np.arange(len(goal))
         self._success = self.env.is_success & ~self._held_objects[i, goal[:, 0]]
         other = self._held_objects.copy()
@@ -130,12 +151,32 @@ class ScriptedExpert:
         wrong = other.any(1)
         goal[wrong] = np.stack([other.argmax(1), np.full(len(goal), -1)], 1)[wrong]
         self._success &= ~wrong
-        changed = (goal != self._goal).any(1)
-        self.reset(np.flatnonzero(changed))
+        self._update_clearing(goal)
+        clearing = (self._clear >= 0) & ~wrong
+        goal[clearing] = np.stack([self._clear, np.full(len(goal), -1)], 1)[clearing]
+        self._forget_choices(np.flatnonzero((goal != self._goal).any(1)))
         self._goal = goal
         self._holding = self._held_objects[i, goal[:, 0]]
         self._object = self._poses[i, goal[:, 0]]
         self._object_R = quaternion_to_matrix(self._object[:, 3:])
+
+    def _update_clearing(self, goal: np.ndarray) -> None:
+        """Stop clearing what was put down, or is not in the way of the `goal` (n, 2) of the task any more."""
+        i, active = np.arange(len(goal)), self._clear >= 0
+        held = active & self._held_objects[i, np.maximum(self._clear, 0)]
+        self._clear_steps = np.where(active, self._clear_steps + 1, 0)
+        put_down = self._clear_held & ~held
+        self._clear_held = held
+        done = put_down | self._success | self._held_objects[i, goal[:, 0]] & ~held
+        done |= (self._clear_steps > MAX_CLEARING_STEPS) & ~held
+        self._clear[active & done] = -1
+
+    def _start_clearing(self, ids: np.ndarray, blocker: np.ndarray) -> None:
+        """Clear away the objects `blocker` (k,) of streams `ids` first; -1 for none."""
+        free = (blocker >= 0) & (self._clear[ids] < 0) & (self._num_cleared[ids] < MAX_CLEARED)
+        self._clear[ids[free]] = blocker[free]
+        self._num_cleared[ids[free]] += 1
+        self._clear_steps[ids[free]] = 0
 
     def _update_grasps(self) -> None:
         """Choose a grasp where none is known, or where the object has moved since."""
@@ -153,6 +194,22 @@ class ScriptedExpert:
             self._grasp_floor[ids] = grasps.floor
             self._grasp_pose[ids] = self._object[ids]
             self._grasp_known[ids] = True
+            self._start_clearing(ids, grasps.blocker)
+            self._make_room(ids[(self._goal[ids, 1] >= 0) & (self._clear[ids] < 0)])
+
+    def _make_room(self, ids: np.ndarray) -> None:
+        """Before picking up, clear away an object from receptacles that have no room left."""
+        for obj, target in np.unique(self._goal[ids], axis=0):
+            mine = ids[(self._goal[ids] == (obj, target)).all(1)]
+            R = self._object_R[mine]
+            hand = self._object[mine, :3] + np.einsum("nij,nj->ni", R, self._grasp_point[mine])
+            closing = np.einsum("nij,nj->ni", R, self._grasp_axis[mine])
+            held = Held(self._object[mine, :3], R, hand, np.arctan2(closing[:, 1], closing[:, 0]), self._arm[mine])
+            places = choose_places(
+                self.scene, obj, target, WorldBoxes.at(self._boxes, self._poses[mine]),
+                self._poses[mine, target, :2], held,
+            )  # fmt: skip
+            self._start_clearing(mine, places.blocker)
 
     def _give_up(self, failed: np.ndarray) -> None:
         """Remember the grasps that failed (n,) bool, so that the next choice is another one."""
@@ -195,11 +252,15 @@ class ScriptedExpert:
         empty = self._opening < EMPTY_OPENING
         missed = aligned & (low < GRASP_REACHED) & empty
         close = aligned & (low < GRASP_REACHED) & ~empty
-        self._notice_failures(missed, empty, aligned & (self._target_p[:, 2] - grasp[:, 2] < GRASP_REACHED))
+        down = aligned & (self._target_p[:, 2] - grasp[:, 2] < GRASP_REACHED)
+        pressing = self._p[:, 2] - self._target_p[:, 2] > PRESSING
+        self._notice_failures(missed, empty, down | pressing)
         # Fingers that are still opening do not go down on the object.
         still_opening = np.where(close, 0.0, 0.05 * np.clip(0.9 - self._opening, 0.0, 0.5) / 0.5)
         gripper = np.where(close, CLOSE, OPEN)[:, None]
-        return Command(self._funnel(grasp, error, still_opening), closing, gripper)
+        # Nor does a hand that is not aligned yet: it would knock over what is tall.
+        tall = np.maximum(self._top_nearby(point) - point[:, 2] - PAD_HALF_SIZE[0], 0.0)
+        return Command(self._funnel(grasp, error, still_opening, tall), closing, gripper)
 
     def _notice_failures(self, missed: np.ndarray, empty: np.ndarray, there: np.ndarray) -> None:
         """Give up grasps that closed on nothing, let the object slip, or cannot be reached (n,) bool."""
@@ -207,7 +268,19 @@ class ScriptedExpert:
         self._vain = np.where(there & trying, self._vain + 1, 0)
         slipped = self._was_holding & trying & empty
         self._was_holding = self._holding.copy()
-        self._give_up(missed & ~self._holding | slipped | (self._vain > MAX_VAIN_STEPS))
+        stuck = self._vain > MAX_VAIN_STEPS
+        self._clear_from_under_hand(np.flatnonzero(stuck))
+        self._give_up(missed & ~self._holding | slipped | stuck)
+
+    def _clear_from_under_hand(self, ids: np.ndarray) -> None:
+        """Where the hand does not get down to the grasp, clear away what it stands on."""
+        for obj in np.unique(self._goal[ids, 0]):
+            mine = ids[self._goal[ids, 0] == obj]
+            blocker = find_blocker(
+                WorldBoxes.at(self._boxes, self._poses[mine]), self._p[mine] - [0, 0, PAD_BELOW_EE],
+                _horizontal(self._R[mine, :, 1]), obj, self._is_support, TOUCHING,
+            )  # fmt: skip
+            self._start_clearing(mine, blocker)
 
     def _place(self) -> Command:
         """Lift, carry above the free spot, lower and let go."""
@@ -231,7 +304,8 @@ class ScriptedExpert:
         rests = (self._target_p[:, 2] - position[:, 2] < 0.004) & (self._p[:, 2] - self._target_p[:, 2] > 0.005)
         release = (error < ALIGNED + 0.006) & ((low < 0.006) | rests)
         gripper = np.where(release, OPEN, CLOSE)[:, None]
-        return Command(self._funnel(position, error, np.zeros(len(i))), closing, gripper)
+        none = np.zeros(len(i))
+        return Command(self._funnel(position, error, none, none), closing, gripper)
 
     def _finish(self) -> Command:
         """The task is complete: open, go straight up and wait."""
@@ -247,10 +321,14 @@ class ScriptedExpert:
         yaw = np.abs(np.arctan2(np.sin(yaw), np.cos(yaw)))
         return np.linalg.norm((goal - self._p)[:, :2], axis=1) + YAW_TO_METRES * yaw
 
-    def _funnel(self, goal: np.ndarray, error: np.ndarray, extra: np.ndarray) -> np.ndarray:
-        """Come to `goal` from above: the height follows the remaining error, and below it the hand rises first."""
+    def _funnel(self, goal: np.ndarray, error: np.ndarray, least: np.ndarray, tall: np.ndarray) -> np.ndarray:
+        """Come to `goal` from above: the height follows the remaining error, and below it the hand rises first.
+
+        It stays `least` (n,) above the goal, and `tall` (n,) higher than usual until it is aligned [m].
+        """
         rise = np.clip(FUNNEL_SLOPE * (error - ALIGNED), 0.0, HOVER_HEIGHT)
-        height = goal[:, 2] + np.maximum(rise, extra)
+        rise += tall * np.clip((error - ALIGNED) / ALIGNED, 0.0, 1.0)
+        height = goal[:, 2] + np.maximum(rise, least)
         too_low = height - self._target_p[:, 2]
         advance = np.clip(1.0 - (too_low - 0.02) / 0.03, 0.0, 1.0)
         position = self._target_p + advance[:, None] * (goal - self._target_p)
@@ -261,6 +339,13 @@ class ScriptedExpert:
         top = WorldBoxes.at(self._boxes, self._poses).top()
         masked = np.where(self._boxes.body == receptacle[:, None], top, -np.inf)
         return masked.max(1)
+
+    def _top_nearby(self, point: np.ndarray) -> np.ndarray:
+        """Height (n,) of the highest object around `point` (n, 3) or around the hand [m]."""
+        world = WorldBoxes.at(self._boxes, self._poses)
+        gap = [np.linalg.norm(world.centre[..., :2] - xy[:, None, :2], axis=-1) for xy in (point, self._p)]
+        near = (np.minimum(*gap) < NEARBY) & ~self._is_support[self._boxes.body]
+        return np.where(near, world.top(), 0.0).max(1)
 
     def _bottom(self) -> np.ndarray:
         """Height (n,) of the lowest point of the object to move [m]."""

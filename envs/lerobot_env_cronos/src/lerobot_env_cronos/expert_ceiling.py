@@ -2,9 +2,10 @@
 
     python -m lerobot_env_cronos.expert_ceiling --scene kitchen_2x2 --output ceiling
 
-prints one row per task and split (independent evaluation, 80 steps from a scene reset) and one per segment of
-reset-free streams (80 steps each, tasks in the training cycle, no scene reset), with 95 % Wilson intervals.
-`--output` also writes `independent.csv`, `reset_free.csv` and, if matplotlib is installed, `reset_free.png`.
+prints one row per task and split (independent evaluation, 80 steps from a scene reset), one per segment of
+reset-free streams (80 steps each, tasks in the training cycle, no scene reset), and one per reset task ("put the
+[object] on the table", in streams that alternate tasks and reset tasks), with 95 % Wilson intervals. `--output`
+also writes `independent.csv`, `reset_free.csv`, `reset_tasks.csv` and, with matplotlib, `reset_free.png`.
 """
 
 import argparse
@@ -70,13 +71,24 @@ def measure_independent(scene: str, split: str, task: Task, env: CronosVectorEnv
     return run_segment(env, ScriptedExpert(env).act, stop_early=True)
 
 
+@dataclass(frozen=True)
+class ResetFreeOutcome:
+    """What happened in reset-free streams."""
+
+    success: np.ndarray
+    """(segments, streams) bool."""
+    instructions: np.ndarray
+    """(segments, streams) str."""
+    lost: np.ndarray
+    """(streams,) bool: a body is out of the workspace at the end."""
+
+
 def measure_reset_free(
-    scene: str, num_streams: int, num_segments: int, end_effector_reset: bool = True
-) -> tuple[np.ndarray, np.ndarray]:
+    scene: str, num_streams: int, num_segments: int, end_effector_reset: bool = True, reset_tasks: bool = False
+) -> ResetFreeOutcome:
     """The expert in streams without scene resets, under the training cycle of tasks.
 
-    Returns:
-        success (segments, streams) bool, and lost (streams,) bool: a body has left the workspace at the end.
+    With `reset_tasks` every second segment is the reset task of the object that was just put somewhere.
     """
     env = CronosVectorEnv(num_streams, scene, obs_type=STATE_OBSERVATIONS)
     everyone, tasks = np.arange(num_streams), env.scene.tasks
@@ -84,14 +96,17 @@ def measure_reset_free(
     expert = ScriptedExpert(env)
     # Streams that share a configuration get different offsets in the cycle.
     offset = everyone + everyone // NUM_CONFIGURATIONS
-    success = np.zeros((num_segments, num_streams), dtype=bool)
+    success, instructions = np.zeros((num_segments, num_streams), dtype=bool), []
     for segment in range(num_segments):
         if end_effector_reset and segment > 0:
             env.end_effector_reset(everyone)
-        env.set_task(everyone, [tasks[(i + segment) % len(tasks)] for i in offset])
+        turn, is_reset = divmod(segment, 2) if reset_tasks else (segment, 0)
+        current = [tasks[(i + turn) % len(tasks)] for i in offset]
+        env.set_task(everyone, [Task(task.object, None) for task in current] if is_reset else current)
         expert.reset(everyone)
         success[segment] = run_segment(env, expert.act)
-    return success, has_lost_body(env)
+        instructions.append(env.instructions)
+    return ResetFreeOutcome(success, np.array(instructions), has_lost_body(env))
 
 
 def has_lost_body(env: CronosVectorEnv) -> np.ndarray:
@@ -158,17 +173,23 @@ def main() -> None:
             outcome = measure_independent(args.scene, split, task, env)
             independent.append(success_rate(split, task.instruction, outcome))
             print_rates(independent[-1:])
-    success, lost = measure_reset_free(
-        args.scene, args.num_streams, args.num_segments, not args.no_end_effector_reset
-    )
-    reset_free = [success_rate(str(i + 1), "all", outcome) for i, outcome in enumerate(success)]
+    with_eer = not args.no_end_effector_reset
+    streams = measure_reset_free(args.scene, args.num_streams, args.num_segments, with_eer)
+    reset_free = [success_rate(str(i + 1), "all", outcome) for i, outcome in enumerate(streams.success)]
     print_rates(reset_free)
-    print_rates([success_rate("mean", "all", success.ravel())])
-    print(f"streams in which a body left the workspace: {lost.sum()}/{len(lost)}")
+    print_rates([success_rate("mean", "all", streams.success.ravel())])
+    print(f"streams in which a body left the workspace: {streams.lost.sum()}/{len(streams.lost)}", flush=True)
+    alternating = measure_reset_free(args.scene, args.num_streams // 2, args.num_segments, with_eer, True)
+    reset_tasks = [
+        success_rate("reset", task.instruction, alternating.success[alternating.instructions == task.instruction])
+        for task in env.scene.reset_tasks
+    ]
+    print_rates(reset_tasks)
     if args.output:
         args.output.mkdir(parents=True, exist_ok=True)
         write_csv(args.output / "independent.csv", independent)
         write_csv(args.output / "reset_free.csv", reset_free)
+        write_csv(args.output / "reset_tasks.csv", reset_tasks)
         title = f"Scripted expert, {args.scene}, {args.num_streams} streams"
         if not draw_curve(args.output / "reset_free.png", reset_free, title):
             print("matplotlib is not installed: no reset_free.png")

@@ -23,7 +23,11 @@ FINGER_ROOM, PALM_ROOM = 0.006, 0.004
 PALM_HALF_Y, PALM_HALF_Z = 0.045, 0.022
 WRIST_LIMIT = 2.6
 """Wrist rotation beyond which a grasp or a place is not chosen [rad]."""
+MAX_REACH = 0.44
+"""Distance from the robot's axis up to which a hand that points down goes everywhere with ease [m]."""
 SLOTS = np.array([-0.75, -0.4, 0.0, 0.4, 0.75])
+BLOCKED_DEPTH = 0.002
+"""A hand that would be this deep in another object cannot grasp; that object has to be moved first [m]."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,8 @@ class Grasps:
     """(n,) height that the fingertips stay above [m]."""
     cost: np.ndarray
     """(n,) its score, 0 the best."""
+    blocker: np.ndarray
+    """(n,) index of the object that is in the way of the hand, -1 for none."""
 
 
 def wrap(angle: np.ndarray) -> np.ndarray:
@@ -89,6 +95,11 @@ def wrist_cost(arm: np.ndarray, point: np.ndarray, hand_yaw: np.ndarray) -> np.n
     wrist = wrap(np.arctan2(point[..., 1], point[..., 0]) + np.pi / 2 - hand_yaw)
     turn = wrist - arm[..., 5]
     return 0.25 * np.abs(turn) + 0.15 * np.abs(wrist) + 10.0 * (np.abs(wrist) > WRIST_LIMIT)
+
+
+def reach_cost(point: np.ndarray) -> np.ndarray:
+    """Cost (...) of points (..., 2 or 3) that the arm only reaches stretched out [m]."""
+    return 40.0 * np.maximum(np.linalg.norm(point[..., :2], axis=-1) - MAX_REACH, 0.0)
 
 
 def finger_points(centre: np.ndarray, closing: np.ndarray, half_gap: tuple[float, ...] = (FINGER_Y,)):
@@ -153,18 +164,19 @@ def choose_grasps(
     # Pads that pass over the grasp point by more than their half length do not hold it.
     cost += 200 * np.maximum(centre[..., 2] - point[..., 2] - 0.010, 0.0)
     cost += _collision_cost(world, candidates, centre, closing, obj, is_support)
-    cost += wrist_cost(arm[:, None], point, np.arctan2(closing[..., 1], closing[..., 0]))
+    cost += wrist_cost(arm[:, None], point, np.arctan2(closing[..., 1], closing[..., 0])) + reach_cost(point)
     failed = np.linalg.norm(candidates.point[None, :, None] - avoid[:, None], axis=-1) < 0.012
     cost += 1.5 * failed.sum(-1)
     com = p + np.einsum("nij,j->ni", R, world.boxes.centre_of_mass[obj])
     cost += 8.0 * np.linalg.norm((point - com[:, None])[..., :2], axis=-1)
     best, n = cost.argmin(1), np.arange(len(p))
-    return Grasps(candidates.point[best], candidates.axis[best], floor[n, best], cost[n, best])
+    blocker = find_blocker(world, centre[n, best], closing[n, best], obj, is_support)
+    return Grasps(candidates.point[best], candidates.axis[best], floor[n, best], cost[n, best], blocker)
 
 
 def _width(world: WorldBoxes, candidates: GraspCandidates, R: np.ndarray, closing: np.ndarray) -> np.ndarray:
     """Extent (n, c) of the grasped box along the closing axis, over the pads' length along the box."""
-    local = np.einsum("cji,nkj,nck->nci", candidates.rotation, R.transpose(0, 2, 1), closing)
+    local = np.einsum("cji,nkj,nck->nci", candidates.rotation, R, closing)
     half = np.minimum(world.boxes.half[candidates.box], 0.026)
     return 2 * (np.abs(local) * half).sum(-1)
 
@@ -204,7 +216,9 @@ def _collision_cost(
     gap = world.distance(fingers.reshape(n, -1, 3)).reshape(n, c, fingers.shape[2], -1).min(2)
     # The grasped box itself is between the fingers, and receptacles are handled by the floor.
     ignored = support | (np.arange(len(support)) == candidates.box[:, None])
-    gap = np.where(ignored, np.inf, gap).min(-1) - PAD_HALF_SIZE[1]
+    gap = np.where(ignored, np.inf, gap) - PAD_HALF_SIZE[1]
+    into_itself = (np.where(world.boxes.body == obj, gap, np.inf) < -BLOCKED_DEPTH).any(-1)
+    gap = gap.min(-1)
     palm = palm_points(centre, closing)
     palm_gap = world.distance(palm.reshape(n, -1, 3)).reshape(n, c, palm.shape[2], -1).min(2)
     palm_gap = np.where(support, np.inf, palm_gap).min(-1)
@@ -213,4 +227,31 @@ def _collision_cost(
     above_gap = world.distance(above.reshape(n, -1, 3)).reshape(n, c, 2, -1).min(2)
     above_gap = np.where(support | (world.boxes.body == obj), np.inf, above_gap).min(-1)
     cost = 120 * np.maximum(FINGER_ROOM - gap, 0.0) + 120 * np.maximum(PALM_ROOM - palm_gap, 0.0)
-    return cost + 60 * np.maximum(0.008 - above_gap, 0.0)
+    return cost + 60 * np.maximum(0.008 - above_gap, 0.0) + 5.0 * into_itself
+
+
+def find_blocker(
+    world: WorldBoxes,
+    centre: np.ndarray,
+    closing: np.ndarray,
+    obj: int,
+    is_support: np.ndarray,
+    margin: float = -BLOCKED_DEPTH,
+) -> np.ndarray:
+    """Index (n,) of the object that a hand around object `obj`, or what it would lift, runs into; -1 for none.
+
+    Args:
+        world: all boxes.
+        centre: (n, 3) middle of the pads [m].
+        closing: (n, 3) horizontal unit vector.
+        obj: index of the object to grasp.
+        is_support: (bodies,) True for receptacles, which block nothing.
+        margin: distance below which another object is in the way [m].
+    """
+    fingers, palm = finger_points(centre, closing, (FINGER_Y, 0.018)), palm_points(centre, closing)
+    above = centre[:, None] + np.array([[0, 0, 0.02], [0, 0, 0.035]])
+    room = np.repeat([PAD_HALF_SIZE[1], 0.0, 0.0], [fingers.shape[1], palm.shape[1], 2])
+    gap = (world.distance(np.concatenate([fingers, palm, above], 1)) - room[:, None]).min(1)
+    body = world.boxes.body
+    gap = np.where(is_support[body] | (body == obj), np.inf, gap)
+    return np.where(gap.min(1) < margin, body[gap.argmin(1)], -1)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_env_cronos.body_boxes import WorldBoxes
-from lerobot_env_cronos.grasping import finger_points, wrist_cost
+from lerobot_env_cronos.grasping import finger_points, reach_cost, wrist_cost
 from lerobot_env_cronos.robot import PAD_HALF_SIZE
 from lerobot_env_cronos.scenes import Scene
 
@@ -19,9 +19,12 @@ OFFSETS = np.stack(np.meshgrid(np.linspace(-1, 1, 5), np.linspace(-1, 1, 5)), -1
 TURNS = np.deg2rad([0.0, -30.0, 30.0, -60.0, 60.0, 90.0])
 ROOM = 0.010
 """Wanted distance from other things [m]."""
+BLOCKED_DEPTH = 0.003
+"""An overlap with another object from which on a receptacle counts as full [m]."""
 PREFERRED_OFFSET = 0.03
 """Distance beside the middle at which an empty receptacle still holds a second object [m]."""
-FOOTPRINT_GRID = np.array([[x, y, z] for x in (-1, 1) for y in np.linspace(-1, 1, 8) for z in (-1, 1)])
+SPACING = 0.016
+"""Of the points of the held object that are checked: closer than the thinnest side of an object, 18 mm [m]."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,8 @@ class Places:
     """(n, 2) the receptacle's centre, or 0 for the table [m]."""
     closing: np.ndarray
     """(n, 2) the hand's closing axis when it lets go."""
+    blocker: np.ndarray
+    """(n,) index of the object that even this spot overlaps with, -1 for none."""
 
 
 @dataclass(frozen=True)
@@ -74,9 +79,9 @@ def choose_places(
     turn = np.repeat(TURNS, len(offsets))
     spots = np.tile(spots, (1, len(TURNS), 1))
     goal = anchor[:, None] + spots
-    gap = _clearance(world, obj, receptacle, goal, turn, top, held)
-    cost = 150 * np.maximum(ROOM - gap, 0.0)
-    cost += wrist_cost(held.arm[:, None], goal, held.hand_yaw[:, None] + turn)
+    which, gaps = _clearance(world, obj, receptacle, goal, turn, top, held)
+    cost = 150 * np.maximum(ROOM - gaps.min(-1), 0.0)
+    cost += wrist_cost(held.arm[:, None], goal, held.hand_yaw[:, None] + turn) + reach_cost(goal)
     distance = np.linalg.norm(spots, axis=-1)
     if on_table:
         cost += 2.0 * np.linalg.norm(goal - held.position[:, None, :2], axis=-1)
@@ -85,7 +90,9 @@ def choose_places(
         cost += 15 * _along(held, spots, turn, world, obj)
     best, i = cost.argmin(1), np.arange(n)
     yaw = held.hand_yaw + turn[best]
-    return Places(spots[i, best], anchor, np.stack([np.cos(yaw), np.sin(yaw)], 1))
+    nearest, gap = which[gaps[i, best].argmin(-1)], gaps[i, best].min(-1)
+    blocker = np.where((gap < -BLOCKED_DEPTH) & (nearest < len(scene.objects)), nearest, -1)
+    return Places(spots[i, best], anchor, np.stack([np.cos(yaw), np.sin(yaw)], 1), blocker)
 
 
 def _table_grid(scene: Scene) -> np.ndarray:
@@ -109,9 +116,10 @@ def _clearance(
     turn: np.ndarray,
     top: np.ndarray,
     held: Held,
-) -> np.ndarray:
-    """Distance (n, s) of the object and the opened fingers at each spot from everything else [m]."""
-    surface = world.boxes.surface(obj, FOOTPRINT_GRID)
+) -> tuple[np.ndarray, np.ndarray]:
+    """The bodies (k,) of the boxes nearby, and how far the object and the opened fingers at each spot are from
+    each of them, (n, s, k) [m]; one box at infinity if there is none."""
+    surface = world.boxes.surface(obj, SPACING)
     body = np.einsum("nij,pj->npi", held.rotation, surface)
     lowest = body[..., 2].min(1)
     closing = np.stack([np.cos(held.hand_yaw), np.sin(held.hand_yaw), 0 * held.hand_yaw], 1)
@@ -127,8 +135,8 @@ def _clearance(
         moved = _turned(points[:, None], turn)
         moved = np.concatenate([moved[..., :2] + goal[:, :, None], moved[..., 2:] + height[..., None]], -1)
         distance = world.distance(moved.reshape(n, -1, 3), np.flatnonzero(others))
-        gaps.append(distance.reshape(n, s, -1).min(2) - thickness)
-    return np.minimum(*gaps)
+        gaps.append(distance.reshape(n, s, -1, distance.shape[-1]).min(2) - thickness)
+    return world.boxes.body[others] if others.any() else np.array([-1]), np.minimum(*gaps)
 
 
 def _along(held: Held, spots: np.ndarray, turn: np.ndarray, world: WorldBoxes, obj: int) -> np.ndarray:

@@ -38,7 +38,7 @@ def register_scene(scene: Scene, bodies: Sequence[Body] = (), configurations: Pa
     BODIES.update(new_bodies)
     SCENES[scene.name] = scene
     if not known:
-        register_gymnasium_id(scene.name)
+        _register_gymnasium(scene.name)
 
 
 def _check(scene: Scene, new_bodies: dict[str, Body]) -> None:
@@ -66,8 +66,12 @@ def gymnasium_id(scene: str) -> str:
     return f"lerobot_env_cronos/{scene}-v0"
 
 
-def register_gymnasium_id(scene: str) -> None:
-    """Register a scene of `SCENES` with Gymnasium."""
-    gym.register(
-        id=gymnasium_id(scene), entry_point="lerobot_env_cronos.episodic:CronosEnv", kwargs={"scene": scene}
-    )
+def register_gymnasium() -> None:
+    """Register every scene of `SCENES` with Gymnasium."""
+    for scene in SCENES:
+        _register_gymnasium(scene)
+
+
+def _register_gymnasium(scene: str) -> None:
+    entry_point = "lerobot_env_cronos.episodic:CronosEnv"
+    gym.register(id=gymnasium_id(scene), entry_point=entry_point, kwargs={"scene": scene})

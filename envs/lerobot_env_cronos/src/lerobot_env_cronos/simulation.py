@@ -219,12 +219,16 @@ class Simulation:
         """The object rests on the table within reach, touches no receptacle and is not grasped (n,)."""
         i = self.scene.bodies.index(obj)
         speed = np.linalg.norm(self.qvel[:, NUM_ROBOT_JOINTS + 6 * i : NUM_ROBOT_JOINTS + 6 * i + 3], axis=1)
-        on = np.linalg.norm(self.force(support_sensor(obj, "table")), axis=1) > SUCCESS_MIN_FORCE_N
+        xy = self.body_pose(obj)[:, :2]
+        on = ((xy >= EE_LOW[:2]) & (xy <= EE_HIGH[:2])).all(1)
+        on &= np.linalg.norm(self.force(support_sensor(obj, "table")), axis=1) > SUCCESS_MIN_FORCE_N
+        for side in ("left", "right"):
+            on &= np.linalg.norm(self.force(grasp_sensor(side, obj)), axis=1) < GRASP_MIN_FORCE_N
         for receptacle in self.scene.receptacles:
             on &= np.linalg.norm(self.force(support_sensor(obj, receptacle)), axis=1) <= SUCCESS_MIN_FORCE_N
         xy = self.body_pose(obj)[:, :2]
         on &= ((xy >= EE_LOW[:2]) & (xy <= EE_HIGH[:2])).all(1)
-        return on & ~self.is_grasped(obj) & (speed < SETTLE_SPEED)
+        return on & (speed < SETTLE_SPEED)
 
     def body_rotations(self) -> np.ndarray:
         """Rotation matrices of all bodies (n, bodies, 3, 3)."""

@@ -91,24 +91,27 @@ def _dress_bear(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> N
         [(-0.06 * hz, 0.55), (0.14 * hz, 0.92), (0.42 * hz, 1.0), (0.68 * hz, 0.86), (0.86 * hz, 0.45)],
         caps="last", pos=(back, 0, 0),
     )  # fmt: skip
-    legs, arms, ears, soles = [], [], [], []
+
+    def roll(
+        radius: float, x0: float, x1: float, y: float, z: float, sides: int = 6, caps: str = "last"
+    ) -> Surface:
+        return cylinder(radius, x0 * hx, x1 * hx, "x", (0, y, z), sides, caps)
+
+    arm = 0.8 * limb
+    limbs, pale, face = [], [], []
     for side in (-1, 1):
-        y = side * (hy - limb)
-        legs.append(cylinder(limb, -0.2 * hx, 0.96 * hx, "x", (0, y, -hz + limb), 8, "last"))
-        arms.append(
-            cylinder(0.8 * limb, -0.4 * hx, 0.62 * hx, "x", (0, side * (hy - 0.8 * limb), -0.2 * hz), 8, "last")
-        )
-        ears.append(cylinder(ear, -0.45 * hx, -0.1 * hx, "x", (0, side * (hy - ear), hz - ear), 8))
-        soles.append(cylinder(0.7 * limb, 0.96 * hx, hx, "x", (0, y, -hz + limb), 8, "last"))
-    add_visual(spec, spec_body, body.name, "fur", torso, head, *legs, *arms, *ears)
-    snout = cylinder(0.36 * hy, 0.2 * hx, 0.76 * hx, "x", (0, 0, 0.26 * hz), 8, "last")
-    tummy = cylinder(0.48 * hy, 0.3 * hx, 0.54 * hx, "x", (0, 0, -0.42 * hz), 8, "last")
-    add_visual(spec, spec_body, f"{body.name} pale", "light fur", snout, tummy, *soles)
-    eyes = [
-        cylinder(0.13 * hy, 0.3 * hx, 0.5 * hx, "x", (0, s * 0.42 * hy, 0.56 * hz), 6, "last") for s in (-1, 1)
-    ]
-    nose = cylinder(0.17 * hy, 0.7 * hx, 0.86 * hx, "x", (0, 0, 0.36 * hz), 6, "last")
-    add_visual(spec, spec_body, f"{body.name} face", "bead", nose, *eyes)
+        limbs += [
+            roll(limb, -0.2, 0.96, side * (hy - limb), -hz + limb, 8),
+            roll(arm, -0.4, 0.62, side * (hy - arm), -0.2 * hz),
+            roll(ear, -0.45, -0.1, side * (hy - ear), hz - ear, 8),
+        ]
+        pale.append(roll(0.7 * limb, 0.96, 1.0, side * (hy - limb), -hz + limb))
+        face.append(roll(0.13 * hy, 0.3, 0.5, side * 0.42 * hy, 0.56 * hz))
+    pale += [roll(0.36 * hy, 0.2, 0.76, 0, 0.26 * hz, 8), roll(0.48 * hy, 0.3, 0.54, 0, -0.42 * hz, 8)]
+    face.append(roll(0.17 * hy, 0.7, 0.86, 0, 0.36 * hz))
+    add_visual(spec, spec_body, body.name, "fur", torso, head, *limbs)
+    add_visual(spec, spec_body, f"{body.name} pale", "light fur", *pale)
+    add_visual(spec, spec_body, f"{body.name} face", "bead", *face)
 
 
 def _dress_water_bottle(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
