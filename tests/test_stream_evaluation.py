@@ -5,7 +5,7 @@ from lerobot_env_cronos import CronosVectorEnv
 
 from cronos_lerobot.protocol import ProtocolConfig
 from cronos_lerobot.report.stream_video import ExpertSpectator, Spectator
-from cronos_lerobot.stream_evaluation import success_by_segment
+from cronos_lerobot.stream_evaluation import Start, classify_starts, rows_by_segment, rows_by_start, run_streams
 
 PROTOCOL = ProtocolConfig(scene_reset_interval=None, end_effector_reset=True)
 
@@ -35,19 +35,19 @@ def make_env() -> CronosVectorEnv:
 
 
 def test_outcomes_are_those_of_each_segment_and_stream():
-    outcomes, found = success_by_segment(make_env(), Idle(), PROTOCOL, 2)
-    assert outcomes.shape == (2, 4)
-    assert not outcomes.any()
-    assert not found.any()
+    outcomes = run_streams(make_env(), Idle(), PROTOCOL, 2)
+    assert outcomes.success.shape == (2, 4)
+    assert not outcomes.success.any()
+    assert (outcomes.start == Start.FREE).all()
 
 
 def test_the_experts_segments_succeed_and_the_idle_ones_do_not():
     env = make_env()
-    outcomes, found = success_by_segment(env, ExpertEverySecondSegment(env), PROTOCOL, 4)
+    outcomes = run_streams(env, ExpertEverySecondSegment(env), PROTOCOL, 4)
     # Two tasks lie between two working segments, none of them done in passing.
-    assert outcomes.all(axis=1).tolist() == [True, False, True, False]
-    assert not outcomes[[1, 3]].any()
-    assert not found.any()
+    assert outcomes.success.all(axis=1).tolist() == [True, False, True, False]
+    assert not outcomes.success[[1, 3]].any()
+    assert (outcomes.start != Start.COMPLETE).all()
 
 
 def test_a_task_left_complete_is_found_so_when_its_turn_comes_again():
@@ -56,6 +56,25 @@ def test_a_task_left_complete_is_found_so_when_its_turn_comes_again():
             return ExpertSpectator.choose(self, o_t, tau) if self.segment == 0 else Idle().choose(o_t, tau)
 
     env = make_env()
-    outcomes, found = success_by_segment(env, Once(env), PROTOCOL, 5)
-    assert outcomes.all(axis=1).tolist() == [True, False, False, False, True]
-    assert found.all(axis=1).tolist() == [False, False, False, False, True]
+    outcomes = run_streams(env, Once(env), PROTOCOL, 5)
+    assert outcomes.success.all(axis=1).tolist() == [True, False, False, False, True]
+    # Tasks: (bottle, plate), (bottle, cloth), (shovel, plate), (shovel, cloth); stream i begins with task i.
+    other, occupied, free = Start.ON_OTHER_RECEPTACLE, Start.RECEPTACLE_OCCUPIED, Start.FREE
+    assert outcomes.start[1].tolist() == [other, free, other, free]
+    assert outcomes.start[2].tolist() == [occupied, occupied, occupied, occupied]
+    assert outcomes.start[3].tolist() == [free, other, free, other]
+    assert (outcomes.start[4] == Start.COMPLETE).all()
+    assert [row[:3] for row in rows_by_segment(outcomes)] == [
+        ("0", 4, 4), ("1", 0, 4), ("2", 0, 4), ("3", 0, 4), ("4", 4, 4), ("all", 8, 20),
+    ]  # fmt: skip
+    assert [row[:3] for row in rows_by_start(outcomes)] == [
+        ("complete", 4, 4), ("on_other_receptacle", 0, 4), ("receptacle_occupied", 0, 4), ("free", 4, 8),
+    ]  # fmt: skip
+
+
+def test_bodies_out_of_reach_are_lost():
+    env = make_env()
+    env.simulation.move_body(np.array([1]), "ketchup bottle", np.array([[0.8, 0.5, -0.74, 1, 0, 0, 0]]))
+    env.simulation.move_body(np.array([2]), "cloth", np.array([[0.8, 0.5, -0.74, 1, 0, 0, 0]]))
+    # All are told to put the bottle on the plate: the cloth does not matter.
+    assert classify_starts(env).tolist() == [Start.FREE, Start.LOST, Start.FREE, Start.FREE]
