@@ -1,0 +1,140 @@
+"""Scenes from outside the package."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from lerobot_env_cronos import SCENES, Body, CronosEnvConfig, CronosVectorEnv, Scene, gymnasium_id, register_scene
+from lerobot_env_cronos.configurations import (
+    _files,
+    _load_splits,
+    footprint_corners,
+    footprint_gap,
+    load_configurations,
+)
+from lerobot_env_cronos.expert import ScriptedExpert
+from lerobot_env_cronos.expert_ceiling import run_segment
+from lerobot_env_cronos.scenes import BODIES
+
+BLOCK = Body("red block", (0.03, 0.03, 0.03), 600, "box", (0.8, 0.1, 0.1))
+COASTER = Body("blue coaster", (0.09, 0.09, 0.005), 900, "disc", (0.1, 0.3, 0.8))
+SCENE = Scene("study_2x1", ("red block", "ketchup bottle"), ("blue coaster",))
+STATE = "environment_state_agent_pos"
+
+
+@pytest.fixture(autouse=True)
+def registries():
+    """All registries are afterwards what they were before."""
+    registries = (SCENES, BODIES, _files)
+    before = [dict(registry) for registry in registries]
+    yield
+    for registry, content in zip(registries, before):
+        registry.clear()
+        registry.update(content)
+    gym.registry.pop(gymnasium_id(SCENE.name), None)
+
+
+def write_file(folder, bodies=SCENE.bodies, n=64):
+    """A file of configurations: the same one 64 times, but for the block's x."""
+    block = [[0.25 + 0.001 * i, 0.0, 0.015, 1, 0, 0, 0] for i in range(n)]
+    others = [[0.3, 0.1, 0.0104, 1, 0, 0, 0], [0.3, -0.1, 0.0025, 1, 0, 0, 0]]
+    splits = {split: [[pose, *others] for pose in block] for split in ("train", "held_out")}
+    path = folder / "mine.json"
+    path.write_text(json.dumps({"version": 0, "bodies": bodies, "splits": splits}))
+    return path
+
+
+def test_a_registered_scene_is_usable_by_name():
+    register_scene(SCENE, bodies=[BLOCK, COASTER])
+    config = CronosEnvConfig(scene="study_2x1", obs_type=STATE)
+    assert config.features["environment_state"].shape == (36,)
+    envs = config.create_envs(2)["independent_train"]
+    observation, _ = envs[1].reset(seed=[3, 4])
+    assert observation["environment_state"].shape == (2, 36)
+    assert envs[1].call("task_description") == ("put the ketchup bottle on the blue coaster",) * 2
+    env = gym.make("lerobot_env_cronos/study_2x1-v0", obs_type=STATE, task="put the red block on the blue coaster")
+    assert env.reset(seed=0)[1]["task"] == "put the red block on the blue coaster"
+
+
+def test_drawn_configurations_are_apart_and_the_same_every_time():
+    register_scene(SCENE, bodies=[BLOCK, COASTER])
+    poses = load_configurations("study_2x1", "train")
+    assert poses.shape == (64, 3, 7)
+    for block, bottle, coaster in poses:
+        places = zip(SCENE.bodies, (block, bottle, coaster))
+        a, b, c = (footprint_corners(n, p[:2], 2 * np.arctan2(p[6], p[3])) for n, p in places)
+        assert min(footprint_gap(a, b), footprint_gap(a, c), footprint_gap(b, c)) > 0.0149
+    # What another process would draw.
+    _load_splits.cache_clear()
+    redrawn = load_configurations("study_2x1", "train")
+    assert redrawn is not poses
+    np.testing.assert_array_equal(redrawn, poses)
+
+
+def test_configurations_from_a_file(tmp_path):
+    register_scene(SCENE, bodies=[BLOCK, COASTER], configurations=write_file(tmp_path))
+    assert load_configurations("study_2x1", "held_out")[5, 0, 0] == pytest.approx(0.255)
+    env = CronosVectorEnv(2, "study_2x1", obs_type=STATE)
+    env.scene_reset(np.array([0, 1]), np.array([10, 20]))
+    np.testing.assert_allclose(env.simulation.body_pose("red block")[:, 0], [0.26, 0.27])
+
+
+def test_plain_bodies_have_mass_and_colour_and_can_be_placed():
+    register_scene(SCENE, bodies=[BLOCK, COASTER])
+    env = CronosVectorEnv(8, "study_2x1", obs_type=STATE)
+    model = env.simulation.model
+    assert model.body("red block").mass[0] == pytest.approx(0.03**3 * 600)
+    assert model.body("blue coaster").mass[0] == pytest.approx(np.pi * 0.045**2 * 0.005 * 900)
+    material = model.geom("red block visual").matid[0]
+    np.testing.assert_allclose(model.mat_rgba[material], [0.8, 0.1, 0.1, 1.0], atol=1e-6)
+    env.set_task(np.arange(8), [SCENE.tasks[0]] * 8)
+    assert run_segment(env, ScriptedExpert(env).act, stop_early=True).mean() >= 0.9
+
+
+def test_registering_again_changes_nothing():
+    register_scene(SCENE, bodies=[BLOCK, COASTER])
+    before = dict(SCENES), dict(BODIES)
+    register_scene(SCENE, bodies=[BLOCK, COASTER])
+    assert before == (SCENES, BODIES)
+
+
+@pytest.mark.parametrize(
+    ("scene", "bodies", "message"),
+    [
+        (Scene("kitchen_2x2", ("red block",), ("blue coaster",)), [BLOCK, COASTER], "another scene 'kitchen_2x2'"),
+        (Scene("My-scene", ("red block",), ("blue coaster",)), [BLOCK, COASTER], "'My-scene'.*a-z"),
+        (SCENE, [BLOCK], "unknown body 'blue coaster'.*yellow plate"),
+        (SCENE, [Body("cloth", (0.1, 0.1, 0.01), 1, "box")], "another body 'cloth'"),
+        (SCENE, [BLOCK, Body("blue coaster", (0.1, 0.1, 0.01), 1, "ring")], "unknown shape 'ring'.*box"),
+        (SCENE, [BLOCK, Body("blue coaster", (0.1, 0.0, 0.01), 1, "disc")], "must be positive"),
+        (Scene("study", ("red block",), ()), [BLOCK], "objects and receptacles"),
+    ],
+)
+def test_what_is_wrong_is_named_and_nothing_registered(scene, bodies, message):
+    before = dict(SCENES), dict(BODIES)
+    with pytest.raises(ValueError, match=message):
+        register_scene(scene, bodies=bodies)
+    assert before == (SCENES, BODIES)
+
+
+@pytest.mark.parametrize(
+    ("bodies", "n", "message"), [(("cloth",), 64, "is v0 of bodies.*needs v0"), (SCENE.bodies, 9, r"\(64, 3, 7\)")]
+)
+def test_a_file_of_something_else_is_refused(tmp_path, bodies, n, message):
+    path = write_file(tmp_path, bodies, n)
+    with pytest.raises(ValueError, match=message):
+        register_scene(SCENE, bodies=[BLOCK, COASTER], configurations=path)
+    assert "study_2x1" not in SCENES
+    assert "red block" not in BODIES
+
+
+def test_bodies_that_do_not_fit_are_an_error(monkeypatch):
+    monkeypatch.setattr("lerobot_env_cronos.configurations.MAX_ATTEMPTS", 20)
+    crowded = Scene(
+        "crowded", ("ketchup bottle",), ("yellow plate", "cloth"), spawn_low=(0.3, 0.0), spawn_high=(0.32, 0.02)
+    )
+    register_scene(crowded)
+    gym.registry.pop(gymnasium_id("crowded"))
+    with pytest.raises(RuntimeError, match="crowded: 3 bodies do not fit"):
+        load_configurations("crowded", "train")
