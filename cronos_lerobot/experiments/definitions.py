@@ -32,6 +32,10 @@ class Row:
     """heuristic or random."""
     num_configurations: int = 64
     """Training configurations, 64 or 1."""
+    tag: str = ""
+    """What else tells the row from the others, one word; needed with `flags`."""
+    flags: tuple[str, ...] = ()
+    """More flags of `cronos-train`."""
 
     @property
     def name(self) -> str:
@@ -41,6 +45,7 @@ class Row:
             words.append(self.task_order)
         if self.num_configurations != 64:
             words.append(f"{self.num_configurations}config")
+        words += [self.tag] if self.tag else []
         return "_".join(words)
 
     @property
@@ -51,6 +56,7 @@ class Row:
             words.append(f"{self.task_order} order")
         if self.num_configurations != 64:
             words.append(f"{self.num_configurations} configuration{'s' * (self.num_configurations > 1)}")
+        words += [self.tag] if self.tag else []
         return ", ".join(words)
 
     @property
@@ -84,8 +90,8 @@ class Experiment:
     name: str
     title: str
     rows: tuple[Row, ...]
-    source: str
-    """Where the paper has it."""
+    source: str = ""
+    """Where the paper has it; empty if it is one's own."""
     steps: int = SHORT
     """S [interaction steps, all streams together]."""
     scene: str = "kitchen_2x2"
@@ -208,7 +214,21 @@ _ALL = (
     ),
 )
 EXPERIMENTS: dict[str, Experiment] = {experiment.name: experiment for experiment in _ALL}
-"""Experiments by name; a new one is added here. Runs with the same settings are shared between them."""
+"""Experiments by name. Runs with the same settings are shared between them."""
+
+
+def register_experiment(experiment: Experiment) -> None:
+    """Add an experiment of one's own; `cronos-reproduce --import=MODULE` imports the module that calls this.
+
+    Raises:
+        ValueError: the name is taken, or two rows of it have the same name.
+    """
+    names = [row.name for row in experiment.rows]
+    if experiment.name in (*EXPERIMENTS, "all", "list"):
+        raise ValueError(f"there is an experiment {experiment.name!r} already")
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"the rows of an experiment need different names (`tag` makes them so), got {names}")
+    EXPERIMENTS[experiment.name] = experiment
 
 
 def find_rows(experiment: Experiment, names: list[str]) -> tuple[Row, ...]:

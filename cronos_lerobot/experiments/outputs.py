@@ -81,29 +81,9 @@ def _settings(result: ExperimentResult) -> dict[str, Any]:
 
 def markdown(result: ExperimentResult, figures: Sequence[str]) -> str:
     """The page: what was run, the table, what the paper's text says, the figures, what is missing."""
-    experiment, options = result.experiment, result.options
-    steps = options.scale.steps[experiment.steps]
-    lines = [f"# {experiment.title}", "", f"{experiment.source} of the paper, repeated by `cronos-reproduce`."]
-    lines += [
-        f"{experiment.scene}, {options.obs_type}, {steps:,} interaction steps ({options.scale.name} scale),"
-        f" sampling temperature {options.temperature} in evaluations.",
-        "",
-        *_table(_main_columns(result)),
-        "",
-        "Numbers are mean ± standard deviation (ddof = 1) over the seeds that are finished; in brackets the 95 %"
-        " percentile bootstrap interval of the mean over seeds. n: episodes of one seed's evaluation. D and C are"
-        " the areas between the curve and 1.0 over interaction steps and over interventions (Equations 3 and 4),"
-        " divided by the length of the axis: smaller is better.",
-        "",
-        f"The paper's numbers: {paper_results()['_source']} Another simulator, another policy and another base:"
-        " compare the order of the rows, not the numbers.",
-    ]
-    if steps != experiment.steps:
-        lines += [
-            "",
-            f"These runs have {steps:,} of the paper's {experiment.steps:,} steps and as many fewer interventions:"
-            f" multiply them by {experiment.steps / steps:.1f} to compare.",
-        ]
+    lines = [*_introduction(result), "", *_table(_main_columns(result)), "", NOTES]
+    if result.experiment.source:
+        lines += _about_the_paper(result)
     lines += _section("Success after so many interventions", _budget_columns(result))
     lines += _section("What the text says", _claim_columns(tables.claim_rows(result)))
     lines += _section("Sequences of tasks", _sequential_columns(tables.sequential_rows(result)))
@@ -112,6 +92,41 @@ def markdown(result: ExperimentResult, figures: Sequence[str]) -> str:
         lines += ["", f"![{file}]({file})"]
     lines += _unfinished(result)
     return "\n".join(lines) + "\n"
+
+
+NOTES = (
+    "Numbers are mean ± standard deviation (ddof = 1) over the seeds that are finished; in brackets the 95 %"
+    " percentile bootstrap interval of the mean over seeds. n: episodes of one seed's evaluation. D and C are the"
+    " areas between the curve and 1.0 over interaction steps and over interventions (Equations 3 and 4), divided"
+    " by the length of the axis: smaller is better."
+)
+
+
+def _introduction(result: ExperimentResult) -> list[str]:
+    experiment, options = result.experiment, result.options
+    lines = [f"# {experiment.title}", ""]
+    if experiment.source:
+        lines += [f"{experiment.source} of the paper, repeated by `cronos-reproduce`.", ""]
+    steps = options.scale.steps[experiment.steps]
+    text = f"{experiment.scene}, {options.obs_type}, {steps:,} interaction steps ({options.scale.name} scale),"
+    return [*lines, f"{text} sampling temperature {options.temperature} in evaluations."]
+
+
+def _about_the_paper(result: ExperimentResult) -> list[str]:
+    paper_steps = result.experiment.steps
+    steps = result.options.scale.steps[paper_steps]
+    lines = [
+        "",
+        f"The paper's numbers: {paper_results()['_source']} Another simulator, another policy and another base:"
+        " compare the order of the rows, not the numbers.",
+    ]
+    if steps != paper_steps:
+        lines += [
+            "",
+            f"These runs have {steps:,} of the paper's {paper_steps:,} steps and as many fewer interventions:"
+            f" multiply them by {paper_steps / steps:.1f} to compare.",
+        ]
+    return lines
 
 
 Columns = dict[str, list[str]]
@@ -126,6 +141,8 @@ def _main_columns(result: ExperimentResult) -> Columns:
     for name, title in (("task_order", "order"), ("configurations", "configurations")):
         if len({row[name] for row in rows}) > 1:
             columns[title] = [str(row[name]) for row in rows]
+    if any(row.row.tag for row in result.rows):
+        columns["row"] = [row.row.tag or MISSING for row in result.rows]
     for split in result.experiment.splits:
         suffix = "" if len(result.experiment.splits) == 1 else f", {split.replace('_', '-')}"
         summaries = [row.success(split) for row in result.rows]

@@ -117,12 +117,15 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
         "--tensorboard=false",
         f"--output_dir={spec.train_folder}",
     ]
-    given = {flag.split("=")[0] for flag in options.extra}
-    command = [flag for flag in command if flag.split("=")[0] not in given] + list(options.extra)
+    # What is given last wins: the row's own flags, then those of the command line.
+    for flags in (spec.row.flags, options.extra):
+        given = {flag.split("=")[0] for flag in flags}
+        command = [flag for flag in command if flag.split("=")[0] not in given] + list(flags)
 
     def resume() -> list[str] | None:
         config = spec.train_folder / LAST_POLICY / TRAIN_CONFIG_NAME
-        return ["cronos-train", "--resume=true", f"--config_path={config}"] if config.is_file() else None
+        plugins = [flag for flag in command if "discover_packages_path" in flag]
+        return ["cronos-train", "--resume=true", f"--config_path={config}", *plugins] if config.is_file() else None
 
     return Job(
         spec.name,
@@ -140,7 +143,7 @@ def evaluation_jobs(spec: RunSpec, evaluation: CheckpointEvaluation) -> list[Job
     for checkpoint in spec.checkpoints if evaluation.every_checkpoint else [spec.steps]:
         for split in evaluation.splits:
             folder = spec.evaluation_folder(evaluation.suite, split, checkpoint)
-            videos = int(checkpoint == spec.steps and not spec.options.scale.smoke)
+            videos = int(evaluation.suite == "sequential" and not spec.options.scale.smoke)
             policy = str(spec.policy(checkpoint))
             command = eval_command(policy, spec.scene, evaluation.suite, split, folder, spec.options, videos)
             jobs.append(_eval_job(f"{spec.name}/{folder.name}", command, folder, spec.name))

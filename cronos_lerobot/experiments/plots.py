@@ -10,13 +10,12 @@ from matplotlib.ticker import MaxNLocator
 
 from cronos_lerobot.experiments.definitions import INTERACTION_STEPS
 from cronos_lerobot.experiments.results import ExperimentResult, RowResult, paper_results, sequential
-from cronos_lerobot.report.figures import COLORS, INK, draw_curve, style_axes
+from cronos_lerobot.report.figures import COLORS, INK, SPLIT_LABELS, draw_curve, style_axes
 from cronos_lerobot.report.series import Curve, mean_curve, segment_rates
 
 AXIS_LABELS = {INTERACTION_STEPS: "interaction steps, all streams", "interventions": "interventions, all streams"}
 Panel = tuple[str, str, str | None]
 """Split, axis and task (None: all together) of one set of axes."""
-SPLIT_LABELS = {"train": "training configurations", "held_out": "held-out configurations"}
 
 
 def row_curve(row: RowResult, split: str, axis: str, task: str | None = None) -> Curve | None:

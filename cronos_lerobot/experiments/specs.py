@@ -127,8 +127,9 @@ def base_policy(scene: str, options: Options) -> str:
 
 def base_evaluation_folder(scene: str, suite: str, split: str, options: Options) -> Path:
     """`--output_dir` of an evaluation of the base policy."""
-    folder = base_folder(scene, options)
     if options.policy_path:
         given = hashlib.sha256(options.policy_path.encode()).hexdigest()[:8]
         folder = options.root / "base" / f"{scene}_{OBS_NAMES[options.obs_type]}_{given}"
+    else:
+        folder = base_folder(scene, options)
     return folder / f"{suite}_{split}{'_smoke' if options.scale.smoke else ''}"

@@ -21,6 +21,7 @@ from cronos_lerobot.report.series import (
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")
 """Okabe and Ito's palette: told apart by the colour-blind too."""
+SPLIT_LABELS = {"train": "training configurations", "held_out": "held-out configurations"}
 INK, GRID = "#333333", "#e4e4e4"
 PPO_PANELS = (
     ("KL divergence per update [nats]", "approx_kl"),
@@ -43,7 +44,7 @@ def evaluation_figure(groups: list[Group]) -> Figure | None:
         style_axes(ax, f"{axis.replace('_', ' ')}, all streams")
         ax.set_ylim(0, 1.02)
     axes[0].set_ylabel("evaluation success")
-    _legend(axes[0], groups)
+    _legend(figure, axes[0], groups)
     return figure
 
 
@@ -55,7 +56,7 @@ def training_figure(groups: list[Group]) -> Figure | None:
         draw_curve(ax, update_curve(group, lambda update: update["rollout"]["success"]), i, _label(group))
     style_axes(ax, "interaction steps, all streams")
     ax.set(ylabel="success of training segments", ylim=(0, 1.02))
-    _legend(ax, groups)
+    _legend(figure, ax, groups)
     return figure if ax.lines else None
 
 
@@ -74,7 +75,7 @@ def segments_figure(groups: list[Group]) -> Figure | None:
     style_axes(ax, "segment since the last scene reset (1 is the first after it)")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set(ylabel="success of training segments", ylim=(0, 1.02))
-    _legend(ax, groups)
+    _legend(figure, ax, groups)
     return figure if ax.lines else None
 
 
@@ -112,7 +113,7 @@ def ppo_figure(groups: list[Group]) -> Figure | None:
             draw_curve(ax, update_curve(group, value), i, _label(group), width=1.2)
         style_axes(ax, "")
         ax.set_title(title, fontsize=9, color=INK, loc="left")
-    _legend(axes[0], groups)
+    _legend(figure, axes[0], groups)
     return figure if any(ax.lines for ax in axes) else None
 
 
@@ -163,6 +164,12 @@ def _thousands(x: float, _: Any) -> str:
     return f"{x / 1e3:g}k" if abs(x) >= 1e4 else f"{x:g}"
 
 
-def _legend(ax: Axes, groups: list[Group]) -> None:
-    if len(groups) > 1 or any(len(group.runs) > 1 for group in groups):
-        ax.legend(fontsize=8, frameon=False, loc="best")
+def _legend(figure: Figure, ax: Axes, groups: list[Group]) -> None:
+    """A legend below the panels, where it covers nothing, if there is anything to tell apart."""
+    handles, labels = ax.get_legend_handles_labels()
+    if not handles or (len(groups) < 2 and len(groups[0].runs) < 2):
+        return
+    columns = 2 if len(labels) > 3 else max(1, len(labels))
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=8, frameon=False)
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(width, height + 0.22 * -(-len(labels) // columns))

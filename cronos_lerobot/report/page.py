@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 import jinja2
 from matplotlib.figure import Figure
 
-from cronos_lerobot.report import clips, figures, tables
+from cronos_lerobot.report import clips, figures, suite_views, tables
 from cronos_lerobot.report.runs import (
     Comparison,
     EvaluationRun,
@@ -23,6 +23,7 @@ from cronos_lerobot.report.runs import (
     compare_training,
     group_runs,
 )
+from cronos_lerobot.report.suites import SuiteRun
 
 PAGE = "index.html"
 DPI = 150
@@ -69,6 +70,8 @@ class Report:
     after: list[EvaluationRun]
     videos: list[Path]
     title: str
+    suites: list[SuiteRun] = field(default_factory=list)
+    """Those of `cronos-eval`."""
 
     @property
     def comparisons(self) -> list[Comparison]:
@@ -83,6 +86,9 @@ def write_report(report: Report, output: Path) -> Path:
     all_evaluations = report.before + report.after + report.evaluations
     rows = {
         "gains": tables.gain_rows(report.comparisons),
+        "seeds": tables.seed_rows(groups),
+        "independent": suite_views.independent_rows(report.suites),
+        "sequential": suite_views.sequential_rows(report.suites),
         "lerobot_eval": tables.lerobot_eval_rows(all_evaluations),
         "evaluations": tables.evaluation_rows(groups),
         "updates": tables.update_rows(groups),
@@ -96,12 +102,17 @@ def write_report(report: Report, output: Path) -> Path:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("cronos_lerobot.report", "."), autoescape=True, trim_blocks=True
     )
-    environment.filters |= {"cell": _cell, "percent": lambda x: f"{100 * x:.1f}"}
+    environment.filters |= {
+        "cell": _cell,
+        "percent": lambda x: f"{100 * x:.1f}",
+        "merged": tables.merge_statistics,
+    }
     page = environment.get_template("page.html.j2").render(
         title=report.title,
         time=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
         comparisons=report.comparisons,
         figures=_draw_figures(groups, output),
+        suite_figures=_draw_suites(report.suites, output),
         tables={name: table for name, table in rows.items() if table},
         clip_rows=_clip_rows(report, output),
         manifests=[(run.name, json.dumps(run.starts, indent=2)) for run in report.training if run.starts],
@@ -124,17 +135,27 @@ def _draw_figures(groups: list[Group], output: Path) -> list[dict[str, str]]:
         figure = draw(groups)
         if figure is None:
             continue
-        buffer = BytesIO()
-        figure.savefig(buffer, format="png", dpi=DPI)
-        (output / f"{name}.png").write_bytes(buffer.getvalue())
-        url = clips.data_url(buffer.getvalue(), "image/png")
-        drawn.append({"title": title, "caption": caption, "url": url})
+        drawn.append({"title": title, "caption": caption, "url": _write_png(figure, output / f"{name}.png")})
     return drawn
+
+
+def _draw_suites(suites: list[SuiteRun], output: Path) -> list[str]:
+    figure = suite_views.sequential_figure(suites)
+    return [] if figure is None else [_write_png(figure, output / "sequential.png")]
+
+
+def _write_png(figure: Figure, path: Path) -> str:
+    """Write a figure; returns it as a data URL."""
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    path.write_bytes(buffer.getvalue())
+    return clips.data_url(buffer.getvalue(), "image/png")
 
 
 def _clip_rows(report: Report, output: Path) -> list[list[dict[str, Any]]]:
     """Rows of videos, each with a data URL, or with the path of the file if it is too large."""
     singles = clips.file_clips(report.videos) + clips.evaluation_clips(report.evaluations)
+    singles += suite_views.suite_clips(report.suites)
     pairs = clips.comparison_clips(report.before, report.after)
     rows = [*((clip,) for clip in singles), *pairs]
     embedder = clips.Embedder()

@@ -12,7 +12,9 @@ from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from lerobot_env_cronos.scenes import SCENES
 
+from cronos_lerobot.evaluation.store import RESULTS
 from cronos_lerobot.report.statistics import Gain, Rate
+from cronos_lerobot.report.suites import SuiteRun, is_results, read_suite_runs
 from cronos_lerobot.training.logging import MANIFEST, METRICS
 
 EVAL_INFO = "eval_info.json"
@@ -22,6 +24,15 @@ NOT_THE_EXPERIMENT = (
     "save_freq", "save_checkpoint", "keep_checkpoints",
 )  # fmt: skip
 """Top-level fields of a training config in which two runs of one experiment may differ."""
+
+DESCRIBED = tuple(
+    f"protocol.{name}"
+    for name in (
+        "scene_reset_interval", "curriculum", "end_effector_reset", "learned_reset", "heuristic_reset",
+        "extra_resets", "task_order", "num_configurations",
+    )
+)  # fmt: skip
+"""Fields that `describe_protocol` puts into words."""
 
 Evaluation = dict[str, Any]
 Update = dict[str, Any]
@@ -40,8 +51,9 @@ class TrainingRun:
 
     @property
     def name(self) -> str:
-        """The folder's name."""
-        return self.folder.resolve().name
+        """The folder's name, with those above it where all runs have the same (`cronos-reproduce`: row/seed)."""
+        folder = self.folder.resolve()
+        return "/".join(folder.parts[-3:-1]) if folder.name == "train" else folder.name
 
     @property
     def seed(self) -> int | None:
@@ -113,14 +125,15 @@ def sum_rates(rates: Iterable[Rate]) -> Rate:
     return total
 
 
-def find_runs(folders: Iterable[Path]) -> tuple[list[TrainingRun], list[EvaluationRun]]:
-    """Read the runs in `folders` and below them, each once.
+def find_runs(folders: Iterable[Path]) -> tuple[list[TrainingRun], list[EvaluationRun], list[SuiteRun]]:
+    """Read the runs of cronos-train, lerobot-eval and cronos-eval in `folders` and below them, each once.
 
     Raises:
         FileNotFoundError: a folder is missing or holds no run.
     """
     training: dict[Path, TrainingRun] = {}
     evaluation: dict[Path, list[EvaluationRun]] = {}
+    suites: list[Path] = []
     for folder in folders:
         found = False
         for path in _files(folder, METRICS):
@@ -129,11 +142,15 @@ def find_runs(folders: Iterable[Path]) -> tuple[list[TrainingRun], list[Evaluati
         for path in _files(folder, EVAL_INFO):
             evaluation.setdefault(path.resolve(), read_evaluation_runs(path.parent))
             found = True
-        if not found:
+        results = [path for path in _files(folder, RESULTS) if is_results(path)]
+        suites += results
+        if not found and not results:
             raise FileNotFoundError(
-                f"{folder} has no {METRICS} of cronos-train and no {EVAL_INFO} of lerobot-eval."
+                f"{folder} has no {METRICS} of cronos-train, no {RESULTS} of cronos-eval and no {EVAL_INFO} of"
+                " lerobot-eval."
             )
-    return list(training.values()), [run for runs in evaluation.values() for run in runs]
+    evaluations = [run for runs in evaluation.values() for run in runs]
+    return list(training.values()), evaluations, read_suite_runs(suites)
 
 
 def _files(folder: Path, name: str) -> Iterator[Path]:
@@ -164,7 +181,10 @@ def read_training_run(folder: Path) -> TrainingRun:
 
 def _read_config(folder: Path, starts: list[dict[str, Any]]) -> dict[str, Any]:
     if starts:
-        return starts[-1]["config"]
+        config = starts[-1]["config"]
+        # A resumed run names its own checkpoint; what it began with is the experiment.
+        first = starts[0]["config"]
+        return config | {"policy": first["policy"]} if "policy" in first else config
     path = folder / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME
     return json.loads(path.read_text()) if path.is_file() else {}
 
@@ -201,10 +221,32 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
         flat[key] = _flatten(experiment)
     names = sorted({name for config in flat.values() for name in config})
     differing = [name for name in names if len({config.get(name) for config in flat.values()}) > 1]
-    if len(groups) > 1 and 0 < len(differing) <= 3:
-        for key, group in groups.items():
-            group.label = ", ".join(f"{name.split('.')[-1]}={flat[key].get(name)}" for name in differing)
+    others = [name for name in differing if name not in DESCRIBED]
+    for key, group in groups.items() if differing and len(others) <= 3 else ():
+        protocol = describe_protocol(group.runs[0].config["protocol"]) if others != differing else ""
+        group.label = ", ".join(filter(None, (protocol, _name_values(flat[key], others))))
     return list(groups.values())
+
+
+def _name_values(config: dict[str, str], names: list[str]) -> str:
+    return ", ".join(f"{name.split('.')[-1]}={config.get(name)}" for name in names)
+
+
+def describe_protocol(protocol: dict[str, Any]) -> str:
+    """A protocol as the paper's Table 1 calls it, such as `T = 1280, EER, CL, HSR`.
+
+    Args:
+        protocol: of a training config.
+    """
+    words = [f"T = {protocol.get('scene_reset_interval')}"]
+    ticks = {"EER": "end_effector_reset", "CL": "curriculum", "LSR": "learned_reset", "HSR": "heuristic_reset"}
+    words += [word for word, name in ticks.items() if protocol.get(name)]
+    words += protocol.get("extra_resets") or []
+    if protocol.get("task_order", "heuristic") != "heuristic":
+        words.append(f"{protocol['task_order']} order")
+    if protocol.get("num_configurations", 64) != 64:
+        words.append(f"{protocol['num_configurations']} configuration(s)")
+    return ", ".join(words)
 
 
 def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, str]:

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from cronos_lerobot.metrics import performance_gap, success_at, summarise
 from cronos_lerobot.report.runs import Comparison, EvaluationRun, Group, TrainingRun, evaluation_rates
 from cronos_lerobot.report.statistics import Gain, Rate
 
@@ -36,6 +37,42 @@ def _gain_columns(gain: Gain) -> Row:
     low, high = gain.interval
     ends = {"gain": gain.value, "gain_ci95_low": low, "gain_ci95_high": high}
     return rate_columns(gain.before, "before_") | rate_columns(gain.after, "after_") | ends
+
+
+def seed_rows(groups: Iterable[Group]) -> list[Row]:
+    """What the seeds of each group came to, up to the last step that all of them have reached.
+
+    Success, interventions, and the areas D and C divided by the lengths of their axes.
+    """
+    rows = []
+    for group in groups:
+        curves = [run.evaluations for run in group.runs if len(run.evaluations) > 1]
+        if not curves:
+            continue
+        end = min(curve[-1]["interaction_steps"] for curve in curves)
+        steps = [[e["interaction_steps"] for e in curve] for curve in curves]
+        success = [[e["success"] for e in curve] for curve in curves]
+        spent = [[e["interventions"] for e in curve] for curve in curves]
+        at_end = [success_at(x, y, end) for x, y in zip(steps, spent, strict=True)]
+        by_steps = [performance_gap(x, y, end).normalised for x, y in zip(steps, success, strict=True)]
+        by_resets = [
+            performance_gap(x, y, up_to).normalised for x, y, up_to in zip(spent, success, at_end, strict=True)
+        ]
+        row: Row = {"runs": group.label, "seeds": len(curves), "split": curves[0][-1]["split"]}
+        row |= {"n": curves[0][-1]["n"], "interaction_steps": end}
+        row |= _summary_columns("success", [success_at(x, y, end) for x, y in zip(steps, success, strict=True)])
+        row |= _summary_columns("interventions", at_end)
+        row |= _summary_columns("D / steps", by_steps) | _summary_columns("C / interventions", by_resets)
+        rows.append(row)
+    return rows
+
+
+def _summary_columns(name: str, values: list[float]) -> Row:
+    summary = summarise(values)
+    if summary is None:
+        return {name: None, f"{name} std": None, f"{name} ci95_low": None, f"{name} ci95_high": None}
+    low, high = summary.ci95 or (None, None)
+    return {name: summary.mean, f"{name} std": summary.std, f"{name} ci95_low": low, f"{name} ci95_high": high}
 
 
 def lerobot_eval_rows(runs: Iterable[EvaluationRun]) -> list[Row]:
@@ -126,6 +163,23 @@ def speed_rows(groups: Iterable[Group]) -> list[Row]:
 
 def _identity(group: Group, run: TrainingRun) -> Row:
     return {"runs": group.label, "run": run.name, "seed": run.seed}
+
+
+def merge_statistics(rows: list[Row]) -> list[Row]:
+    """For reading: a number, its `std` and its `ci95_low` and `ci95_high` in one cell instead of four."""
+    merged = []
+    for row in rows:
+        cells: Row = {}
+        for name, value in row.items():
+            if name.endswith((" std", " ci95_low", " ci95_high")):
+                continue
+            std, low, high = (row.get(f"{name} {part}") for part in ("std", "ci95_low", "ci95_high"))
+            if isinstance(value, float) and (std, low) != (None, None):
+                text = f"{value:.4g}" + (f" ± {std:.2g}" if std is not None else "")
+                value = text + (f" [{low:.4g}, {high:.4g}]" if low is not None and high is not None else "")
+            cells[name] = value
+        merged.append(cells)
+    return merged
 
 
 def write_csv(path: Path, rows: list[Row]) -> None:

@@ -11,8 +11,8 @@ from cronos_lerobot.report.runs import EvaluationRun, find_runs
 from cronos_lerobot.report.tables import comparison_text
 
 EPILOG = """\
-DIR is a run folder of cronos-train, an output folder of lerobot-eval, or any folder above such ones. Runs that
-differ in nothing but the seed are drawn as one line, their mean and standard deviation.
+DIR is a run folder of cronos-train, an output folder of cronos-eval or lerobot-eval, or any folder above such
+ones. Runs that differ in nothing but the seed are drawn as one line, their mean and standard deviation.
 
 examples:
   one run while it trains, or after it
@@ -21,6 +21,8 @@ examples:
       cronos-report outputs/train/episodic_* outputs/train/eer_* --output=report
   what a training came to, measured by lerobot-eval on both splits, with videos side by side
       cronos-report outputs/train/eer --before outputs/eval/base_* --after outputs/eval/eer_*
+  all runs of an experiment
+      cronos-reproduce table1 --scale=small; cronos-report outputs/reproduce/runs/kitchen_2x2_state_small
 
 OUTPUT/index.html contains everything and can be sent as it is; figures (PNG) and tables (CSV) lie beside it.
 """
@@ -60,14 +62,14 @@ def make_report(
     Raises:
         FileNotFoundError: a folder holds no run, or a video is missing.
     """
-    training, evaluations = find_runs(runs)
+    training, evaluations, suites = find_runs(runs)
     old, new = _evaluations(before or []), _evaluations(after or [])
     paired = {run.folder.resolve() for run in old + new}
     rest = [run for run in evaluations if run.folder.resolve() not in paired]
     for video in videos or []:
         if not video.is_file():
             raise FileNotFoundError(f"No video {video}.")
-    return Report(training, rest, old, new, videos or [], title)
+    return Report(training, rest, old, new, videos or [], title, suites)
 
 
 def _evaluations(folders: list[Path]) -> list[EvaluationRun]:

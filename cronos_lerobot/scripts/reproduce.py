@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Iterable
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -101,9 +102,18 @@ def make_parser() -> argparse.ArgumentParser:
         "--root", type=Path, default=ROOT, help=f"holds base policies and runs, shared by all (default: {ROOT})"
     )
     parser.add_argument("--output_dir", type=Path, help="tables and figures (default: ROOT/EXPERIMENT_SCALE_OBS)")
+    parser.add_argument("--import", action="append", metavar="MODULE", help="register the experiments of a module")
     parser.add_argument("--dry_run", action="store_true", help="print the commands and their state; run nothing")
     parser.add_argument("--report_only", action="store_true", help="draw what there is; run nothing")
     return parser
+
+
+def import_modules(arguments: list[str]) -> None:
+    """Import the modules of --import, so that the parser knows their experiments."""
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early.add_argument("--import", action="append", dest="modules", default=[])
+    for module in early.parse_known_args(arguments)[0].modules:
+        import_module(module)
 
 
 def parse_seeds(text: str | None, default: int) -> tuple[int, ...]:
@@ -141,7 +151,8 @@ def make_options(args: argparse.Namespace, extra: list[str], scenes: Iterable[st
     }
     if "clone_steps" in changes:
         changes.setdefault("checkpoint", changes["clone_steps"])
-    recipes = {scene: replace(base_recipe(scale, scene, obs_type), **changes) for scene in scenes}
+    needed = () if args.policy_path else scenes
+    recipes = {scene: replace(base_recipe(scale, scene, obs_type), **changes) for scene in needed}
     seeds = parse_seeds(args.seeds, scale.seeds)
     from cronos_lerobot.experiments.specs import Options
 
@@ -161,7 +172,7 @@ def make_options(args: argparse.Namespace, extra: list[str], scenes: Iterable[st
 def print_list() -> None:
     """Print the experiments and their rows."""
     for experiment in EXPERIMENTS.values():
-        print(f"{experiment.name}: {experiment.title} ({experiment.source})")
+        print(f"{experiment.name}: {experiment.title}{f' ({experiment.source})' if experiment.source else ''}")
         print(f"    {experiment.scene}, {experiment.steps:,} steps at --scale=paper")
         for row in experiment.rows:
             print(f"    {row.name:<24} {row.label}")
@@ -199,8 +210,9 @@ def write_reports(chosen: list[tuple[Experiment, tuple[Row, ...]]], options: Opt
 
 def main() -> None:
     """Entry point of `cronos-reproduce`."""
-    parser = make_parser()
     split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
+    import_modules(sys.argv[1:split])
+    parser = make_parser()
     args = parser.parse_args(sys.argv[1:split])
     if args.experiment == "list":
         print_list()
@@ -227,7 +239,8 @@ def main() -> None:
         except KeyboardInterrupt:
             sys.exit("\ninterrupted: the same command goes on from here")
     write_reports(chosen, options, args.output_dir)
-    sys.exit(0 if done else 1)
+    if not done:
+        sys.exit(1)
 
 
 if __name__ == "__main__":

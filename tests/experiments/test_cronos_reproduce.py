@@ -4,9 +4,11 @@ import json
 import shutil
 import subprocess
 import sys
+import textwrap
 
 import pytest
 
+from cronos_lerobot.experiments import definitions
 from cronos_lerobot.scripts import reproduce as script
 
 ROWS = ("t80", "t1280_eer_cl_hsr")
@@ -121,3 +123,33 @@ def test_own_recipe_of_the_base_policy():
 def test_starting_to_explain_takes_no_pytorch():
     code = "import sys; import cronos_lerobot.scripts.reproduce; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_own_experiment(tmp_path, monkeypatch, capsys):
+    module = """
+    from cronos_lerobot.experiments import Experiment, Row, register_experiment
+    from cronos_lerobot.experiments.definitions import EXPERIMENTS
+    flags = ("--protocol.extra_resets=[stuck]", "--protocol.update_interval=320")
+    rows = (Row(1280, end_effector_reset=True), Row(1280, end_effector_reset=True, tag="stuck", flags=flags))
+    register_experiment(Experiment("stuck", "Resetting stuck scenes", rows))
+    """
+    (tmp_path / "my_experiments.py").write_text(textwrap.dedent(module))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(definitions, "EXPERIMENTS", dict(definitions.EXPERIMENTS))
+    monkeypatch.setattr(script, "EXPERIMENTS", definitions.EXPERIMENTS)
+    flags = ["stuck", "--import=my_experiments", "--policy.path=me/policy", "--seeds=1", f"--root={tmp_path}"]
+    call(monkeypatch, *flags, "--dry_run")
+    plain, stuck = capsys.readouterr().out.split("# kitchen_2x2_state_small/")[1:]
+    assert plain.startswith("t1280_eer_307k/seed1")
+    assert stuck.startswith("t1280_eer_stuck_307k/seed1")
+    assert "extra_resets" not in plain
+    assert "--protocol.extra_resets=[stuck]" in stuck
+    # A flag of the row replaces the experiment's.
+    assert stuck.count("update_interval") == 1
+    assert "update_interval=320" in stuck
+    call(monkeypatch, *flags, "--report_only")
+    assert "1 of 1 seeds not begun" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="need different names"):
+        definitions.register_experiment(definitions.Experiment("twice", "", (definitions.Row(80),) * 2))
+    with pytest.raises(ValueError, match="'table1' already"):
+        definitions.register_experiment(definitions.Experiment("table1", "", (definitions.Row(80),)))

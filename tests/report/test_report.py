@@ -14,7 +14,8 @@ from cronos_lerobot.report.page import write_report
 from cronos_lerobot.report.runs import find_runs, group_runs
 from cronos_lerobot.report.series import evaluation_curve, segment_history, segment_rates
 from cronos_lerobot.report.statistics import Gain, Rate, newcombe_interval
-from cronos_lerobot.report.tables import comparison_text, speed_rows
+from cronos_lerobot.report.suites import policy_name
+from cronos_lerobot.report.tables import comparison_text, merge_statistics, seed_rows, speed_rows
 from cronos_lerobot.scripts.report import make_report
 
 
@@ -46,7 +47,7 @@ def test_gain_of_nothing_covers_zero():
 def test_runs_are_found_below_a_folder_once(tmp_path):
     run = write_training_run(tmp_path / "all/train/a")
     write_evaluation(tmp_path / "all/eval/held_out", "independent_held_out")
-    training, evaluations = find_runs([tmp_path / "all", run])
+    training, evaluations, _ = find_runs([tmp_path / "all", run])
     assert [r.name for r in training] == ["a"]
     assert [(e.suite, e.overall) for e in evaluations] == [("independent_held_out", Rate(10, 32))]
     assert evaluations[0].tasks[INSTRUCTIONS[3]] == Rate(4, 8)
@@ -58,7 +59,7 @@ def test_unfinished_last_line_is_skipped(tmp_path):
     run = write_training_run(tmp_path / "a")
     with (run / "metrics.jsonl").open("a") as file:
         file.write('{"kind": "upd')
-    (read,), _ = find_runs([run])
+    (read,), *_ = find_runs([run])
     assert (len(read.updates), len(read.evaluations)) == (8, 3)
 
 
@@ -67,7 +68,7 @@ def test_groups_differ_in_more_than_the_seed_and_are_called_so(tmp_path):
         for seed in (0, 1):
             write_training_run(tmp_path / f"{interval}_{seed}", seed=seed, interval=interval)
     groups = group_runs(find_runs([tmp_path])[0])
-    assert [group.label for group in groups] == ["scene_reset_interval=160", "scene_reset_interval=320"]
+    assert [group.label for group in groups] == ["T = 160", "T = 320"]
     assert [[run.seed for run in group.runs] for group in groups] == [[0, 1], [0, 1]]
 
 
@@ -163,6 +164,114 @@ def test_csv_files_hold_every_number(report_folder):
     assert sum(int(row["n"]) for row in read_csv(folder / "segments.csv")) == 8 * 16
     (interventions,) = read_csv(folder / "interventions.csv")
     assert (interventions["scene_reset"], interventions["initial"]) == ("32", "8")
+
+
+def test_seeds_together_end_where_all_have_been(tmp_path):
+    write_training_run(tmp_path / "a", seed=0, interval=160, successes=(2, 4, 6))
+    write_training_run(tmp_path / "b", seed=1, interval=160, successes=(2, 6, 8))
+    # The second run is killed half way.
+    lines = (tmp_path / "b/metrics.jsonl").read_text().splitlines(keepends=True)
+    (tmp_path / "b/metrics.jsonl").write_text("".join(lines[:6]))
+    (row,) = seed_rows(group_runs(find_runs([tmp_path])[0]))
+    assert (row["seeds"], row["interaction_steps"], row["interventions"]) == (2, 5120, 32)
+    assert (row["success"], row["success ci95_low"], row["success ci95_high"]) == (0.625, 0.5, 0.75)
+    # Gaps .75 to .5 and .75 to .25: on average .625 and .5, over steps and over resets alike.
+    assert row["D / steps"] == pytest.approx((0.625 + 0.5) / 2)
+    assert row["C / interventions"] == pytest.approx(row["D / steps"])
+    assert row["D / steps std"] == pytest.approx(0.125 / 2**0.5)
+    (merged,) = merge_statistics([row])
+    assert merged["success"] == "0.625 ± 0.18 [0.5, 0.75]"
+    assert "success std" not in merged
+
+
+def test_many_differences_of_the_protocol_are_put_as_the_paper_does(tmp_path):
+    for name, interval, changes in (
+        ("a", 160, {}),
+        ("b", 320, {"end_effector_reset": True, "curriculum": [[640, 160]], "heuristic_reset": True}),
+        ("c", 320, {"end_effector_reset": True, "task_order": "random", "num_configurations": 1}),
+    ):
+        manifest = write_training_run(tmp_path / name, interval=interval) / "manifest.json"
+        content = json.loads(manifest.read_text())
+        content["starts"][0]["config"]["protocol"] |= changes
+        manifest.write_text(json.dumps(content))
+    labels = [group.label for group in group_runs(find_runs([tmp_path])[0])]
+    assert labels == ["T = 160", "T = 320, EER, CL, HSR", "T = 320, EER, random order, 1 configuration(s)"]
+
+
+def test_resumed_run_stays_in_its_group(tmp_path):
+    for name in "ab":
+        manifest = write_training_run(tmp_path / name, seed=ord(name)) / "manifest.json"
+        content = json.loads(manifest.read_text())
+        (first,) = content["starts"]
+        first["config"]["policy"] = {"pretrained_path": "base"}
+        resumed = json.loads(json.dumps(first))
+        resumed["config"]["policy"]["pretrained_path"] = "a/checkpoints/last"
+        content["starts"] += [resumed] if name == "b" else []
+        manifest.write_text(json.dumps(content))
+    assert len(group_runs(find_runs([tmp_path])[0])) == 1
+
+
+def write_results(folder, policy, content, **settings):
+    folder.mkdir(parents=True)
+    head = {"format": 1, "policy": policy, "temperature": 0.6, "scene": "kitchen_2x2"} | settings
+    (folder / "results.json").write_text(json.dumps(head | content))
+
+
+def rate(success, n=64, std=0.1):
+    return {"success": success, "n": n, "ci95": [max(0, success - 0.1), min(1, success + 0.1)], "std": std}
+
+
+def chains(successes):
+    length = {"mean": sum(successes), "std": 0.2, "ci95": [0.5, 2.5]}
+    return {"n": 640, "positions": [rate(s, 640) for s in successes], "average_chain_length": length}
+
+
+def test_results_of_cronos_eval(tmp_path):
+    """Both suites, in a folder each, of one policy; another temperature is another evaluation."""
+    policy = "outputs/train/eer/checkpoints/0010240/pretrained_model"
+    single = {"independent": {"train": rate(0.75) | {"per_task": {INSTRUCTIONS[0]: rate(0.5, 16)}}}}
+    write_results(tmp_path / "e/single", policy, single)
+    sequential = {"sequential": {"train": chains([0.75, 0.5]), "held_out": chains([0.25, 0.0])}}
+    video = {"path": "videos/a.mp4", "suite": "sequential", "split": "train", "kind": "good", "number": 3}
+    sequential["videos"] = [video | {"configuration": 7, "length": 2}]
+    write_results(tmp_path / "e/chains", policy, sequential)
+    (tmp_path / "e/chains/videos").mkdir()
+    (tmp_path / "e/chains/videos/a.mp4").write_bytes(b"a chain")
+    (tmp_path / "e/results.json").write_text('{"something": "else"}')
+    write_results(tmp_path / "greedy", policy, {"sequential": {"train": chains([1.0, 1.0])}}, temperature=0)
+    page = write_report(
+        make_report([tmp_path / "e/single", tmp_path / "e/chains"]), tmp_path / "report"
+    ).read_text()
+    rows = read_csv(tmp_path / "report/sequential.csv")
+    assert [(r["policy"], r["split"], r["SEQ 0"], r["SEQ 1"], r["chain length"], r["chains"]) for r in rows] == [
+        ("eer 0010240", "train", "0.75", "0.5", "1.25", "640"),
+        ("eer 0010240", "held_out", "0.25", "0.0", "0.25", "640"),
+    ]
+    rows = read_csv(tmp_path / "report/independent.csv")
+    assert [(r["task"], r["success"], r["n"]) for r in rows] == [
+        ("all tasks", "0.75", "64"),
+        (INSTRUCTIONS[0], "0.5", "16"),
+    ]
+    assert "1.25 ± 0.2 [0.5, 2.5]" in page
+    assert base64.b64encode(b"a chain").decode() in page
+    assert "eer 0010240, ordering 3, configuration 7: 2 done" in page
+    content = base64.b64encode((tmp_path / "report/sequential.png").read_bytes()).decode()
+    assert content in page
+    runs = find_runs([tmp_path / "e/chains", tmp_path / "greedy"])[2]
+    assert [run.name for run in runs] == ["eer 0010240 (temperature=0.6)", "eer 0010240 (temperature=0)"]
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/results.json").write_text("[]")
+    with pytest.raises(FileNotFoundError, match="cronos-eval"):
+        find_runs([tmp_path / "other"])
+
+
+def test_policies_in_short():
+    assert (
+        policy_name("out/runs/t80_1300k/seed1/train/checkpoints/0102400/pretrained_model")
+        == "t80_1300k/seed1 0102400"
+    )
+    assert policy_name("outputs/train/eer/checkpoints/last/pretrained_model") == "eer last"
+    assert policy_name("someone/policy") == "someone/policy"
 
 
 @pytest.mark.parametrize("intervals", [(160,), (160, 320), (160, 320, 640)])

@@ -1,0 +1,89 @@
+"""Tables, figure and videos of `cronos-eval`'s results."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cronos_lerobot.report.clips import Clip
+from cronos_lerobot.report.figures import COLORS, INK, SPLIT_LABELS, style_axes
+from cronos_lerobot.report.suites import SuiteRun
+
+MAX_DRAWN = len(COLORS)
+"""Evaluations in the figure, the first ones; the tables have all."""
+
+
+def independent_rows(runs: Iterable[SuiteRun]) -> list[dict[str, Any]]:
+    """Success of single tasks: a row for all of them together and one for each."""
+    rows = []
+    for run in runs:
+        for split, found in run.splits("independent").items():
+            for task, rate in {"all tasks": found, **found["per_task"]}.items():
+                low, high = rate["ci95"]
+                numbers = {"success": rate["success"], "n": rate["n"], "ci95_low": low, "ci95_high": high}
+                rows.append({"policy": run.name, "split": split, "task": task} | numbers)
+    return rows
+
+
+def sequential_rows(runs: Iterable[SuiteRun]) -> list[dict[str, Any]]:
+    """Success at each position of a chain, and the average chain length; `std` is over the orderings."""
+    rows = []
+    for run in runs:
+        for split, found in run.splits("sequential").items():
+            row: dict[str, Any] = {"policy": run.name, "split": split, "chains": found["n"]}
+            for k, position in enumerate(found["positions"]):
+                row |= {f"SEQ {k}": position["success"], f"SEQ {k} std": position["std"]}
+            length = found["average_chain_length"]
+            low, high = length["ci95"]
+            row |= {"chain length": length["mean"], "chain length std": length["std"]}
+            rows.append(row | {"chain length ci95_low": low, "chain length ci95_high": high})
+    return rows
+
+
+def sequential_figure(runs: Iterable[SuiteRun]) -> Figure | None:
+    """Success by position with 95 % intervals, a panel for each split."""
+    drawn = [run for run in runs if run.splits("sequential")][:MAX_DRAWN]
+    splits = list(dict.fromkeys(split for run in drawn for split in run.splits("sequential")))
+    if not splits:
+        return None
+    figure = Figure(figsize=(10, 3.8), layout="constrained")
+    axes = figure.subplots(1, len(splits), squeeze=False, sharey=True)[0]
+    for ax, split in zip(axes, splits, strict=True):
+        _draw_positions(ax, drawn, split)
+        ax.set_title(SPLIT_LABELS.get(split, split), fontsize=9, color=INK, loc="left")
+    axes[0].set_ylabel("success")
+    if len(drawn) > 1:
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8, frameon=False)
+    return figure
+
+
+def _draw_positions(ax: Axes, runs: list[SuiteRun], split: str) -> None:
+    width, number = 0.8 / len(runs), 0
+    for i, run in enumerate(runs):
+        positions = run.splits("sequential").get(split, {}).get("positions", [])
+        number = max(number, len(positions))
+        x = np.arange(len(positions)) + (i - (len(runs) - 1) / 2) * width
+        y = np.array([position["success"] for position in positions])
+        ends = np.array([position["ci95"] for position in positions]).reshape(-1, 2)
+        ax.bar(x, y, 0.92 * width, yerr=np.abs(ends - y[:, None]).T, color=COLORS[i], ecolor=INK, label=run.name)
+    style_axes(ax, "task in the sequence")
+    ax.set_xticks(range(number), [f"SEQ {k}" for k in range(number)])
+    ax.set_ylim(0, 1.02)
+
+
+def suite_clips(runs: Iterable[SuiteRun]) -> list[Clip]:
+    """The videos of all evaluations."""
+    clips = []
+    for run in runs:
+        for path, video in run.videos:
+            if path.is_file():
+                what = "ordering" if video["suite"] == "sequential" else "task"
+                title = f"{video['suite']}, {video['split'].replace('_', '-')}: {video['kind']}"
+                caption = f"{run.name}, {what} {video['number']}, configuration {video['configuration']}:"
+                clips.append(Clip(title, f"{caption} {video['length']} done", path))
+    return clips
