@@ -1,0 +1,55 @@
+"""docs/experiments.md says what the code does."""
+
+import re
+from pathlib import Path
+
+from cronos_lerobot.experiments.definitions import EXPERIMENTS
+from cronos_lerobot.experiments.scales import BASE_RECIPES, OBS_NAMES, SCALES
+from cronos_lerobot.scripts.reproduce import make_parser
+
+DOCS = (Path(__file__).parents[2] / "docs/experiments.md").read_text()
+
+
+def table_rows(heading):
+    """Cells of the rows of the table whose first column is called `heading`."""
+    lines = DOCS[DOCS.index(f"| {heading} |") :].split("\n\n")[0].splitlines()[2:]
+    return [[cell.strip(" `") for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_numbers_of_runs():
+    rows = {row[0]: row for row in table_rows("experiment")}
+    distinct = {scale: set() for scale in ("paper", "small")}
+    for name, experiment in EXPERIMENTS.items():
+        million, paper, small = rows[name][2], rows[name][3], rows[name][5]
+        assert million == f"{experiment.steps / 1e6:.1f} M"
+        for scale, number in (("paper", paper), ("small", small)):
+            assert int(number) == len(experiment.rows) * SCALES[scale].seeds
+            distinct[scale] |= {(experiment.scene, experiment.steps, row) for row in experiment.rows}
+    for scale, column in (("paper", 3), ("small", 5)):
+        assert int(rows["all"][column]) == len(distinct[scale]) * SCALES[scale].seeds
+    assert list(rows) == [*EXPERIMENTS, "all"]
+
+
+def test_scales():
+    for name, steps, seeds, streams, frequency, n in table_rows("scale"):
+        scale = SCALES[name]
+        assert (int(seeds), int(streams), int(n.split()[0])) == (scale.seeds, scale.num_envs, scale.eval_episodes)
+        assert int(frequency.split()[0].replace(",", "")) == scale.eval_freq
+        if name == "small":
+            assert [int(s.replace(",", "")) for s in steps.split(" and ")] == list(scale.steps.values())
+
+
+def test_recipes():
+    names = {(scene, short): recipe for (scene, obs), recipe in BASE_RECIPES.items() for short in [OBS_NAMES[obs]]}
+    section = DOCS[DOCS.index("| | demonstrations") :].split("\n\n")[0].splitlines()[2:]
+    assert len(section) == len(names)
+    for line in section:
+        scene, obs, *numbers = re.findall(r"\w+", line)
+        recipe = names[scene, obs]
+        assert [int(number) for number in numbers] == [recipe.demos, recipe.clone_steps, recipe.checkpoint]
+
+
+def test_every_flag_is_there():
+    flags = {flag for action in make_parser()._actions for flag in action.option_strings} - {"-h", "--help"}
+    documented = set(re.findall(r"`(--[\w.]+)`", DOCS[DOCS.index("## Flags") : DOCS.index("## Where")]))
+    assert documented == flags
