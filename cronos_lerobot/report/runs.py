@@ -20,8 +20,8 @@ from cronos_lerobot.training.logging import MANIFEST, METRICS
 EVAL_INFO = "eval_info.json"
 
 NOT_THE_EXPERIMENT = (
-    "seed", "output_dir", "job_name", "resume", "record", "wandb", "tensorboard", "torch_threads", "log_freq",
-    "save_freq", "save_checkpoint", "keep_checkpoints",
+    "seed", "steps", "output_dir", "job_name", "resume", "record", "wandb", "tensorboard", "torch_threads",
+    "log_freq", "save_freq", "save_checkpoint", "keep_checkpoints",
 )  # fmt: skip
 """Top-level fields of a training config in which two runs of one experiment may differ."""
 
