@@ -17,8 +17,8 @@ from cronos_lerobot.experiments.runner import BLOCKED, CHANGED, DONE, FAILED
 
 TAIL_LINES = 20
 """Lines of a failed job's log that are shown."""
-LINE_INTERVAL_S = 60.0
-"""How often progress is printed where there is no terminal [s]."""
+LINE_INTERVAL_S, TABLE_INTERVAL_S = 60.0, 1.0
+"""How often progress is shown, without a terminal and on one [s]."""
 
 
 def log_tail(job: Job, lines: int = TAIL_LINES) -> str:
@@ -58,11 +58,30 @@ def duration(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60:02} min" if minutes >= 60 else f"{minutes} min"
 
 
+class Forecast:
+    """How long all jobs together may still take, from the interaction steps done since it was made."""
+
+    def __init__(self, jobs: Sequence[Job]) -> None:
+        self.jobs = jobs
+        self._first: tuple[float, int] | None = None
+
+    def text(self, states: dict[str, str], running: Sequence[Job]) -> str:
+        """The time left in words; empty until there is something to tell it from."""
+        done = sum(job.work for job in self.jobs if job.name in states)
+        done += sum(min(job.work, progress.done) for job in running if (progress := job.progress()))
+        now = time.monotonic()
+        first_time, first_done = self._first = self._first or (now, done)
+        left = sum(job.work for job in self.jobs) - done
+        if done <= first_done or left <= 0:
+            return ""
+        return f"about {duration(left * (now - first_time) / (done - first_done))} of training left"
+
+
 class LineDisplay:
     """Prints a line for every event, and where the running jobs are once a minute."""
 
-    def __init__(self, total: int) -> None:
-        self.total = total
+    def __init__(self, jobs: Sequence[Job]) -> None:
+        self.jobs, self._forecast = jobs, Forecast(jobs)
         self._printed = time.monotonic()
 
     def __enter__(self) -> LineDisplay:
@@ -80,8 +99,9 @@ class LineDisplay:
         if time.monotonic() - self._printed < LINE_INTERVAL_S:
             return
         self._printed = time.monotonic()
-        done = sum(state == DONE for state in states.values())
-        print(f"[{time.strftime('%H:%M')}] {done} of {self.total} jobs done", flush=True)
+        done = f"{sum(state == DONE for state in states.values())} of {len(self.jobs)} jobs done"
+        text = ", ".join(filter(None, (done, self._forecast.text(states, running))))
+        print(f"[{time.strftime('%H:%M')}] {text}", flush=True)
         for job in running:
             steps, text, left = progress_line(job)
             words = [word for word in (steps, text, f"{left} left" if left else "") if word]
@@ -91,14 +111,20 @@ class LineDisplay:
 class TableDisplay:
     """A table of the running jobs under a bar for all of them; events scroll by above."""
 
-    def __init__(self, total: int) -> None:
+    def __init__(self, jobs: Sequence[Job]) -> None:
         self._console = Console()
+        self._forecast = Forecast(jobs)
         self._bar = Progress(
-            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[left]}"),
             console=self._console,
-        )  # fmt: skip
-        self._task = self._bar.add_task("jobs done", total=total)
+        )
+        self._task = self._bar.add_task("jobs done", total=len(jobs), left="")
         self._live = Live(console=self._console, refresh_per_second=2, transient=True)
+        self._drawn = 0.0
 
     def __enter__(self) -> TableDisplay:
         self._live.__enter__()
@@ -112,14 +138,18 @@ class TableDisplay:
         self._console.print(describe(job, what), markup=False, highlight=False)
 
     def update(self, states: dict[str, str], running: Sequence[Job]) -> None:
-        """Draw the table anew."""
+        """Draw the table anew, if it is time."""
+        if time.monotonic() - self._drawn < TABLE_INTERVAL_S:
+            return
+        self._drawn = time.monotonic()
         table = Table("running", "steps", "success", "left", box=None, pad_edge=False, header_style="dim")
         for job in running:
             table.add_row(job.name, *progress_line(job))
-        self._bar.update(self._task, completed=sum(state == DONE for state in states.values()))
+        done = sum(state == DONE for state in states.values())
+        self._bar.update(self._task, completed=done, left=self._forecast.text(states, running))
         self._live.update(Group(table, self._bar))
 
 
-def make_display(total: int) -> LineDisplay | TableDisplay:
+def make_display(jobs: Sequence[Job]) -> LineDisplay | TableDisplay:
     """The display for this process's output."""
-    return TableDisplay(total) if sys.stdout.isatty() else LineDisplay(total)
+    return TableDisplay(jobs) if sys.stdout.isatty() else LineDisplay(jobs)

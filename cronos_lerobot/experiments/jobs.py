@@ -41,6 +41,8 @@ class Job:
     resume: Callable[[], list[str] | None] = lambda: None
     """The command that goes on with an unfinished `output`, None if there is nothing to go on with."""
     progress: Callable[[], Progress | None] = lambda: None
+    work: int = 0
+    """Interaction steps, for the time that all jobs together may still take."""
 
     @property
     def log(self) -> Path:

@@ -134,6 +134,7 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
         needs=(base,) if base else (),
         resume=resume,
         progress=lambda: train_progress(spec.train_folder, spec.steps),
+        work=spec.steps,
     )
 
 

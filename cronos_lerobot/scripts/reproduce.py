@@ -191,7 +191,7 @@ def print_plan(jobs: list[Job]) -> None:
 
 def run_jobs(jobs: list[Job], parallel: int, threads: int) -> bool:
     """Run what is not done; returns whether all is done in the end."""
-    with make_display(len(jobs)) as display:
+    with make_display(jobs) as display:
         states = Runner(jobs, parallel, display, {"OMP_NUM_THREADS": str(threads)}).run()
     counts = {state: list(states.values()).count(state) for state in dict.fromkeys(states.values())}
     print("jobs: " + ", ".join(f"{number} {state}" for state, number in counts.items()))

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from cronos_lerobot.experiments.display import LineDisplay
-from cronos_lerobot.experiments.jobs import Job, changed_flags, is_done, read_record
+from cronos_lerobot.experiments.jobs import Job, Progress, changed_flags, is_done, read_record
 from cronos_lerobot.experiments.runner import Runner
 
 
@@ -81,7 +81,7 @@ def test_failure_blocks_what_needs_it_and_nothing_else(tmp_path, capsys):
         count_job(tmp_path, "c", needs=("b",)),
         count_job(tmp_path, "d"),
     ]
-    states = Runner(jobs, 1, LineDisplay(4)).run()
+    states = Runner(jobs, 1, LineDisplay([])).run()
     assert states == {"a": "failed", "b": "blocked", "c": "blocked", "d": "done"}
     out = capsys.readouterr().out
     assert "so far so good\nthe disk is full" in out
@@ -124,13 +124,13 @@ def test_changed_command_is_reported_and_its_output_left_alone(tmp_path, capsys)
     assert is_done(old)
     assert not is_done(new)
     assert changed_flags(new) == ["---lr=1", "+--lr=2"]
-    states = Runner([new, count_job(tmp_path, "b", needs=("a",))], 1, LineDisplay(2)).run()
+    states = Runner([new, count_job(tmp_path, "b", needs=("a",))], 1, LineDisplay([])).run()
     assert states == {"a": "changed", "b": "blocked"}
     assert "+--lr=2" in capsys.readouterr().out
     assert json.loads(old.record.read_text()) == record
     # Once its output is out of the way it runs.
     (tmp_path / "a").rmdir()
-    assert Runner([python_job(tmp_path, "a", "")], 1, LineDisplay(1)).run() == {"a": "done"}
+    assert Runner([python_job(tmp_path, "a", "")], 1, LineDisplay([])).run() == {"a": "done"}
 
 
 def test_lost_output_is_made_again(tmp_path):
@@ -176,7 +176,7 @@ code = (
 )
 job = Job("a", ("python", "-c", code, str(out / "a")), out / "a")
 try:
-    Runner([job], 1, LineDisplay(1)).run()
+    Runner([job], 1, LineDisplay([])).run()
 except KeyboardInterrupt:
     sys.exit(7)
 """
@@ -206,3 +206,29 @@ def _raise_if_gone(pid):
     # A zombie that nobody has waited for yet is gone too.
     if f"{pid} (sleep) Z" in Path(f"/proc/{pid}/stat").read_text():
         raise ProcessLookupError
+
+
+def test_lines_of_progress(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("cronos_lerobot.experiments.display.LINE_INTERVAL_S", 0.0)
+    clock = iter(range(0, 10_000, 600))
+    monkeypatch.setattr("cronos_lerobot.experiments.display.time.monotonic", lambda: float(next(clock)))
+    done = [0]
+
+    def progress():
+        return Progress(done[0], 1000, 90 * 60.0, "evaluation 0.50")
+
+    running = Job("b", ("python",), tmp_path / "b", progress=progress, work=1000)
+    jobs = [
+        Job("a", ("python",), tmp_path / "a", work=1000),
+        running,
+        Job("c", ("python",), tmp_path / "c", work=1000),
+    ]
+    display = LineDisplay(jobs)
+    display.update({"a": "done"}, [running])
+    assert "left" not in capsys.readouterr().out.splitlines()[0]
+    done[0] = 500
+    display.update({"a": "done"}, [running])
+    first, second = capsys.readouterr().out.splitlines()
+    # 500 steps between two looks at the clock, three calls of it (half an hour) apart; 1500 steps are left.
+    assert first.endswith("1 of 3 jobs done, about 1 h 30 min of training left")
+    assert second == "    b: 500 / 1,000, evaluation 0.50, 1 h 30 min left"
