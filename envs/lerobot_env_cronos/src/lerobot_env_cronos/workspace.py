@@ -36,13 +36,13 @@ class Unsuitable(StrEnum):
 def find_unsuitable(simulation: Simulation) -> dict[Unsuitable, np.ndarray]:
     """Return for each reason which bodies of which simulations it applies to, (n, bodies) bool."""
     position = simulation.body_poses()[..., :3]
-    outside = ((position[..., :2] < EE_LOW[:2]) | (position[..., :2] > EE_HIGH[:2])).any(-1)
+    outside = np.asarray((position[..., :2] < EE_LOW[:2]) | (position[..., :2] > EE_HIGH[:2])).any(-1)
     flat = np.array([name in simulation.scene.receptacles for name in simulation.scene.bodies])
     # Lying upside down is as good as lying upright.
     upright = np.abs(simulation.body_rotations()[..., 2, 2])
     on_edge = flat & (upright < np.cos(MAX_RECEPTACLE_TILT_RAD))
     return {
-        Unsuitable.OUTSIDE: outside,
+        Unsuitable.OUTSIDE: np.asarray(outside),
         Unsuitable.FALLEN: np.asarray((position[..., 2] < 0.0) | on_edge),
         Unsuitable.UNSEEN: np.asarray(~is_in_view(position)),
     }
