@@ -1,6 +1,7 @@
 """The declared runs are the paper's, written down here a second time by hand."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -204,6 +205,16 @@ def test_evaluations_of_checkpoints():
     assert evals[0].needs == ("kitchen_2x2_state_paper/t80_1300k/seed2",)
     figure5 = [job for job in jobs_of("figure5", rows=["t80"]).values() if job.command[0] == "cronos-eval"]
     assert len(figure5) == 2 * 5
+
+
+def test_checkpoints_lie_where_updates_pass_a_multiple():
+    """`cronos-train` saves after the first update at or past each multiple of `save_freq`, and at the end."""
+    scale = replace(
+        SCALES["small"], steps=dict.fromkeys(SCALES["small"].steps, 10_000), num_envs=8, eval_freq=3_000
+    )
+    spec = run_specs(EXPERIMENTS["table1"], replace(options("small"), scale=scale))[0]
+    # Updates every 8 x 160 = 1280 steps: 3840 is the first past 3000, 6400 past 6000, 10240 past 9000.
+    assert (spec.steps, spec.checkpoints) == (10_240, [3_840, 6_400, 10_240])
 
 
 def test_flags_given_last_replace_the_experiments():

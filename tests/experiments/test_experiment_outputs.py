@@ -137,12 +137,22 @@ def test_unfinished_run_is_drawn_but_not_counted(options, tmp_path):
     row = by_row(tables.main_rows(result))
     assert (row["t80"]["success_train_mean"], row["t80"]["seeds"], row["t80"]["seeds_wanted"]) == (0.75, 1, 2)
     assert row["t1280"]["success_train_mean"] is None
+    # A finished seed stands for its row alone.
+    assert plots.row_curve(result.rows[0], "train", "interaction_steps").y.tolist() == [0.25, 0.5, 0.75]
     curve = plots.row_curve(result.rows[1], "train", "interaction_steps")
     assert curve.y.tolist() == [0.25, 0.5, 1.0]
     assert plots.row_label(result.rows[1]) == "T = 1280 (1 seed, unfinished)"
     text = write_outputs(EXPERIMENTS["table1"], EXPERIMENTS["table1"].rows, options, tmp_path / "out")
     assert "t80_10k/seed2: 10,240 of 10,240 steps" in text
     assert "t1280_eer_cl: 2 of 2 seeds not begun" in text
+
+
+def test_run_without_its_last_evaluation_has_no_success_at_the_end(options):
+    make_run(options, "table1", "t80", 1, (2, 4, 6), updates=4)
+    row = by_row(tables.main_rows(results(options, "table1")))["t80"]
+    assert (row["seeds"], row["success_train_mean"]) == (1, None)
+    # Its curve is still there.
+    assert row["D_normalised_mean"] is not None
 
 
 def test_run_of_another_command_is_named(options):

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from cronos_lerobot.experiments.display import LineDisplay
-from cronos_lerobot.experiments.jobs import Job, Progress, changed_flags, is_done, read_record
+from cronos_lerobot.experiments.jobs import Job, Progress, changed_flags, is_done, lock, read_record
 from cronos_lerobot.experiments.runner import Runner
 
 
@@ -199,6 +199,27 @@ def test_signals_stop_the_children_and_theirs(tmp_path, number):
     time.sleep(0.2)
     with pytest.raises(ProcessLookupError):
         _raise_if_gone(int(pid.read_text()))
+
+
+def test_child_of_a_killed_runner_keeps_its_claim(tmp_path):
+    process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(RUNNER), str(tmp_path)])
+    pid = tmp_path / "a/pid"
+    deadline = time.monotonic() + 60
+    while not (pid.exists() and pid.read_text()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    job = Job("a", ("python",), tmp_path / "a")
+    try:
+        assert lock(job) is None
+    finally:
+        # The child leads a group of its own, its `sleep` is in it.
+        os.killpg(os.getpgid(int(pid.read_text())), signal.SIGKILL)
+    deadline = time.monotonic() + 10
+    while (claim := lock(job)) is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert claim is not None
+    os.close(claim)
 
 
 def _raise_if_gone(pid):
