@@ -1,7 +1,11 @@
 # `make demo` and `make test` set everything up by themselves; `make help` lists the rest.
 # They need Python 3.12 with pip, make, and on Debian or Ubuntu root (or sudo) for three OpenGL packages.
 
-PYTHON ?= $(shell command -v python3.12 || command -v python3)
+ifndef PYTHON
+# The first Python 3.12 that has pip: that of an active virtual environment may have none.
+PYTHON := $(shell for python in $$(which -a python3.12 python3); do \
+  $$python -c 'import pip, sys; sys.exit(sys.version_info[:2] != (3, 12))' 2>/dev/null && echo $$python && break; done)
+endif
 UV := .uv/bin/uv
 RUN := $(UV) run --frozen
 
@@ -11,8 +15,8 @@ help: ## List the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
 $(UV):
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))' || \
-	  { echo "Python 3.12 is needed; found $$($(PYTHON) --version). Try: make PYTHON=/path/to/python3.12"; exit 1; }
+	@test -n "$(PYTHON)" || \
+	  { echo "No Python 3.12 with pip was found. Try: make $(MAKECMDGOALS) PYTHON=/path/to/python3.12"; exit 1; }
 	$(PYTHON) -m pip install --quiet --disable-pip-version-check --target .uv 'uv>=0.8,<1'
 
 setup: system $(UV) ## Install the system packages and the locked Python environment
