@@ -1,0 +1,104 @@
+"""The network: two vision towers, a projector and Llama, under the names of the published checkpoints."""
+
+from __future__ import annotations
+
+import timm
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812
+from transformers import LlamaConfig, LlamaForCausalLM
+
+from lerobot_policy_openvla.architecture import Architecture
+
+ATTENTION = ("sdpa", "eager", "flash_attention_2")
+
+
+class VisionTower(nn.Module):
+    """Patch tokens of the second-to-last block of a DINOv2 and of a SigLIP, side by side.
+
+    What comes after that block (the last block, the norm, the pooling) is never looked at and left out.
+    """
+
+    def __init__(self, architecture: Architecture) -> None:
+        super().__init__()
+        towers = []
+        for name, activation in zip(architecture.timm_model_ids, architecture.act_layers, strict=True):
+            tower = timm.create_model(
+                name, pretrained=False, num_classes=0, img_size=architecture.image_size, act_layer=activation
+            )
+            tower.prune_intermediate_layers([len(tower.blocks) - 2], prune_norm=True)
+            # timm's SigLIP keeps a pooling that nothing here calls.
+            tower.attn_pool = None
+            towers.append(tower)
+        self.featurizer, self.fused_featurizer = towers
+        if self.featurizer.patch_embed.num_patches != self.fused_featurizer.patch_embed.num_patches:
+            raise ValueError(f"The towers {architecture.timm_model_ids} cut an image into different patches.")
+
+    @property
+    def width(self) -> int:
+        """Channels of the result."""
+        return self.featurizer.embed_dim + self.fused_featurizer.embed_dim
+
+    @property
+    def num_patches(self) -> int:
+        """Patches P of an image."""
+        return self.featurizer.patch_embed.num_patches
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Map pixel values (B, 6, size, size) to patch features (B, P, width)."""
+        features = []
+        for tower, image in zip((self.featurizer, self.fused_featurizer), pixels.chunk(2, dim=1), strict=True):
+            last = len(tower.blocks) - 1
+            features += tower.forward_intermediates(image, indices=[last], output_fmt="NLC", intermediates_only=True)
+        return torch.cat(features, dim=-1)
+
+
+class Projector(nn.Module):
+    """Patch features to the width of the language model's embeddings, three layers with GELU between."""
+
+    def __init__(self, vision_width: int, text_width: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(vision_width, 4 * vision_width)
+        self.fc2 = nn.Linear(4 * vision_width, text_width)
+        self.fc3 = nn.Linear(text_width, text_width)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map (B, P, vision width) to (B, P, text width)."""
+        return self.fc3(F.gelu(self.fc2(F.gelu(self.fc1(features)))))
+
+
+class OpenVLANetwork(nn.Module):
+    """Its parameters have the names of the published safetensors but for timm's `gamma` (see checkpoint.py)."""
+
+    def __init__(self, architecture: Architecture, attention: str = "sdpa") -> None:
+        super().__init__()
+        text = {k: v for k, v in architecture.text_config.items() if k not in ("model_type", "torch_dtype", "dtype")}
+        config = LlamaConfig(**text)
+        config._attn_implementation = attention
+        self.vision_backbone = VisionTower(architecture)
+        self.projector = Projector(self.vision_backbone.width, config.hidden_size)
+        self.language_model = LlamaForCausalLM(config)
+
+    @property
+    def text_width(self) -> int:
+        """Width of the language model's hidden states."""
+        return self.language_model.config.hidden_size
+
+    def embed_tokens(self, tokens: Tensor) -> Tensor:
+        """Tokens (B, L) to embeddings (B, L, text width)."""
+        return self.language_model.model.embed_tokens(tokens)
+
+    def set_gradient_checkpointing(self, enabled: bool) -> None:
+        """Compute the blocks' activations again in the backward pass instead of keeping them.
+
+        Llama's layers do so only while they are in training mode, which changes nothing else in them; their
+        dropout stays as it is.
+        """
+        for tower in (self.vision_backbone.featurizer, self.vision_backbone.fused_featurizer):
+            tower.set_grad_checkpointing(enabled)
+        if enabled:
+            self.language_model.gradient_checkpointing_enable({"use_reentrant": False})
+        else:
+            self.language_model.gradient_checkpointing_disable()
+        for layer in self.language_model.model.layers:
+            layer.training = enabled
