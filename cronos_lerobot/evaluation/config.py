@@ -7,6 +7,7 @@ import hashlib
 import json
 import sys
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,11 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
-from lerobot_env_cronos import CronosEnvConfig, configurations, load_orderings, orderings
-from lerobot_env_cronos.configurations import NUM_CONFIGURATIONS, SPLITS
+from lerobot_env_cronos import Benchmark, CronosEnvConfig, configurations, load_benchmark, orderings
+from lerobot_env_cronos.benchmark import SUITES
+from lerobot_env_cronos.configurations import SPLITS
 from lerobot_env_cronos.model import CAMERAS
 from lerobot_env_cronos.scenes import SCENES
-
-from cronos_lerobot.evaluation.plan import SUITES
 
 QUICK_CONFIGURATIONS, QUICK_ORDERINGS = 16, 3
 EXPERT = "scripted expert"
@@ -51,9 +51,13 @@ class SuitesConfig:
             chosen = _words(value)
             if not chosen or set(chosen) - set(valid) or len(set(chosen)) < len(chosen):
                 raise ValueError(f"eval.{name} must be of {list(valid)}, comma-separated, got {value!r}")
-        if self.n_episodes is not None and not 1 <= self.n_episodes <= NUM_CONFIGURATIONS:
-            raise ValueError(f"eval.n_episodes must be 1 to {NUM_CONFIGURATIONS}, got {self.n_episodes}")
-        for name, least in (("orderings", 1), ("temperature", 0), ("batch_size", 1), ("videos", 0)):
+        for name, least in (
+            ("n_episodes", 1),
+            ("orderings", 1),
+            ("temperature", 0),
+            ("batch_size", 1),
+            ("videos", 0),
+        ):
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"eval.{name} must be at least {least}, got {value}")
@@ -67,8 +71,8 @@ class CronosEvalConfig:
     """
 
     env: EnvConfig = field(default_factory=CronosEnvConfig)
-    """Scene and observations. What is not given follows from the policy: the scene that it was trained in, and the
-    images or the state that it takes."""
+    """Scene, benchmark and observations. What is not given follows from the benchmark, if there is one, and from
+    the policy: the scene that it was trained in, and the images or the state that it takes."""
     policy: PreTrainedConfig | None = None
     """The policy: --policy.path=<checkpoint or Hub id>."""
     eval: SuitesConfig = field(default_factory=SuitesConfig)
@@ -112,6 +116,9 @@ class CronosEvalConfig:
         self._derive_env({name.removeprefix("--") for name in given})
         self.env.advance, self.env.end_effector_reset = self.advance, self.end_effector_reset
         self.env.__post_init__()
+        most = self._most_configurations()
+        if self.eval.n_episodes is not None and self.eval.n_episodes > most:
+            raise ValueError(f"eval.n_episodes must be 1 to {most}, got {self.eval.n_episodes}")
         if self.output_dir is None:
             name = "expert" if self.policy is None else self.policy.type
             self.output_dir = Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_cronos_{name}"
@@ -139,7 +146,9 @@ class CronosEvalConfig:
         if self.policy is None:
             derived["obs_type"] = "environment_state_agent_pos"
         else:
-            derived = _observations(self.policy) | _trained_scene(self.policy.pretrained_path)
+            derived = _observations(self.policy)
+            if env.benchmark is None:
+                derived |= _trained_scene(self.policy.pretrained_path)
         for name, value in derived.items():
             if name not in given:
                 setattr(env, name, value)
@@ -154,16 +163,27 @@ class CronosEvalConfig:
         """Splits to evaluate on."""
         return _words(self.eval.splits)
 
+    def benchmark(self) -> Benchmark:
+        """What `env` names: its configurations, episodes and chains."""
+        assert isinstance(self.env, CronosEnvConfig)
+        return load_benchmark(self.env.benchmark, self.env.scene)
+
     @property
     def num_configurations(self) -> int:
-        """Configurations of each split."""
-        return self.eval.n_episodes or (QUICK_CONFIGURATIONS if self.quick else NUM_CONFIGURATIONS)
+        """Configurations of each task and ordering."""
+        most = self._most_configurations()
+        return self.eval.n_episodes or (min(most, QUICK_CONFIGURATIONS) if self.quick else most)
+
+    def _most_configurations(self) -> int:
+        benchmark = self.benchmark()
+        groups = [benchmark.groups(suite, split) for suite in self.suites for split in self.splits]
+        return max(len(group.configurations) for group in chain.from_iterable(groups))
 
     @property
     def num_orderings(self) -> int:
         """Orderings of the sequential suite."""
-        assert isinstance(self.env, CronosEnvConfig)
-        most = len(load_orderings(self.env.scene))
+        benchmark = self.benchmark()
+        most = max(len(benchmark.groups("sequential", split)) for split in self.splits)
         return min(most, self.eval.orderings or (QUICK_ORDERINGS if self.quick else most))
 
     def to_dict(self) -> dict[str, Any]:
@@ -177,7 +197,8 @@ class CronosEvalConfig:
         decisive = (
             "scene", "obs_type", "privileged_state", "observation_height", "observation_width", "camera_name"
         )  # fmt: skip
-        return {
+        own = {} if env.benchmark is None else {"benchmark": self.benchmark().fingerprint}
+        return own | {
             "policy": EXPERT if self.policy is None else fingerprint(self.policy),
             "env": {name: getattr(env, name) for name in decisive},
             "versions": {"configurations": configurations.VERSION, "orderings": orderings.VERSION},

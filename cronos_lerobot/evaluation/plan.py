@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lerobot_env_cronos import load_orderings
+from lerobot_env_cronos import Benchmark, EpisodeGroup
+from lerobot_env_cronos.benchmark import SUITES
 from lerobot_env_cronos.configurations import SPLITS
-from lerobot_env_cronos.scenes import STEPS_PER_TASK, get_scene
+from lerobot_env_cronos.scenes import STEPS_PER_TASK
 
 from cronos_lerobot.evaluation.chains import Chain, Noise, chain_noise
 
-SUITES = ("independent", "sequential")
 ORDERINGS_PER_PART = 2
 """Of the sequential suite: 128 chains, about a minute of work."""
 
@@ -31,29 +31,35 @@ class Part:
 
 
 def make_parts(
-    scene: str, suites: Sequence[str], splits: Sequence[str], num_configurations: int, num_orderings: int
+    benchmark: Benchmark, suites: Sequence[str], splits: Sequence[str], num_configurations: int, num_orderings: int
 ) -> list[Part]:
     """Return the parts of an evaluation, suite by suite and split by split.
 
     Args:
-        scene: its name.
+        benchmark: whose episodes and chains they are.
         suites: some of `SUITES`.
         splits: some of `train`, `held_out`.
-        num_configurations: the first ones of each split.
-        num_orderings: the first ones of the scene.
+        num_configurations: the first ones of each task and ordering.
+        num_orderings: the first ones of each split.
     """
-    configurations = range(num_configurations)
     parts = []
     for suite in suites:
         for split in splits:
+            groups = benchmark.groups(suite, split)
             if suite == "independent":
-                tasks = enumerate(get_scene(scene).tasks)
-                chains = [Chain(i, (task,), c) for i, task in tasks for c in configurations]
-                parts.append(Part(f"independent_{split}", suite, split, tuple(chains)))
+                chains = _chains(groups, num_configurations)
+                parts.append(Part(f"independent_{split}", suite, split, chains))
                 continue
-            orderings = list(enumerate(load_orderings(scene)))[:num_orderings]
-            for start in range(0, len(orderings), ORDERINGS_PER_PART):
-                some = orderings[start : start + ORDERINGS_PER_PART]
-                chains = [Chain(i, ordering, c) for i, ordering in some for c in configurations]
-                parts.append(Part(f"sequential_{split}_{start}", suite, split, tuple(chains)))
+            groups = groups[:num_orderings]
+            for start in range(0, len(groups), ORDERINGS_PER_PART):
+                chains = _chains(groups[start : start + ORDERINGS_PER_PART], num_configurations)
+                parts.append(Part(f"sequential_{split}_{start}", suite, split, chains))
     return parts
+
+
+def _chains(groups: Sequence[EpisodeGroup], num_configurations: int) -> tuple[Chain, ...]:
+    return tuple(
+        Chain(group.number, group.tasks, configuration)
+        for group in groups
+        for configuration in group.configurations[:num_configurations]
+    )

@@ -14,7 +14,7 @@ import numpy as np
 from lerobot.envs.factory import make_env_pre_post_processors
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
-from lerobot_env_cronos import CronosEnvConfig, SequentialVectorEnv, get_scene, load_orderings
+from lerobot_env_cronos import CronosEnvConfig, SequentialVectorEnv, get_scene, gymnasium_id
 from tqdm import tqdm
 
 from cronos_lerobot.evaluation.actors import Actor, ExpertActor, make_actor
@@ -49,9 +49,10 @@ class Evaluation:
         assert config.output_dir is not None
         self.config, self.env_config = config, config.env
         self.scene = get_scene(config.env.scene)
+        self.benchmark = config.benchmark()
         self._make_actor = make_actor or self._configured_actor
         self.parts = make_parts(
-            self.scene.name, config.suites, config.splits, config.num_configurations, config.num_orderings
+            self.benchmark, config.suites, config.splits, config.num_configurations, config.num_orderings
         )
         self.store = ResultStore(config.output_dir, config.identity())
 
@@ -162,6 +163,11 @@ class Evaluation:
             "format": FORMAT,
             "policy": EXPERT if config.policy is None else str(config.policy.pretrained_path),
             "scene": self.scene.name,
+            "benchmark": {
+                "environment": gymnasium_id(self.scene.name),
+                "fingerprint": self.benchmark.fingerprint,
+                "source": self.benchmark.source,
+            },
             "obs_type": self.env_config.obs_type,
             "temperature": config.eval.temperature if self._has_temperature() else None,
             "seed": config.seed,
@@ -193,8 +199,9 @@ class Evaluation:
                 if (content["suite"], content["split"]) == (suite, split)
                 for record in content["chains"]
             ]
+            groups = self.benchmark.groups(suite, split)
             if suite == "independent":
-                found[split] = independent_results(records, self.scene.tasks)
+                found[split] = independent_results(records, [group.tasks[0] for group in groups])
             else:
-                found[split] = sequential_results(records, load_orderings(self.scene.name))
+                found[split] = sequential_results(records, [group.tasks for group in groups])
         return found

@@ -2,6 +2,7 @@
 
 from lerobot_env_cronos import gl as gl  # isort: skip  # chooses the OpenGL platform before mujoco is imported
 
+from lerobot_env_cronos.benchmark import Benchmark, EpisodeGroup, load_benchmark
 from lerobot_env_cronos.config import CronosEnvConfig
 from lerobot_env_cronos.episodic import CronosEnv, IndependentVectorEnv
 from lerobot_env_cronos.orderings import load_orderings
@@ -16,16 +17,19 @@ __all__ = [
     "CONTROL_HZ",
     "SCENES",
     "STEPS_PER_TASK",
+    "Benchmark",
     "Body",
     "CronosEnv",
     "CronosEnvConfig",
     "CronosVectorEnv",
+    "EpisodeGroup",
     "IndependentVectorEnv",
     "Scene",
     "SequentialVectorEnv",
     "Task",
     "get_scene",
     "gymnasium_id",
+    "load_benchmark",
     "load_orderings",
     "register_scene",
 ]

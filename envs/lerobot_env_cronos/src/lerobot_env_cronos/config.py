@@ -1,7 +1,7 @@
 """`--env.type=cronos`: the LeRobot configuration of the CRONOS scenes."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -12,16 +12,16 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import parse_camera_names
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
+from lerobot_env_cronos.benchmark import SUITES, EpisodeGroup, benchmark_scene, load_benchmark
 from lerobot_env_cronos.configurations import SPLITS
-from lerobot_env_cronos.episodic import EpisodicVectorEnv, IndependentVectorEnv, LazyVectorEnv, find_task
+from lerobot_env_cronos.episodic import EpisodicVectorEnv, IndependentVectorEnv, LazyVectorEnv
 from lerobot_env_cronos.observations import AGENT_POS_NAMES, OBS_TYPES, environment_state_names
-from lerobot_env_cronos.orderings import Ordering, load_orderings
 from lerobot_env_cronos.registry import gymnasium_id
-from lerobot_env_cronos.scenes import CONTROL_HZ, Task, get_scene
+from lerobot_env_cronos.scenes import CONTROL_HZ, get_scene
 from lerobot_env_cronos.sequential import ADVANCES, SequentialVectorEnv
 from lerobot_env_cronos.simulation import ACTION_NAMES
 
-SUITES = ("independent", "sequential")
+DEFAULT_SCENE = "kitchen_2x2"
 
 
 @EnvConfig.register_subclass("cronos")
@@ -34,13 +34,17 @@ class CronosEnvConfig(EnvConfig):
     (sequential); null for all."""
     fps: int = CONTROL_HZ
     """Control frequency [Hz]; fixed by the protocol."""
-    scene: str = "kitchen_2x2"
-    """Scene: kitchen_2x2, kitchen_3x3, playroom_2x2, or a registered one."""
+    scene: str = ""
+    """Scene: kitchen_2x2, kitchen_3x3, playroom_2x2, or a registered one; by default the benchmark's, or
+    kitchen_2x2."""
     suite: str = "independent"
     """Evaluation suite: independent (every task from every configuration, 80 steps), or sequential (chains of all
     tasks without a reset in between, in ten orderings, 80 steps for each task)."""
     split: str = "train"
     """Configurations: train or held_out, 64 each."""
+    benchmark: str | None = None
+    """A benchmark of its author's own configurations and chains: <owner>/<repository>[@<revision>] of a dataset on
+    the Hub, or a folder; null for this package's."""
     advance: str = "window"
     """When a chain goes on to its next task: window (when the 80 steps are over) or on_success (at once)."""
     end_effector_reset: bool = False
@@ -72,6 +76,7 @@ class CronosEnvConfig(EnvConfig):
 
     def _build(self) -> None:
         """Check the fields and derive the features from them."""
+        self.scene = self.scene or (benchmark_scene(self.benchmark) if self.benchmark else DEFAULT_SCENE)
         scene = get_scene(self.scene)
         _check("suite", self.suite, SUITES)
         _check("split", self.split, SPLITS)
@@ -109,7 +114,7 @@ class CronosEnvConfig(EnvConfig):
         """Keyword arguments of `CronosVectorEnv`."""
         names = (
             "obs_type", "privileged_state", "observation_height", "observation_width", "camera_name",
-            "render_size", "num_threads",
+            "render_size", "num_threads", "benchmark",
         )  # fmt: skip
         return {name: getattr(self, name) for name in names}
 
@@ -119,26 +124,25 @@ class CronosEnvConfig(EnvConfig):
         envs: dict[int, gym.vector.VectorEnv] = {i: LazyVectorEnv(make, n_envs) for i, make in makers.items()}
         return {f"{self.suite}_{self.split}": envs}
 
-    def _chosen(self) -> Mapping[int, Task | Ordering]:
+    def _chosen(self) -> dict[int, EpisodeGroup]:
         """The tasks or orderings of the suite that `task` chooses, by their number."""
-        if self.suite == "independent":
-            task = find_task(self.scene, self.task)
-            return {i: t for i, t in enumerate(get_scene(self.scene).tasks) if task in (None, t)}
-        orderings = dict(enumerate(load_orderings(self.scene)))
-        if self.task is None:
-            return orderings
-        chosen = {i: ordering for i, ordering in orderings.items() if str(i) == str(self.task)}
-        if not chosen:
-            valid = [str(i) for i in orderings]
-            raise ValueError(f"unknown ordering {self.task!r} of {self.scene}; valid orderings: {valid}")
-        return chosen
+        groups = load_benchmark(self.benchmark, self.scene).groups(self.suite, self.split)
+        independent = self.suite == "independent"
+        names = {group.instructions[0] if independent else str(group.number): group for group in groups}
+        if self.task is not None and str(self.task) not in names:
+            kind = "task" if independent else "ordering"
+            where = self.scene if self.benchmark is None else self.benchmark
+            raise ValueError(f"unknown {kind} {self.task!r} of {where}; valid {kind}s: {list(names)}")
+        return {
+            group.number: group for name, group in names.items() if self.task is None or name == str(self.task)
+        }
 
-    def _maker(self, n_envs: int, chosen: Task | Ordering) -> Callable[[], EpisodicVectorEnv]:
-        kwargs = {"split": self.split} | self.gym_kwargs
-        if isinstance(chosen, Task):
-            return partial(IndependentVectorEnv, n_envs, self.scene, task=chosen, **kwargs)
+    def _maker(self, n_envs: int, group: EpisodeGroup) -> Callable[[], EpisodicVectorEnv]:
+        kwargs = {"split": self.split, "configurations": group.configurations} | self.gym_kwargs
+        if self.suite == "independent":
+            return partial(IndependentVectorEnv, n_envs, self.scene, task=group.tasks[0], **kwargs)
         return partial(
-            SequentialVectorEnv, n_envs, self.scene, ordering=chosen,
+            SequentialVectorEnv, n_envs, self.scene, ordering=group.tasks,
             advance=self.advance, end_effector_reset=self.end_effector_reset, **kwargs,
         )  # fmt: skip
 

@@ -29,7 +29,8 @@ SEED = 2026
 """Of the packaged configurations, and of those of scenes without a file."""
 
 
-def _check_split(split: str) -> None:
+def check_split(split: str) -> None:
+    """Raise a ValueError that names the valid splits, unless this is one."""
     if split not in SPLITS:
         raise ValueError(f"unknown split {split!r}; valid splits: {list(SPLITS)}")
 
@@ -40,7 +41,7 @@ _files: dict[str, Path] = {}
 
 def load_configurations(scene_name: str, split: str) -> np.ndarray:
     """Poses (64, bodies, 7) of a split: position [m], quaternion (w, x, y, z), bodies in the scene's order."""
-    _check_split(split)
+    check_split(split)
     return _load_splits(get_scene(scene_name), _files.get(scene_name))[split]
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from lerobot_env_cronos.configurations import SPLITS, load_configurations
+from lerobot_env_cronos.configurations import check_split
 from lerobot_env_cronos.scenes import STEPS_PER_TASK, Task, get_scene
 from lerobot_env_cronos.vector_env import CronosVectorEnv
 
@@ -19,15 +19,30 @@ class EpisodicVectorEnv(CronosVectorEnv):
 
     What is over is neither simulated nor rendered any more: its observation stays the last one.
 
+    Args:
+        split: `train` or `held_out`.
+        configurations: where episodes start, indices into the split; None for all of them.
+        **kwargs: see `CronosVectorEnv`.
+
     Attributes:
         done: (n,) bool, the episodes that are over.
+        starts: (k,) int, the configurations; episode i of `reset(seed=s)` starts from `starts[(s + i) % k]`.
     """
 
-    def __init__(self, num_envs: int, scene: str = "kitchen_2x2", *, split: str = "train", **kwargs):
-        if split not in SPLITS:
-            raise ValueError(f"unknown split {split!r}; valid splits: {list(SPLITS)}")
+    def __init__(
+        self,
+        num_envs: int,
+        scene: str = "kitchen_2x2",
+        *,
+        split: str = "train",
+        configurations: Sequence[int] | None = None,
+        **kwargs,
+    ):
+        check_split(split)
         self.split = split
         super().__init__(num_envs, scene, **kwargs)
+        everywhere = range(len(self.benchmark.configurations[split]))
+        self.starts = np.array(everywhere if configurations is None else configurations, dtype=int)
         self.done = np.zeros(num_envs, dtype=bool)
         self._last: dict[str, Any] | None = None
 
@@ -43,35 +58,25 @@ class EpisodicVectorEnv(CronosVectorEnv):
 class IndependentVectorEnv(EpisodicVectorEnv):
     """`num_envs` independent episodes of one task (paper, Section 4, "Independent-task evaluation").
 
-    An episode starts from configuration `seed % 64` of `split` with the arm at home. It is `terminated` when the
-    task is complete and `truncated` after 80 steps; from then on it is frozen, pays no reward and reports no
-    success until the next `reset`, which is what LeRobot's rollout expects of a finished episode.
+    An episode starts from configuration `starts[seed % len(starts)]` of `split`, by default `seed % 64`, with the
+    arm at home. It is `terminated` when the task is complete and `truncated` after 80 steps; from then on it is
+    frozen, pays no reward and reports no success until the next `reset`, as LeRobot's rollout expects.
 
     Args:
         task: the task of every episode.
-        split: `train` or `held_out`.
-        **kwargs: see `CronosVectorEnv`.
+        **kwargs: see `EpisodicVectorEnv`.
     """
 
-    def __init__(
-        self,
-        num_envs: int,
-        scene: str = "kitchen_2x2",
-        *,
-        task: Task,
-        split: str = "train",
-        **kwargs,
-    ):
+    def __init__(self, num_envs: int, scene: str = "kitchen_2x2", *, task: Task, **kwargs):
         self.task = task
         self._max_episode_steps = STEPS_PER_TASK
-        super().__init__(num_envs, scene, split=split, **kwargs)
+        super().__init__(num_envs, scene, **kwargs)
         self._elapsed = np.zeros(num_envs, dtype=int)
 
     def reset(self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None):
-        """Start new episodes in all environments, at configurations `seed + i` or `seeds[i]`, modulo 64."""
+        """Start new episodes everywhere, at starts number `seed + i` or `seeds[i]`, modulo their count."""
         gym.vector.VectorEnv.reset(self, seed=seed if isinstance(seed, int) else None)
-        configurations = self._configurations_of(seed)
-        self.scene_reset(self._all, configurations, self.split)
+        self.scene_reset(self._all, self._choose_starts(seed, self.starts), self.split)
         self.set_task(self._all, [self.task] * self.num_envs)
         self.done[:] = False
         self._elapsed[:] = 0
@@ -169,7 +174,7 @@ class CronosEnv(gym.Env):
         self._env = IndependentVectorEnv(1, scene, task=self._tasks[0], split=split, **kwargs)
         self.observation_space = self._env.single_observation_space
         self.action_space = self._env.single_action_space
-        self._num_configurations = len(load_configurations(scene, split))
+        self._num_configurations = len(self._env.starts)
 
     @property
     def task_description(self) -> str:

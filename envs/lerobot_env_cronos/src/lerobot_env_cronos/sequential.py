@@ -46,12 +46,11 @@ class SequentialVectorEnv(EpisodicVectorEnv):
 
     Args:
         ordering: the tasks of the chains that `reset` starts.
-        split: `train` or `held_out`.
         advance: `window` starts the next task when the 80 steps are over; `on_success` (CALVIN's) as soon as the
             task is complete.
         end_effector_reset: send the arm home, gripper open, between tasks.
         window: control steps for each task.
-        **kwargs: see `CronosVectorEnv`.
+        **kwargs: see `EpisodicVectorEnv`.
 
     Attributes:
         chain_length: (n,) int, tasks completed so far. As a failure ends the chain, it says which ones.
@@ -64,7 +63,6 @@ class SequentialVectorEnv(EpisodicVectorEnv):
         scene: str = "kitchen_2x2",
         *,
         ordering: Sequence[Task],
-        split: str = "train",
         advance: str = "window",
         end_effector_reset: bool = False,
         window: int = STEPS_PER_TASK,
@@ -74,7 +72,7 @@ class SequentialVectorEnv(EpisodicVectorEnv):
             raise ValueError(f"unknown advance {advance!r}; valid values: {list(ADVANCES)}")
         if window < 1 or not ordering:
             raise ValueError(f"need a window of at least 1 step and a task, got {window} and {list(ordering)}")
-        super().__init__(num_envs, scene, split=split, **kwargs)
+        super().__init__(num_envs, scene, **kwargs)
         self.ordering = tuple(ordering)
         self.advance, self.window, self._sends_arm_home = advance, window, end_effector_reset
         self._max_episode_steps = window * len(self.ordering)
@@ -86,9 +84,9 @@ class SequentialVectorEnv(EpisodicVectorEnv):
         self.done[:] = True
 
     def reset(self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None):
-        """Start `ordering` in all environments, at configurations `seed + i` or `seeds[i]`, modulo 64."""
+        """Start `ordering` everywhere, at starts number `seed + i` or `seeds[i]`, modulo their count."""
         gym.vector.VectorEnv.reset(self, seed=seed if isinstance(seed, int) else None)
-        self.start(self._all, [self.ordering] * self.num_envs, self._configurations_of(seed))
+        self.start(self._all, [self.ordering] * self.num_envs, self._choose_starts(seed, self.starts))
         nothing = np.zeros(self.num_envs, dtype=bool)
         return self.observe_running(self._all), self._chain_info(nothing, nothing, self.position)
 

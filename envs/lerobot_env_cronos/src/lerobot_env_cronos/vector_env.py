@@ -11,10 +11,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from lerobot_env_cronos.configurations import (
-    NUM_CONFIGURATIONS,
-    load_configurations,
-)
+from lerobot_env_cronos.benchmark import load_benchmark
+from lerobot_env_cronos.configurations import check_split
 from lerobot_env_cronos.observations import ObservationBuilder
 from lerobot_env_cronos.scenes import CONTROL_HZ, Task, get_scene
 from lerobot_env_cronos.simulation import ACTION_HIGH, ACTION_LOW, Simulation
@@ -37,6 +35,8 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             4); `difference` pays the change of that level between two steps (RL4VLA's code).
         num_threads: physics threads, 0 for all cores; results do not depend on it.
         render_size: (height, width) of `render()` [px].
+        benchmark: where the configurations come from: `<owner>/<repository>[@<revision>]` of a dataset on the Hub,
+            or a folder; None for this package's.
 
     Attributes:
         timer: called with `physics`, `observe` or `reset`, returns the context in which that work is done; a
@@ -63,12 +63,14 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         reward: str = "difference",
         num_threads: int = 0,
         render_size: tuple[int, int] = (480, 640),
+        benchmark: str | None = None,
     ):
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
         if reward not in REWARDS:
             raise ValueError(f"unknown reward {reward!r}; valid rewards: {list(REWARDS)}")
         self.scene = get_scene(scene)
+        self.benchmark = load_benchmark(benchmark, scene)
         self.num_envs = num_envs
         self.timer: Callable[[str], AbstractContextManager] = lambda name: nullcontext()
         self.reward = reward
@@ -88,23 +90,25 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         self.is_grasped = np.zeros(num_envs, dtype=bool)
         self._level = np.zeros(num_envs, dtype=np.float32)
         self._all = np.arange(num_envs)
-        self.scene_reset(self._all, self._all % NUM_CONFIGURATIONS)
+        self.scene_reset(self._all, self._all % len(self.benchmark.configurations["train"]))
 
     # Gymnasium --------------------------------------------------------------------------------------------
 
     def reset(self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None):
-        """Scene-reset every stream to a training configuration: `(seed + i) % 64`, or `seeds[i] % 64`."""
+        """Scene-reset every stream to a training configuration, of n: `(seed + i) % n`, or `seeds[i] % n`."""
         super().reset(seed=seed if isinstance(seed, int) else None)
-        self.scene_reset(self._all, self._configurations_of(seed))
+        starts = np.arange(len(self.benchmark.configurations["train"]))
+        self.scene_reset(self._all, self._choose_starts(seed, starts))
         return self.observe(), self._info()
 
-    def _configurations_of(self, seed: int | Sequence[int] | None) -> np.ndarray:
+    def _choose_starts(self, seed: int | Sequence[int] | None, starts: np.ndarray) -> np.ndarray:
+        """One of the configurations `starts` (k,) for each stream, by its seed."""
         if seed is None:
-            return self.np_random.integers(NUM_CONFIGURATIONS, size=self.num_envs)
+            return starts[self.np_random.integers(len(starts), size=self.num_envs)]
         seeds = seed + self._all if isinstance(seed, int | np.integer) else np.asarray(seed)
         if len(seeds) != self.num_envs:
             raise ValueError(f"got {len(seeds)} seeds for {self.num_envs} environments")
-        return seeds % NUM_CONFIGURATIONS
+        return starts[seeds % len(starts)]
 
     def step(self, actions: np.ndarray):
         """Apply actions (n, 7) in physical units; out-of-bounds values are clipped.
@@ -156,8 +160,17 @@ class CronosVectorEnv(gym.vector.VectorEnv):
     # Interventions ----------------------------------------------------------------------------------------
 
     def scene_reset(self, ids: np.ndarray, configurations: np.ndarray, split: str = "train") -> None:
-        """Put every body of streams `ids` at benchmark configurations (k,) of a split, and the arm home."""
-        self.place_bodies(ids, load_configurations(self.scene.name, split)[configurations])
+        """Put every body of streams `ids` at benchmark configurations (k,) of a split, and the arm home.
+
+        Raises:
+            ValueError: unknown split, or there is no such configuration.
+        """
+        check_split(split)
+        poses = self.benchmark.configurations[split]
+        if np.max(configurations, initial=0) >= len(poses) or np.min(configurations, initial=0) < 0:
+            valid = f"0 to {len(poses) - 1} of {split}, benchmark {self.benchmark.source}"
+            raise ValueError(f"configurations must be {valid}, got {np.asarray(configurations).tolist()}")
+        self.place_bodies(ids, poses[configurations])
 
     def place_bodies(self, ids: np.ndarray, poses: np.ndarray) -> None:
         """Put every body of streams `ids` at `poses` (k, bodies, 7), and the arm home."""
