@@ -94,7 +94,9 @@ class Architecture:
             first, second = (tuple(v) if isinstance(v, list | tuple) else v for v in values)
             return first, second
 
-        pairs = {name: pair(fields[name]) for name in ("timm_model_ids", "act_layers", "image_means", "image_stds")}
+        pairs = {
+            name: pair(fields[name]) for name in ("timm_model_ids", "act_layers", "image_means", "image_stds")
+        }
         return cls(**(fields | pairs))
 
     def to_dict(self) -> dict[str, Any]:

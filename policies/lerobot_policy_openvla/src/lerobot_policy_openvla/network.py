@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import Any
+
 import timm
 import torch
+from timm.models import VisionTransformer
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 from transformers import LlamaConfig, LlamaForCausalLM
@@ -13,11 +18,19 @@ from lerobot_policy_openvla.architecture import Architecture
 ATTENTION = ("sdpa", "eager", "flash_attention_2")
 
 
+def depth_of(tower: Any) -> int:
+    """Blocks of a timm vision transformer."""
+    return len(tower.blocks)
+
+
 class VisionTower(nn.Module):
     """Patch tokens of the second-to-last block of a DINOv2 and of a SigLIP, side by side.
 
     What comes after that block (the last block, the norm, the pooling) is never looked at and left out.
     """
+
+    featurizer: VisionTransformer
+    fused_featurizer: VisionTransformer
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()
@@ -26,7 +39,8 @@ class VisionTower(nn.Module):
             tower = timm.create_model(
                 name, pretrained=False, num_classes=0, img_size=architecture.image_size, act_layer=activation
             )
-            tower.prune_intermediate_layers([len(tower.blocks) - 2], prune_norm=True)
+            assert isinstance(tower, VisionTransformer)
+            tower.prune_intermediate_layers([depth_of(tower) - 2], prune_norm=True)
             # timm's SigLIP keeps a pooling that nothing here calls.
             tower.attn_pool = None
             towers.append(tower)
@@ -46,10 +60,10 @@ class VisionTower(nn.Module):
 
     def forward(self, pixels: Tensor) -> Tensor:
         """Map pixel values (B, 6, size, size) to patch features (B, P, width)."""
-        features = []
-        for tower, image in zip((self.featurizer, self.fused_featurizer), pixels.chunk(2, dim=1), strict=True):
-            last = len(tower.blocks) - 1
-            features += tower.forward_intermediates(image, indices=[last], output_fmt="NLC", intermediates_only=True)
+        towers, images = (self.featurizer, self.fused_featurizer), pixels.chunk(2, dim=1)
+        features = [
+            t.get_intermediate_layers(x, n=[depth_of(t) - 1])[0] for t, x in zip(towers, images, strict=True)
+        ]
         return torch.cat(features, dim=-1)
 
 
@@ -72,7 +86,9 @@ class OpenVLANetwork(nn.Module):
 
     def __init__(self, architecture: Architecture, attention: str = "sdpa") -> None:
         super().__init__()
-        text = {k: v for k, v in architecture.text_config.items() if k not in ("model_type", "torch_dtype", "dtype")}
+        text = {
+            k: v for k, v in architecture.text_config.items() if k not in ("model_type", "torch_dtype", "dtype")
+        }
         config = LlamaConfig(**text)
         config._attn_implementation = attention
         self.vision_backbone = VisionTower(architecture)
@@ -84,21 +100,36 @@ class OpenVLANetwork(nn.Module):
         """Width of the language model's hidden states."""
         return self.language_model.config.hidden_size
 
+    @property
+    def bos_token_id(self) -> int:
+        """The token that every sequence begins with."""
+        token = self.language_model.config.bos_token_id
+        return 1 if token is None else token
+
     def embed_tokens(self, tokens: Tensor) -> Tensor:
         """Tokens (B, L) to embeddings (B, L, text width)."""
         return self.language_model.model.embed_tokens(tokens)
 
-    def set_gradient_checkpointing(self, enabled: bool) -> None:
-        """Compute the blocks' activations again in the backward pass instead of keeping them.
-
-        Llama's layers do so only while they are in training mode, which changes nothing else in them; their
-        dropout stays as it is.
-        """
+    def enable_gradient_checkpointing(self) -> None:
+        """Keep fewer activations for the backward pass, see `recomputing`."""
         for tower in (self.vision_backbone.featurizer, self.vision_backbone.fused_featurizer):
-            tower.set_grad_checkpointing(enabled)
-        if enabled:
-            self.language_model.gradient_checkpointing_enable({"use_reentrant": False})
-        else:
-            self.language_model.gradient_checkpointing_disable()
-        for layer in self.language_model.model.layers:
-            layer.training = enabled
+            tower.set_grad_checkpointing(True)
+        self.language_model.gradient_checkpointing_enable({"use_reentrant": False})
+        # That also makes the embeddings take part in the gradient, which only reentrant checkpoints need.
+        self.language_model.disable_input_require_grads()
+
+    @contextmanager
+    def recomputing(self) -> Generator[None]:
+        """Inside, Llama's layers do what `enable_gradient_checkpointing` asked for, in evaluation mode too.
+
+        They do it only in training mode, which changes nothing else in a layer: dropout is in its parts.
+        """
+        layers = self.language_model.model.layers
+        modes = [layer.training for layer in layers]
+        for layer in layers:
+            layer.training = True
+        try:
+            yield
+        finally:
+            for layer, mode in zip(layers, modes, strict=True):
+                layer.training = mode
