@@ -103,9 +103,26 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--output_dir", type=Path, help="tables and figures (default: ROOT/EXPERIMENT_SCALE_OBS)")
     parser.add_argument("--import", action="append", metavar="MODULE", help="register the experiments of a module")
-    parser.add_argument("--dry_run", action="store_true", help="print the commands and their state; run nothing")
-    parser.add_argument("--report_only", action="store_true", help="draw what there is; run nothing")
+    for name, text in (
+        ("dry_run", "print the commands and their state; run nothing"),
+        ("report_only", "draw what there is; run nothing"),
+    ):
+        # LeRobot's users write --flag=true.
+        parser.add_argument(
+            f"--{name}", nargs="?", const=True, default=False, type=parse_bool, metavar="true|false", help=text
+        )
     return parser
+
+
+def parse_bool(text: str) -> bool:
+    """`true` or `false`.
+
+    Raises:
+        argparse.ArgumentTypeError: it is neither.
+    """
+    if text.lower() not in ("true", "false"):
+        raise argparse.ArgumentTypeError(f"must be true or false, got {text!r}")
+    return text.lower() == "true"
 
 
 def import_modules(arguments: list[str]) -> None:
