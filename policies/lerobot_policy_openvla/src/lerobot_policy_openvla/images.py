@@ -23,12 +23,15 @@ def centre_crop(images: Tensor, area: float = CROP_AREA) -> Tensor:
 
 
 def resize(images: Tensor, size: int) -> Tensor:
-    """Bicubic resize of images (B, 3, H, W) in 0..255 to (B, 3, size, size), rounded to whole levels.
+    """Bicubic resize of images (B, 3, H, W) in 0..255 to (B, 3, size, size), without regard to the aspect ratio.
 
-    Without regard to the aspect ratio, and rounded, as PIL does it: so the published checkpoints were trained.
+    The levels are what PIL makes of them, with which the published checkpoints were trained: along rows first,
+    then along columns, and each time rounded to whole levels.
     """
-    resized = interpolate(images.float(), size=(size, size), mode="bicubic", antialias=True)
-    return resized.round().clamp(0, 255)
+    for shape in ((images.shape[-2], size), (size, size)):
+        images = interpolate(images.float(), size=shape, mode="bicubic", antialias=True)
+        images = images.round().clamp(0, 255)
+    return images
 
 
 def prepare_images(images: Tensor, architecture: Architecture, crop: bool) -> Tensor:

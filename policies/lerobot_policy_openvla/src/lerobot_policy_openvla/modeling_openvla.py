@@ -208,7 +208,7 @@ class OpenVLAPolicy(PreTrainedPolicy):
             raise ValueError("the policy has adapters of its own already: use either --policy.lora_rank or --peft")
 
     @classmethod
-    def from_pretrained(  # ty: ignore[incompatible-method-override]
+    def from_pretrained(
         cls, pretrained_name_or_path: str | Path, *, config: PreTrainedConfig | None = None, **kwargs: Any
     ) -> OpenVLAPolicy:
         """Load a policy that was saved by LeRobot or with PEFT, or a published checkpoint.

@@ -60,10 +60,8 @@ class VisionTower(nn.Module):
 
     def forward(self, pixels: Tensor) -> Tensor:
         """Map pixel values (B, 6, size, size) to patch features (B, P, width)."""
-        towers, images = (self.featurizer, self.fused_featurizer), pixels.chunk(2, dim=1)
-        features = [
-            t.get_intermediate_layers(x, n=[depth_of(t) - 1])[0] for t, x in zip(towers, images, strict=True)
-        ]
+        towers = zip((self.featurizer, self.fused_featurizer), pixels.chunk(2, dim=1), strict=True)
+        features = [tower.get_intermediate_layers(x, n=[depth_of(tower) - 1])[0] for tower, x in towers]
         return torch.cat(features, dim=-1)
 
 
