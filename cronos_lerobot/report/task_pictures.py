@@ -47,7 +47,7 @@ def draw_sheet(pictures: list[tuple[str, list[np.ndarray]]]) -> Image.Image:
     size = (COLUMNS * (cell_width + GAP) + GAP, rows * (cell_height + GAP) + GAP)
     sheet = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(sheet)
-    font = ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"), 19)
+    font = caption_font(19)
     for i, (instruction, frames) in enumerate(pictures):
         x = GAP + i % COLUMNS * (cell_width + GAP)
         y = GAP + i // COLUMNS * (cell_height + GAP)
@@ -56,6 +56,11 @@ def draw_sheet(pictures: list[tuple[str, list[np.ndarray]]]) -> Image.Image:
             picture = Image.fromarray(frame).resize(PICTURE, Image.Resampling.LANCZOS)
             sheet.paste(picture, (x + j * PICTURE[0], y + CAPTION))
     return sheet
+
+
+def caption_font(size: int) -> ImageFont.FreeTypeFont:
+    """The font of captions, one that comes with matplotlib; `size` in px."""
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"), size)
 
 
 def main() -> None:

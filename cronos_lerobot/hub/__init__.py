@@ -1,0 +1,1 @@
+"""Benchmarks, streams, policies and results as repositories on the Hugging Face Hub."""

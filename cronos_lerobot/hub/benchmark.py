@@ -1,0 +1,120 @@
+"""The repository of a benchmark: parquet files, a card with pictures, and `eval.yaml`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import datasets
+import pyarrow as pa
+import pyarrow.parquet as pq
+import yaml
+from lerobot_env_cronos import Benchmark, gymnasium_id, load_benchmark
+from lerobot_env_cronos.benchmark import SUITES, benchmark_scene, draw_benchmark
+from lerobot_env_cronos.benchmark_files import CONFIGS, CONFIGURATIONS, make_tables
+from lerobot_env_cronos.config import DEFAULT_SCENE
+from lerobot_env_cronos.configurations import SPLITS
+from lerobot_env_cronos.scenes import BODIES, STEPS_PER_TASK
+
+from cronos_lerobot.hub.cards import render_card
+from cronos_lerobot.hub.config import BenchmarkConfig
+from cronos_lerobot.hub.pictures import configuration_pictures, configuration_sheet, task_sheet
+
+FRAMEWORK = "cronos-lerobot"
+"""`evaluation_framework` of eval.yaml."""
+REPLACES = [f"{config}/*" for config in CONFIGS] + ["pictures/*"]
+"""What a new version of a benchmark removes of the old one."""
+
+
+def choose_benchmark(config: BenchmarkConfig) -> Benchmark:
+    """The benchmark that the flags name.
+
+    Raises:
+        ValueError: it cannot be loaded or drawn.
+    """
+    if config.benchmark is not None and config.seed is not None:
+        raise ValueError("--benchmark publishes one that is there, --seed draws a new one: choose")
+    if config.benchmark is not None:
+        return load_benchmark(config.benchmark, config.scene or benchmark_scene(config.benchmark))
+    scene = config.scene or DEFAULT_SCENE
+    if config.seed is None:
+        return load_benchmark(None, scene)
+    return draw_benchmark(scene, config.seed, config.num_configurations, config.num_orderings, config.chain_length)
+
+
+def write_benchmark_repository(config: BenchmarkConfig, folder: Path) -> str:
+    """Write the tree of a benchmark's repository into `folder`; returns what it is, in words.
+
+    Raises:
+        ValueError: the benchmark cannot be loaded or drawn.
+    """
+    benchmark = choose_benchmark(config)
+    pictures = configuration_pictures(benchmark) if config.pictures else None
+    for (name, split), table in make_tables(benchmark).items():
+        path = folder / name / f"{split}.parquet"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shown = pictures[split] if pictures is not None and name == CONFIGURATIONS else None
+        pq.write_table(_describe(table, shown), path)
+    if pictures is not None:
+        (folder / "pictures").mkdir()
+        (folder / "pictures" / "tasks.png").write_bytes(task_sheet(benchmark))
+        (folder / "pictures" / "configurations.png").write_bytes(configuration_sheet(pictures))
+    title = config.title or f"CRONOS {benchmark.scene.name}"
+    (folder / "eval.yaml").write_text(_eval_yaml(benchmark, title))
+    (folder / "README.md").write_text(_card(benchmark, config, title))
+    sizes = ", ".join(f"{benchmark.size(suite, 'held_out')} {suite}" for suite in SUITES)
+    return f"{benchmark.scene.name} ({sizes} in held_out; fingerprint {benchmark.fingerprint})"
+
+
+def _describe(table: pa.Table, pictures: list[bytes] | None) -> pa.Table:
+    """The table with the Hub's description of its columns, and with a picture in each row."""
+    if pictures is not None:
+        names = (f"{i}.jpg" for i in range(len(pictures)))
+        values = [{"bytes": picture, "path": name} for picture, name in zip(pictures, names, strict=True)]
+        image = datasets.Image()
+        table = table.add_column(2, pa.field("picture", image.pa_type), pa.array(values, image.pa_type))
+    features = datasets.Features.from_arrow_schema(table.schema)
+    if pictures is not None:
+        features["picture"] = datasets.Image()
+    return table.cast(features.arrow_schema)
+
+
+def _eval_yaml(benchmark: Benchmark, title: str) -> str:
+    scene = benchmark.scene
+    content = {
+        "name": title,
+        "description": (
+            f"Pick and place ({', '.join(scene.objects)}; {', '.join(scene.receptacles)}) by instruction: single"
+            f" tasks, and chains of tasks without a reset, {STEPS_PER_TASK} control steps for each task"
+            f" ({gymnasium_id(scene.name)}, fingerprint {benchmark.fingerprint})."
+        ),
+        "evaluation_framework": FRAMEWORK,
+        "tasks": [
+            {"id": task_id(suite, split), "config": suite, "split": split} for suite in SUITES for split in SPLITS
+        ],
+    }
+    return yaml.safe_dump(content, sort_keys=False, width=110)
+
+
+def task_id(suite: str, split: str) -> str:
+    """Of eval.yaml and of results: `independent_train`, `sequential_held_out`, ..."""
+    return f"{suite}_{split}"
+
+
+def _card(benchmark: Benchmark, config: BenchmarkConfig, title: str) -> str:
+    scene = benchmark.scene
+    rows = sum(benchmark.size(suite, split) for suite in SUITES for split in SPLITS)
+    return render_card(
+        "benchmark",
+        title=title,
+        repo_id=config.repo_id,
+        benchmark=benchmark,
+        scene=scene,
+        environment=gymnasium_id(scene.name),
+        bodies=[BODIES[name] for name in scene.bodies],
+        window_steps=STEPS_PER_TASK,
+        has_pictures=config.pictures,
+        is_packaged=benchmark.fingerprint == load_benchmark(None, scene.name).fingerprint,
+        column_prefix=scene.bodies[0].replace(" ", "_"),
+        chain_length=len(benchmark.groups("sequential", "train")[0].tasks),
+        size_category="n<1K" if rows < 1000 else "1K<n<10K" if rows < 10_000 else "10K<n<100K",
+    )

@@ -1,0 +1,121 @@
+"""The configurations of `cronos-publish`, one for each thing that is published."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from cronos_lerobot.hub.push import Target
+
+
+@dataclass
+class PublishConfig:
+    """Where to, for all of them."""
+
+    repo_id: str = ""
+    """Repository on the Hub: <owner>/<name>. HF_ENDPOINT chooses the Hub, HF_TOKEN the account."""
+    branch: str | None = None
+    """Branch to push to, made if it is not there; null for main."""
+    revision: str | None = None
+    """Branch, tag or commit that a new branch starts from; null for main."""
+    private: bool | None = None
+    """Make a new repository private; null for the account's default."""
+    dry_run: bool = False
+    """Write what would be pushed to --output_dir, and push nothing."""
+    output_dir: Path | None = None
+    """Folder for the dry run; must be empty or not there."""
+
+    repo_type: ClassVar[str] = "dataset"
+
+    def validate(self) -> None:
+        """Check what all of them need.
+
+        Raises:
+            ValueError: a flag is missing or in vain.
+            FileExistsError: the dry run's folder is in use.
+        """
+        if not self.repo_id:
+            raise ValueError("--repo_id=<owner>/<name> is required, also in a dry run: the card names it")
+        if self.revision and not self.branch:
+            raise ValueError("--revision is what a new --branch starts from; there is no --branch")
+        if self.dry_run != (self.output_dir is not None):
+            raise ValueError("--dry_run=true and --output_dir=<folder> go together")
+        if self.output_dir is not None and self.output_dir.exists() and any(self.output_dir.iterdir()):
+            raise FileExistsError(f"{self.output_dir} is not empty; choose another --output_dir")
+
+    @property
+    def target(self) -> Target:
+        """The place on the Hub."""
+        return Target(self.repo_id, self.repo_type, self.branch, self.revision, self.private)
+
+
+@dataclass
+class BenchmarkConfig(PublishConfig):
+    """Publish a benchmark: configurations of a scene, episodes and chains.
+
+    By default this package's; with --benchmark another one that is there; with --seed a new one.
+    """
+
+    scene: str = ""
+    """Scene: kitchen_2x2 (default), kitchen_3x3, playroom_2x2, or a registered one."""
+    benchmark: str | None = None
+    """Publish this one: a folder, or <owner>/<repository>[@<revision>]; see docs/hub.md for the files."""
+    seed: int | None = None
+    """Draw new configurations and orderings from this seed."""
+    num_configurations: int = 64
+    """With --seed: configurations of each split."""
+    num_orderings: int = 10
+    """With --seed: orderings, each from every configuration."""
+    chain_length: int | None = None
+    """With --seed: tasks of a chain; null for all of the scene."""
+    title: str = ""
+    """Title of the card and the leaderboard; `CRONOS <scene>` by default."""
+    pictures: bool = True
+    """Pictures of the tasks and of every configuration; they need OpenGL."""
+
+
+@dataclass
+class StreamConfig(PublishConfig):
+    """Publish recorded training streams as a LeRobotDataset."""
+
+    root: Path | None = None
+    """Folder of the dataset: --record.root of cronos-train, by default <run>/streams."""
+    run: Path | None = None
+    """Folder of the training run, for the card; by default the one that the dataset lies in, if it does."""
+
+
+@dataclass
+class PolicyConfig(PublishConfig):
+    """Publish a policy that cronos-train made, with what it was trained with."""
+
+    path: Path | None = None
+    """Run folder of cronos-train (its last checkpoint), or one of its checkpoints."""
+    dataset: str | None = None
+    """Dataset repository of its recorded streams; by default the --record.repo_id of the run."""
+    base_policy: str | None = None
+    """Model repository of the policy that training began with; by default the run's --policy.path, if that is
+    one."""
+    results: Path | None = None
+    """results.json of cronos-eval, or its folder, for the card."""
+
+    repo_type: ClassVar[str] = "model"
+
+
+@dataclass
+class ResultsConfig(PublishConfig):
+    """Publish results of cronos-eval to a policy's repository, for the benchmark's leaderboard."""
+
+    results: Path | None = None
+    """results.json of cronos-eval, or its folder."""
+    benchmark: str = ""
+    """Benchmark that was evaluated: dataset repository, <owner>/<repository>[@<revision>]."""
+    suites: str = "independent,sequential"
+    """Suites to publish, comma-separated."""
+    partial: bool = False
+    """Publish an evaluation of fewer episodes than the benchmark has, or with other options than its own; the
+    entry says so."""
+    source_url: str | None = None
+    """Page with the details of the evaluation, such as its log."""
+
+    repo_type: ClassVar[str] = "model"

@@ -1,0 +1,126 @@
+"""The repository of a policy: the checkpoint as LeRobot wrote it, a card, and curves."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from cronos_lerobot.evaluation.store import RESULTS
+from cronos_lerobot.hub.cards import render_card
+from cronos_lerobot.hub.config import PolicyConfig
+from cronos_lerobot.hub.runs import (
+    Checkpoint,
+    find_checkpoint,
+    is_repository,
+    read_run,
+    run_facts,
+    train_config_path,
+)
+from cronos_lerobot.report import figures
+from cronos_lerobot.report.runs import TrainingRun, group_runs
+
+REPLACES = ["curves/*"]
+FIGURES = {
+    "evaluation": ("Periodic evaluation, with 95 % intervals", figures.evaluation_figure),
+    "training": ("Success of the training streams' segments", figures.training_figure),
+    "segments": ("The same by segment since the last scene reset, last quarter", figures.segments_figure),
+}
+DPI = 110
+
+
+def write_policy_repository(config: PolicyConfig, folder: Path) -> str:
+    """Write the tree of a policy's repository into `folder`; returns what it is, in words.
+
+    Raises:
+        ValueError: --path is missing, or results.json is none.
+        FileNotFoundError: there is no policy, or no results.json.
+    """
+    if config.path is None:
+        raise ValueError("--path=<run folder or checkpoint> is required")
+    checkpoint = find_checkpoint(config.path)
+    for file in sorted(checkpoint.model.iterdir()):
+        if file.is_file():
+            shutil.copyfile(file, folder / file.name)
+    policy = json.loads((checkpoint.model / "config.json").read_text())
+    run = read_run(checkpoint.run, checkpoint.step) if checkpoint.run else None
+    curves = _draw_curves(run, folder) if run else []
+    results = read_results(config.results) if config.results else None
+    (folder / "README.md").write_text(_card(config, checkpoint, policy, run, curves, results))
+    steps = f" after {run.last['interaction_steps']} interaction steps" if run else ""
+    return f"{policy['type']} policy{steps}"
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """Read results.json of cronos-eval, given itself or its folder.
+
+    Raises:
+        FileNotFoundError: it is not there.
+        ValueError: it is of something else.
+    """
+    file = path / RESULTS if path.is_dir() else path
+    if not file.is_file():
+        raise FileNotFoundError(f"no {RESULTS} of cronos-eval at {path}")
+    results = json.loads(file.read_text())
+    if not isinstance(results, dict) or results.get("format") != 1:
+        raise ValueError(f"{file} is no {RESULTS} of cronos-eval in format 1")
+    return results
+
+
+def _draw_curves(run: TrainingRun, folder: Path) -> list[tuple[str, str]]:
+    """Draw what there is to draw; returns (caption, path) of each."""
+    groups = group_runs([run])
+    drawn = []
+    for name, (caption, draw) in FIGURES.items():
+        figure: Figure | None = draw(groups)
+        if figure is None:
+            continue
+        path = folder / "curves" / f"{name}.png"
+        path.parent.mkdir(exist_ok=True)
+        figure.savefig(path, dpi=DPI)
+        drawn.append((caption, f"curves/{name}.png"))
+    return drawn
+
+
+def _card(
+    config: PolicyConfig,
+    checkpoint: Checkpoint,
+    policy: dict[str, Any],
+    run: TrainingRun | None,
+    curves: list[tuple[str, str]],
+    results: dict[str, Any] | None,
+) -> str:
+    trained = json.loads(train_config_path(checkpoint.model).read_text()) if _has_config(checkpoint) else {}
+    base = (run.config.get("policy") or {}).get("pretrained_path") if run else None
+    recorded = (trained.get("record") or trained.get("dataset") or {}).get("repo_id")
+    base_model = config.base_policy or (str(base) if is_repository(base) else None)
+    env = trained.get("env") or {}
+    return render_card(
+        "policy",
+        repo_id=config.repo_id,
+        policy_type=policy["type"],
+        inputs=policy.get("input_features") or {},
+        outputs=policy.get("output_features") or {},
+        run=run_facts(run) if run else None,
+        dataset=config.dataset or recorded,
+        is_demonstrations=run is None,
+        base_model=base_model,
+        base_is_local=base is not None and base_model is None,
+        scene=env.get("scene") or "kitchen_2x2",
+        obs_type=env.get("obs_type") or _guess_observation(policy),
+        curves=curves,
+        results=results,
+    )
+
+
+def _has_config(checkpoint: Checkpoint) -> bool:
+    return train_config_path(checkpoint.model).is_file()
+
+
+def _guess_observation(policy: dict[str, Any]) -> str:
+    features = (policy.get("input_features") or {}).values()
+    has_pixels = any(feature.get("type") == "VISUAL" for feature in features)
+    return "pixels_agent_pos" if has_pixels else "environment_state_agent_pos"

@@ -1,0 +1,143 @@
+"""Pushes a folder to the Hub, and says in one sentence what went wrong."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+from huggingface_hub import HfApi, constants
+from huggingface_hub.errors import (
+    HfHubHTTPError,
+    HFValidationError,
+    LocalTokenNotFoundError,
+    RepositoryNotFoundError,
+    RevisionNotFoundError,
+)
+from huggingface_hub.utils import disable_progress_bars
+
+
+class PublishError(Exception):
+    """Publishing failed; the message says why and what helps."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A place on the Hub."""
+
+    repo_id: str
+    repo_type: str
+    """`dataset` or `model`."""
+    branch: str | None = None
+    """Where to push, `main` by default; made if it is not there."""
+    revision: str | None = None
+    """What a new branch starts from, `main` by default."""
+    private: bool | None = None
+
+    @property
+    def url(self) -> str:
+        """Its page."""
+        prefix = "datasets/" if self.repo_type == "dataset" else ""
+        branch = f"/tree/{self.branch}" if self.branch else ""
+        return f"{constants.ENDPOINT}/{prefix}{self.repo_id}{branch}"
+
+
+def push_folder(
+    folder: Path,
+    target: Target,
+    message: str,
+    *,
+    replaces: Sequence[str] = (),
+    tag: str | None = None,
+    creates: bool = True,
+) -> str:
+    """Make the repository what `folder` is; files that are there already are not sent again.
+
+    Args:
+        folder: the tree to push.
+        target: where to.
+        message: of the commit.
+        replaces: patterns of files that are removed where the folder does not have them.
+        tag: to put onto the result, moved if it is there.
+        creates: make the repository if it is not there.
+
+    Returns:
+        The URL of the repository.
+
+    Raises:
+        PublishError: the Hub refused, or the connection was lost; pushing again goes on with what is missing.
+    """
+    if not sys.stderr.isatty():
+        disable_progress_bars()
+        # The Hub's advice on large folders and its retries: what matters of them is in our errors.
+        logging.getLogger("huggingface_hub").setLevel(logging.ERROR)
+    api = HfApi()
+    repo_id, kind = target.repo_id, target.repo_type
+    with explained(target):
+        if creates:
+            api.create_repo(repo_id, repo_type=kind, private=target.private, exist_ok=True)
+        if target.branch:
+            api.create_branch(
+                repo_id, repo_type=kind, branch=target.branch, revision=target.revision, exist_ok=True
+            )
+        api.upload_folder(
+            repo_id=repo_id,
+            repo_type=kind,
+            folder_path=folder,
+            revision=target.branch,
+            commit_message=message,
+            delete_patterns=list(replaces) or None,
+        )
+        if tag:
+            _move_tag(api, target, tag)
+    return target.url
+
+
+def _move_tag(api: HfApi, target: Target, tag: str) -> None:
+    with suppress(RevisionNotFoundError):
+        api.delete_tag(target.repo_id, repo_type=target.repo_type, tag=tag)
+    api.create_tag(target.repo_id, repo_type=target.repo_type, tag=tag, revision=target.branch)
+
+
+@contextmanager
+def explained(target: Target) -> Generator[None]:
+    """Turn what the Hub's client raises into a PublishError."""
+    try:
+        yield
+    except Exception as error:
+        why = _explain(error, target)
+        if why is None:
+            raise
+        raise PublishError(why) from error
+
+
+def _explain(error: BaseException, target: Target) -> str | None:
+    where, hub = f"{target.repo_type} {target.repo_id}", constants.ENDPOINT
+    if isinstance(error, HFValidationError):
+        return f"{target.repo_id!r} is no name of a repository, expected <owner>/<name>: {error}"
+    if isinstance(error, RevisionNotFoundError):
+        return f"{where} has no revision {target.revision or target.branch or 'main'!r} on {hub}"
+    if isinstance(error, LocalTokenNotFoundError):
+        return f"there is no token for {hub}: set HF_TOKEN, or run `hf auth login`"
+    status = getattr(error.response, "status_code", None) if isinstance(error, HfHubHTTPError) else None
+    if status == 401:
+        return (
+            f"{hub} refused the token, or there is none: set HF_TOKEN to one that may write (or `hf auth login`)"
+        )
+    if isinstance(error, RepositoryNotFoundError):
+        return f"there is no {where} on {hub}, or the token gives no access to it"
+    if status == 403:
+        return f"the token may not write to {where} on {hub}"
+    if isinstance(error, HfHubHTTPError) and status is not None and status < 500:
+        return f"{hub} refused: {error}"
+    if isinstance(error, HfHubHTTPError | httpx.TransportError):
+        return (
+            f"lost the connection to {hub} ({type(error).__name__}) while pushing to {where}: run the same command"
+            " again, it goes on with what is missing"
+        )
+    # An upload in a thread is reported with its cause.
+    return _explain(error.__cause__, target) if isinstance(error, RuntimeError) and error.__cause__ else None

@@ -1,0 +1,167 @@
+"""`.eval_results/cronos.yaml` of a policy's repository: scores for the benchmark's leaderboard on the Hub."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+from huggingface_hub import EvalResultEntry, HfApi, eval_result_entries_to_yaml
+from huggingface_hub.errors import EntryNotFoundError
+from lerobot_env_cronos import Benchmark, gymnasium_id, load_benchmark
+from lerobot_env_cronos.benchmark import SUITES
+
+from cronos_lerobot.hub.benchmark import task_id
+from cronos_lerobot.hub.config import ResultsConfig
+from cronos_lerobot.hub.policy import read_results
+from cronos_lerobot.hub.push import PublishError, explained
+
+FILE = ".eval_results/cronos.yaml"
+STANDARD = {"advance": "window", "end_effector_reset": False}
+"""How the benchmark's chains are run; another way is another score."""
+
+
+def write_results(config: ResultsConfig, folder: Path) -> str:
+    """Write the repository's results with the new ones among them into `folder`; returns what they are, in words.
+
+    Raises:
+        ValueError: the results are not of this benchmark, or not of all of it.
+        PublishError: the policy's repository is missing, or its results cannot be read.
+    """
+    if config.results is None:
+        raise ValueError("--results=<results.json of cronos-eval, or its folder> is required")
+    results = read_results(config.results)
+    benchmark = _load(config, results)
+    entries = make_entries(results, benchmark, config)
+    content = merge(_published(config), eval_result_entries_to_yaml(entries))
+    path = folder / FILE
+    path.parent.mkdir(parents=True)
+    path.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=110))
+    values = ", ".join(f"{entry.task_id} {entry.value:g}" for entry in entries)
+    return f"results on {benchmark.source}: {values}"
+
+
+def _load(config: ResultsConfig, results: dict[str, Any]) -> Benchmark:
+    """The benchmark's repository, checked to be what was evaluated."""
+    evaluated = results.get("benchmark")
+    if evaluated is None:
+        raise ValueError(
+            "results.json does not say which benchmark was evaluated: an older version wrote it. The cronos-eval"
+            " command that made it, run again, writes it anew from the finished parts"
+        )
+    name = config.benchmark or evaluated["source"]
+    if name.count("/") != 1 or Path(name).is_dir():
+        raise ValueError(f"--benchmark=<owner>/<repository>[@<revision>] is required; evaluated was {name}")
+    benchmark = load_benchmark(name, results["scene"])
+    here = {"environment": gymnasium_id(benchmark.scene.name), "fingerprint": benchmark.fingerprint}
+    differing = [
+        f"{key} {evaluated[key]} was evaluated, {name} has {value}"
+        for key, value in here.items()
+        if evaluated[key] != value
+    ]
+    if differing:
+        raise ValueError(
+            f"the results are not of {name}: {'; '.join(differing)}. Evaluate with --env.benchmark={name}"
+        )
+    return benchmark
+
+
+def make_entries(results: dict[str, Any], benchmark: Benchmark, config: ResultsConfig) -> list[EvalResultEntry]:
+    """An entry for each suite and split of results.json.
+
+    Raises:
+        ValueError: there is nothing to publish, or an evaluation was partial and `config.partial` is not set.
+    """
+    suites = [suite.strip() for suite in config.suites.split(",")]
+    if unknown := set(suites) - set(SUITES):
+        raise ValueError(f"unknown suites {sorted(unknown)}; valid suites: {list(SUITES)}")
+    dataset_id, _, revision = benchmark.source.partition("@")
+    entries = []
+    for suite in suites:
+        for split, scores in results.get(suite, {}).items():
+            caveat = _caveat(suite, split, scores["n"], benchmark.size(suite, split), results)
+            if caveat and not config.partial:
+                raise ValueError(f"{task_id(suite, split)}: {caveat}; --partial=true publishes it all the same")
+            entries.append(
+                EvalResultEntry(
+                    dataset_id=dataset_id,
+                    dataset_revision=revision or None,
+                    task_id=task_id(suite, split),
+                    value=_value(suite, scores),
+                    date=results["date"],
+                    source_url=config.source_url,
+                    notes="; ".join([f"PARTIAL: {caveat}"] * bool(caveat) + _notes(suite, scores, results)),
+                )
+            )
+    if not entries:
+        raise ValueError(f"results.json has none of the suites {suites}")
+    return entries
+
+
+def _caveat(suite: str, split: str, n: int, size: int, results: dict[str, Any]) -> str | None:
+    """In which way an evaluation is not the benchmark's own, if in any."""
+    if n != size:
+        return f"{n} of the {size} {'chains' if suite == 'sequential' else 'episodes'} of {split} were evaluated"
+    other = {name: results[name] for name, value in STANDARD.items() if results[name] != value}
+    return f"evaluated with {other}, the benchmark has {STANDARD}" if suite == "sequential" and other else None
+
+
+def _value(suite: str, scores: dict[str, Any]) -> float:
+    if suite == "sequential":
+        return round(scores["average_chain_length"]["mean"], 4)
+    return round(100 * scores["success"], 4)
+
+
+def _notes(suite: str, scores: dict[str, Any], results: dict[str, Any]) -> list[str]:
+    """What a reader of the leaderboard needs: size, interval, settings."""
+    if suite == "sequential":
+        low, high = scores["average_chain_length"]["ci95"]
+        positions = ", ".join(f"{100 * position['success']:.1f}" for position in scores["positions"])
+        what = [f"average chain length, 95 % interval {low:.2f} to {high:.2f}", f"SEQ 0, 1, ... {positions} %"]
+    else:
+        low, high = scores["ci95"]
+        what = [f"success in %, 95 % interval {100 * low:.1f} to {100 * high:.1f}"]
+    temperature = results["temperature"]
+    how = (
+        "greedy"
+        if temperature == 0
+        else f"temperature {temperature}"
+        if temperature
+        else "the policy's own sampling"
+    )
+    versions = results["versions"]
+    packages = [
+        f"{name} {versions[name]}" for name in ("cronos-lerobot", "lerobot_env_cronos") if name in versions
+    ]
+    return [f"n={scores['n']}", *what, how, f"seed {results['seed']}", results["obs_type"], ", ".join(packages)]
+
+
+def _published(config: ResultsConfig) -> list[dict[str, Any]]:
+    """The entries that the repository has."""
+    api = HfApi()
+    with explained(config.target):
+        refs = api.list_repo_refs(config.repo_id)
+        branches = {branch.name for branch in refs.branches}
+        revision = config.branch if config.branch in branches else config.revision
+        api.model_info(config.repo_id, revision=revision)
+        try:
+            path = api.hf_hub_download(config.repo_id, FILE, revision=revision)
+        except EntryNotFoundError:
+            return []
+    entries = yaml.safe_load(Path(path).read_text()) or []
+    if not isinstance(entries, list) or not all(
+        isinstance(entry, dict) and "dataset" in entry for entry in entries
+    ):
+        raise PublishError(f"{FILE} of {config.repo_id} is no list of results; mend or delete it first")
+    return entries
+
+
+def merge(there: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Entries with the new ones in the place of older ones of the same benchmark and task, or at the end."""
+
+    def key(entry: dict[str, Any]) -> tuple[Any, Any]:
+        return entry["dataset"].get("id"), entry["dataset"].get("task_id")
+
+    latest = {key(entry): entry for entry in new}
+    kept = [latest.pop(key(entry), entry) for entry in there]
+    return kept + list(latest.values())

@@ -1,0 +1,117 @@
+"""What a card tells about a training run of cronos-train."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+
+from cronos_lerobot.hub.cards import command_line
+from cronos_lerobot.protocol import COUNTED_INTERVENTIONS
+from cronos_lerobot.report.runs import TrainingRun, describe_protocol, read_training_run
+from cronos_lerobot.training.logging import MANIFEST, METRICS
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A policy on disk, and the run that it comes from."""
+
+    model: Path
+    """LeRobot's folder: config.json, model.safetensors, processors."""
+    run: Path | None
+    """Folder of cronos-train, if it is of one."""
+    step: int | None
+    """Interaction steps before it, if it is of a run."""
+
+
+def find_checkpoint(path: Path) -> Checkpoint:
+    """The checkpoint that `path` means: a run folder (the last one), a checkpoint, or a model's folder.
+
+    Raises:
+        FileNotFoundError: there is no policy there.
+    """
+    candidates = (
+        path / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR,
+        path / PRETRAINED_MODEL_DIR,
+        path,
+    )
+    for model in candidates:
+        if (model / "config.json").is_file() and any(model.glob("*.safetensors")):
+            break
+    else:
+        raise FileNotFoundError(
+            f"{path} holds no policy: expected a run folder of cronos-train, one of its checkpoints, or a folder"
+            " with config.json and model.safetensors"
+        )
+    model = model.resolve()
+    checkpoint = model.parent
+    run = checkpoint.parent.parent
+    if checkpoint.name.isdigit() and (run / METRICS).is_file() and (run / MANIFEST).is_file():
+        return Checkpoint(model, run, int(checkpoint.name))
+    return Checkpoint(model, None, None)
+
+
+def read_run(folder: Path, step: int | None = None) -> TrainingRun:
+    """A run as it was at `step`, or as it is."""
+    run = read_training_run(folder)
+    if step is not None:
+        run.evaluations = [record for record in run.evaluations if record["interaction_steps"] <= step]
+        run.updates = [record for record in run.updates if record["interaction_steps"] <= step]
+    return run
+
+
+def run_facts(run: TrainingRun) -> dict[str, Any]:
+    """The facts of a run that cards show."""
+    config, last = run.config, run.last
+    env, protocol = config["env"], config["protocol"]
+    return {
+        "scene": env["scene"],
+        "env": env,
+        "observation": describe_observation(env),
+        "protocol": protocol,
+        "protocol_name": describe_protocol(protocol),
+        "algorithm": config["algorithm"]["type"],
+        "num_envs": config["num_envs"],
+        "seed": config["seed"],
+        "steps": last["interaction_steps"],
+        "updates": last["updates"],
+        "interventions": last["interventions"],
+        "by_kind": _by_kind(last["interventions_by_kind"]),
+        "evaluations": run.evaluations,
+        "versions_then": run.starts[-1]["versions"],
+        "commit_then": run.starts[-1]["git_commit"],
+        "command": command_line(run.starts[0]["command"]),
+        "num_starts": len(run.starts),
+    }
+
+
+def _by_kind(counts: dict[str, int]) -> list[tuple[str, int, str]]:
+    """(kind, number, whether it counts as an intervention)."""
+    counted = {kind.name.lower() for kind in COUNTED_INTERVENTIONS}
+    return [
+        (name.lower().replace("_", " "), number, "yes" if name.lower() in counted else "no")
+        for name, number in counts.items()
+    ]
+
+
+def describe_observation(env: dict[str, Any]) -> str:
+    """What was observed, in words."""
+    if env["obs_type"] != "pixels_agent_pos":
+        return "privileged state: the poses of all bodies"
+    cameras = " and ".join(f"`{name.strip()}`" for name in env["camera_name"].split(","))
+    state = ", with the privileged state beside it" if env["privileged_state"] else ""
+    return f"camera {cameras}, {env['observation_width']} x {env['observation_height']} px{state}"
+
+
+def is_repository(name: Any) -> bool:
+    """Whether a path or name can be a repository on the Hub: `<owner>/<name>`, and no folder here."""
+    text = str(name or "")
+    return text.count("/") == 1 and not text.startswith((".", "/", "~")) and not Path(text).exists()
+
+
+def train_config_path(model: Path) -> Path:
+    """Of the training config beside a policy."""
+    return model / TRAIN_CONFIG_NAME

@@ -1,0 +1,132 @@
+"""The repository of a recorded dataset, streams or demonstrations: the LeRobotDataset as it is, and a card."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from lerobot.datasets.utils import INFO_PATH
+from lerobot_env_cronos import gymnasium_id
+from lerobot_env_cronos.scenes import SCENES
+from lerobot_env_cronos.statistics import wilson_interval
+
+from cronos_lerobot.data.schema import STREAM_ID
+from cronos_lerobot.data.streams import StreamDataset
+from cronos_lerobot.hub.cards import render_card
+from cronos_lerobot.hub.config import StreamConfig
+from cronos_lerobot.hub.runs import read_run, run_facts
+from cronos_lerobot.training.logging import MANIFEST, METRICS
+
+FOLDERS = ("data", "meta", "videos")
+"""Of a LeRobotDataset; others, such as pictures that wait to be encoded, stay here."""
+REPLACES = [f"{folder}/*" for folder in FOLDERS]
+
+
+def read_info(config: StreamConfig) -> dict[str, Any]:
+    """meta/info.json of the dataset.
+
+    Raises:
+        ValueError: --root is missing, or the dataset is empty.
+        FileNotFoundError: there is no dataset.
+    """
+    if config.root is None:
+        raise ValueError("--root=<folder of the dataset> is required, such as outputs/train/eer/streams")
+    path = config.root / INFO_PATH
+    if not path.is_file():
+        raise FileNotFoundError(f"{config.root} is no LeRobotDataset: it has no {INFO_PATH}")
+    info = json.loads(path.read_text())
+    if not info["total_episodes"]:
+        raise ValueError(f"{config.root} has no episode yet")
+    return info
+
+
+def read_codebase_version(config: StreamConfig) -> str:
+    """LeRobot's version of the dataset's format, the tag that LeRobot looks for on the Hub."""
+    return read_info(config)["codebase_version"]
+
+
+def write_stream_repository(config: StreamConfig, folder: Path) -> str:
+    """Write the tree of a dataset's repository into `folder`; returns what it is, in words.
+
+    A dry run copies the files; a push, whose tree is gone afterwards, links them.
+
+    Raises:
+        ValueError: --root is missing or the dataset is empty.
+        FileNotFoundError: there is no dataset, or --run is no run.
+    """
+    info = read_info(config)
+    assert config.root is not None
+    for name in FOLDERS:
+        for file in sorted((config.root / name).rglob("*")):
+            # What the recorder has not finished yet has a hidden name.
+            if file.is_file() and not file.name.startswith("."):
+                place = folder / file.relative_to(config.root)
+                place.parent.mkdir(parents=True, exist_ok=True)
+                if config.dry_run:
+                    shutil.copyfile(file, place)
+                else:
+                    place.symlink_to(file.resolve())
+    is_stream = STREAM_ID in info["features"]
+    card = _stream_card(config, info) if is_stream else _demonstrations_card(config, info)
+    (folder / "README.md").write_text(card)
+    kind = "streams" if is_stream else "demonstrations"
+    return f"{kind}: {info['total_episodes']} episodes, {info['total_frames']} frames"
+
+
+def _find_run(config: StreamConfig) -> Path | None:
+    """Folder of the training run, given or around the dataset."""
+    assert config.root is not None
+    if config.run is not None:
+        if not (config.run / MANIFEST).is_file():
+            raise FileNotFoundError(f"{config.run} is no run of cronos-train: it has no {MANIFEST}")
+        return config.run
+    around = config.root.resolve().parent
+    return around if (around / MANIFEST).is_file() and (around / METRICS).is_file() else None
+
+
+def _stream_card(config: StreamConfig, info: dict[str, Any]) -> str:
+    from cronos_lerobot.data.stream_statistics import statistics
+
+    streams = StreamDataset(config.repo_id, root=config.root)
+    run = _find_run(config)
+    return render_card(
+        "streams",
+        repo_id=config.repo_id,
+        info=info,
+        statistics=statistics(streams),
+        missing=_missing(streams),
+        run=run_facts(read_run(run)) if run else None,
+        interval=wilson_interval,
+        **_common(info, run),
+    )
+
+
+def _missing(streams: StreamDataset) -> str | None:
+    """What is missing of the streams, if anything: filtered ones are not whole."""
+    try:
+        streams.check()
+    except ValueError as error:
+        return str(error)
+    return None
+
+
+def _demonstrations_card(config: StreamConfig, info: dict[str, Any]) -> str:
+    return render_card("demonstrations", repo_id=config.repo_id, info=info, **_common(info, None))
+
+
+def _common(info: dict[str, Any], run: Path | None) -> dict[str, Any]:
+    scene = read_run(run).config["env"]["scene"] if run else None
+    cameras = [name for name, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
+    observation = [
+        f"`{name}` {feature['shape'][1]} x {feature['shape'][0]} px"
+        for name, feature in info["features"].items()
+        if name in cameras
+    ] + [f"`{name}`" for name in info["features"] if name.startswith("observation.") and name not in cameras]
+    return {
+        "scene": scene,
+        "environment": gymnasium_id(scene) if scene in SCENES else None,
+        "observation": ", ".join(observation),
+        "is_video": any(feature["dtype"] == "video" for feature in info["features"].values()),
+    }

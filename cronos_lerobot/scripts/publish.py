@@ -1,0 +1,116 @@
+"""`cronos-publish`: benchmarks, streams, policies and results to the Hugging Face Hub.
+
+cronos-publish benchmark   configurations and chains of a scene, for `--env.benchmark` and `datasets.load_dataset`
+cronos-publish stream      recorded training streams, a LeRobotDataset
+cronos-publish policy      a policy with its training protocol, its interventions and its curves
+cronos-publish results     results of cronos-eval to a policy's repository, for the benchmark's leaderboard
+
+examples:
+  the benchmark of a scene; and one of your own, drawn from a seed
+      cronos-publish benchmark --repo_id=me/cronos_kitchen
+      cronos-publish benchmark --repo_id=me/my_kitchen --seed=7 --num_configurations=32 --num_orderings=4
+  what would be pushed, as a folder
+      cronos-publish benchmark --repo_id=me/cronos_kitchen --dry_run=true --output_dir=outputs/publish
+  a training run: its streams, its policy
+      cronos-publish stream --root=outputs/train/eer/streams --repo_id=me/eer_stream
+      cronos-publish policy --path=outputs/train/eer --repo_id=me/eer
+  what the policy achieves
+      cronos-eval --policy.path=me/eer --env.benchmark=me/cronos_kitchen --output_dir=outputs/eval/eer
+      cronos-publish results --results=outputs/eval/eer --benchmark=me/cronos_kitchen --repo_id=me/eer
+
+HF_ENDPOINT chooses the Hub and HF_TOKEN the account (or `hf auth login`). After a lost connection the same command
+goes on with what is missing. `cronos-publish policy --help` has the flags of a command, docs/hub.md the rest.
+"""
+
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import draccus
+from draccus.utils import ParsingError
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from cronos_lerobot.hub.config import BenchmarkConfig, PolicyConfig, PublishConfig, ResultsConfig, StreamConfig
+from cronos_lerobot.hub.push import PublishError, push_folder
+
+
+def publish_benchmark(config: BenchmarkConfig) -> None:
+    """`cronos-publish benchmark`."""
+    from cronos_lerobot.hub.benchmark import REPLACES, write_benchmark_repository
+
+    _publish(config, write_benchmark_repository, replaces=REPLACES)
+
+
+def publish_stream(config: StreamConfig) -> None:
+    """`cronos-publish stream`."""
+    from cronos_lerobot.hub.streams import REPLACES, read_codebase_version, write_stream_repository
+
+    version = read_codebase_version(config)
+    _publish(config, write_stream_repository, replaces=REPLACES, tag=version)
+
+
+def publish_policy(config: PolicyConfig) -> None:
+    """`cronos-publish policy`."""
+    from cronos_lerobot.hub.policy import REPLACES, write_policy_repository
+
+    _publish(config, write_policy_repository, replaces=REPLACES)
+
+
+def publish_results(config: ResultsConfig) -> None:
+    """`cronos-publish results`."""
+    from cronos_lerobot.hub.results import write_results
+
+    _publish(config, write_results, creates=False)
+
+
+def _publish(
+    config: Any,
+    write: Callable[[Any, Path], str],
+    **push: Any,
+) -> None:
+    """Write the tree, to the dry run's folder or to one that is pushed and gone."""
+    if config.dry_run:
+        config.output_dir.mkdir(parents=True, exist_ok=True)
+        what = write(config, config.output_dir)
+        files = [path for path in config.output_dir.rglob("*") if path.is_file()]
+        size = sum(path.stat().st_size for path in files) / 1e6
+        print(f"dry run: {what}\n{len(files)} files, {size:.2f} MB in {config.output_dir}; nothing was pushed")
+        return
+    with tempfile.TemporaryDirectory(prefix="cronos_publish_") as folder:
+        what = write(config, Path(folder))
+        url = push_folder(Path(folder), config.target, f"Publish {what}", **push)
+    print(f"published {what}\n{url}")
+
+
+COMMANDS: dict[str, tuple[type[PublishConfig], Callable[[Any], None]]] = {
+    "benchmark": (BenchmarkConfig, publish_benchmark),
+    "stream": (StreamConfig, publish_stream),
+    "policy": (PolicyConfig, publish_policy),
+    "results": (ResultsConfig, publish_results),
+}
+
+
+def main() -> None:
+    """Entry point of `cronos-publish`."""
+    command, *arguments = sys.argv[1:] or ["--help"]
+    if command in ("--help", "-h"):
+        print(__doc__)
+        return
+    if command not in COMMANDS:
+        sys.exit(f"error: unknown command {command!r}; valid commands: {list(COMMANDS)}")
+    config_class, publish = COMMANDS[command]
+    register_third_party_plugins()
+    try:
+        config = draccus.parse(config_class, args=arguments)
+        config.validate()
+        publish(config)
+    except ParsingError as error:
+        sys.exit(f"error: {error.__cause__ or error}")
+    except (ValueError, OSError, PublishError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()
