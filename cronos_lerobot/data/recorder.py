@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, REWARD
@@ -17,6 +17,7 @@ from cronos_lerobot.data.schema import (
     STREAM_ID,
     STREAM_INTERVENTIONS,
     SUCCESS,
+    SUCCESS_FRAME,
     TOTAL_INTERVENTIONS,
     VALUE,
     Intervention,
@@ -24,6 +25,7 @@ from cronos_lerobot.data.schema import (
     frame_format,
     observation_columns,
     stream_features,
+    with_cameras,
 )
 from cronos_lerobot.data.writer import SegmentWriter
 
@@ -49,7 +51,7 @@ class StreamRecorder:
         *,
         num_envs: int,
         segment_length: int,
-        streams: int | Literal["all"] = "all",
+        streams: int | str = "all",
     ) -> None:
         """Record into `writer` (see `open` for the usual way to make one).
 
@@ -84,7 +86,8 @@ class StreamRecorder:
         root: str | Path,
         *,
         segment_length: int,
-        streams: int | Literal["all"] = "all",
+        streams: int | str = "all",
+        cameras: Mapping[str, tuple[int, int]] | None = None,
         state: Mapping[str, Any] | None = None,
         **writer_options: Any,
     ) -> Self:
@@ -96,11 +99,15 @@ class StreamRecorder:
             root: its folder; must not exist for a new dataset and must for a resumed one.
             segment_length: the most steps between two task switches (K).
             streams: how many of the streams to record, or "all".
+            cameras: pictures to record in place of the observation's: (height, width) [px] by camera.
             state: of `state_dict()`. Everything that was written after it is dropped from the dataset.
             writer_options: passed on to `SegmentWriter`.
         """
         if state is None:
-            features = stream_features(env.single_observation_space, **feature_names(env))
+            space = env.single_observation_space
+            if cameras is not None:
+                space = with_cameras(space, cameras)
+            features = stream_features(space, **feature_names(env))
             fps = int(env.metadata["render_fps"])
             writer = SegmentWriter(repo_id, root, features, fps, **writer_options)
         else:
@@ -131,7 +138,8 @@ class StreamRecorder:
         """Take one step of all n streams. Everything is copied.
 
         Args:
-            obs: the raw observation that the actions were chosen on, leading dimension n.
+            obs: the raw observation that the actions were chosen on, leading dimension n; at least that of the
+                recorded streams.
             instructions: n instructions, those the actions were chosen under.
             actions: (n, 7), physical units, as given to `env.step`.
             rewards: (n,) of this step.
@@ -166,10 +174,11 @@ class StreamRecorder:
             TOTAL_INTERVENTIONS: np.full(self.num_envs, total_interventions),
             POLICY_VERSION: np.full(self.num_envs, policy_version),
         }
-        columns = {key: np.asarray(column) for key, column in columns.items()} | observation_columns(obs)
+        columns = {key: np.asarray(column) for key, column in columns.items()}
         for key, column in columns.items():
             if len(column) != self.num_envs:
                 raise ValueError(f"{key} has leading dimension {len(column)}, expected {self.num_envs}")
+        columns |= observation_columns(obs)
         for stream in range(self.num_streams):
             self._append(stream, columns, instructions[stream])
             if segment_ends[stream]:
@@ -237,12 +246,15 @@ class StreamRecorder:
         # The writer keeps the arrays until they are encoded, so the stream goes on in a fresh buffer.
         length = self._lengths[stream]
         frames = {key: buffer[:length] for key, buffer in self._buffers[stream].items()}
+        success = frames[SUCCESS]
         metadata = {
             STREAM_ID: stream,
             SEGMENT_INDEX: int(frames[SEGMENT_INDEX][0]),
             STEP: int(frames[STEP][0]),
             INTERVENTION: int(frames[INTERVENTION][0]),
-            SUCCESS: bool(frames[SUCCESS].any()),
+            POLICY_VERSION: int(frames[POLICY_VERSION][0]),
+            SUCCESS: bool(success.any()),
+            SUCCESS_FRAME: int(success.argmax()) if success.any() else -1,
         }
         self.writer.add_segment(frames, self._tasks[stream], episode_metadata=metadata)
         self._buffers[stream] = self._new_buffer()

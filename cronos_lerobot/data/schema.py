@@ -28,6 +28,8 @@ TOTAL_INTERVENTIONS = "cronos.total_interventions"
 POLICY_VERSION = "cronos.policy_version"
 LOG_PROB = "cronos.log_prob"
 VALUE = "cronos.value"
+SUCCESS_FRAME = "cronos.success_frame"
+"""Of an episode's row in `meta/episodes`: the first frame after which the task was complete, -1 if none."""
 
 Features = dict[str, dict[str, Any]]
 
@@ -135,6 +137,17 @@ def stream_features(
         observation_space, state_names=state_names, environment_state_names=environment_state_names
     )
     return observation_and_action | columns
+
+
+def with_cameras(space: gymnasium.Space, cameras: Mapping[str, tuple[int, int]]) -> gymnasium.spaces.Dict:
+    """An observation space with other pictures: uint8 (height, width, 3) by camera, in place of its own."""
+    if not isinstance(space, gymnasium.spaces.Dict):
+        raise ValueError(f"the observation space must be a gymnasium Dict, got {space}")
+    spaces = {key: part for key, part in space.items() if key != "pixels"}
+    boxes: dict[str, gymnasium.Space] = {
+        name: gymnasium.spaces.Box(0, 255, (*size, 3), np.uint8) for name, size in cameras.items()
+    }
+    return gymnasium.spaces.Dict(spaces | {"pixels": gymnasium.spaces.Dict(boxes)})
 
 
 def feature_names(env: CronosVectorEnv) -> dict[str, Sequence[str]]:

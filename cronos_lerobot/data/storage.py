@@ -7,11 +7,12 @@ whole, `info.json` last. A process killed at any moment leaves a dataset that lo
 of episodes from `info.json` and looks up everything else from there.
 """
 
+import contextlib
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import pandas as pd
@@ -31,6 +32,7 @@ from lerobot.datasets.io_utils import (
 from lerobot.datasets.utils import (
     DEFAULT_DATA_PATH,
     DEFAULT_EPISODES_PATH,
+    DEFAULT_TASKS_PATH,
     DEFAULT_VIDEO_PATH,
     INFO_PATH,
     STATS_PATH,
@@ -38,17 +40,30 @@ from lerobot.datasets.utils import (
 from lerobot.utils.utils import flatten_dict, unflatten_dict
 
 from cronos_lerobot.data.png import encode_png
-from cronos_lerobot.data.stats import Stats, episode_stats
-from cronos_lerobot.data.video import VideoFile
+from cronos_lerobot.data.stats import Stats, episode_stats, vector_stats
 
 INCOMPLETE = ".incomplete"
+
+
+class VideoSink(Protocol):
+    """An mp4 being written, one episode after the other."""
+
+    num_frames: int
+
+    def append(self, episode: Any, /) -> None:
+        """Write the pixels of an episode."""
+
+    def close(self) -> None:
+        """Complete the file."""
 
 
 class Shard:
     """One data file, one episodes file and one mp4 per video key, being written under `.incomplete`."""
 
-    def __init__(self, meta: LeRobotDatasetMetadata, index: int, encoder: RGBEncoderConfig) -> None:
-        """Start shard `index` (0, 1, ...) of the dataset `meta`."""
+    def __init__(
+        self, meta: LeRobotDatasetMetadata, index: int, open_video: Callable[[str, Path], VideoSink]
+    ) -> None:
+        """Start shard `index` (0, 1, ...) of the dataset `meta`; `open_video` takes a video key and a path."""
         chunk, file = divmod(index, meta.info.chunks_size)
         self._place = {"chunk_index": chunk, "file_index": file}
         self._meta = meta
@@ -59,7 +74,7 @@ class Shard:
         self.stats: list[Stats] = []
         self._schema = get_hf_features_from_features(meta.features).arrow_schema
         self._data = pq.ParquetWriter(self._stage(self._data_path), self._schema, compression="snappy")
-        self._videos = {key: self._open_video(key, encoder) for key in meta.video_keys}
+        self.videos = {key: open_video(key, self._stage(self._video_path(key))) for key in meta.video_keys}
 
     @property
     def _data_path(self) -> str:
@@ -73,75 +88,115 @@ class Shard:
         self, frames: Mapping[str, np.ndarray], task: str, task_index: int, metadata: Mapping[str, Any]
     ) -> None:
         """Write one episode: arrays (T, ...) by feature, without LeRobot's own index columns."""
-        length = len(next(iter(frames.values())))
-        episode = self._meta.info.total_episodes + len(self.rows)
-        start = self._meta.info.total_frames + self.num_frames
+        columns = {**frames, **self._bookkeeping(len(next(iter(frames.values()))), task_index)}
+        table = _to_table(columns, self._schema)
+        stats = episode_stats(columns, self._meta.features)
+        self._append(table, {key: frames[key] for key in self.videos}, task, metadata, stats)
+
+    def copy(
+        self,
+        rows: pa.Table,
+        videos: Mapping[str, Any],
+        task: str,
+        task_index: int,
+        metadata: Mapping[str, Any],
+        stats: Stats,
+    ) -> None:
+        """Write one episode of another dataset with the same features.
+
+        Args:
+            rows: its rows of the data file, from its first frame on; its indices are replaced.
+            videos: by video key, what the sinks of this shard take.
+            task: the instruction.
+            task_index: its index in this dataset.
+            metadata: columns for the episode's row in `meta/episodes`.
+            stats: of all its columns but the indices.
+        """
+        columns = self._bookkeeping(rows.num_rows, task_index)
+        for name, values in columns.items():
+            place = rows.schema.get_field_index(name)
+            rows = rows.set_column(
+                place, rows.schema.field(place), pa.array(values, rows.schema.field(place).type)
+            )
+        # The source's schema metadata would describe the source.
+        rows = rows.select(self._schema.names).cast(self._schema).replace_schema_metadata(self._schema.metadata)
+        stats = stats | {name: vector_stats(values) for name, values in columns.items()}
+        self._append(rows, videos, task, metadata, stats)
+
+    def publish(self, tasks: Mapping[str, int], encoder: RGBEncoderConfig | None) -> None:
+        """Move the shard into the dataset and count it in `info.json`, which makes it part of the dataset.
+
+        Everything is on disk before the first file moves, so that they all move within a millisecond.
+
+        Args:
+            tasks: `task_index` by instruction, of the whole dataset.
+            encoder: of the videos, for `info.json`; None where it describes them already.
+        """
+        meta, info = self._meta, self._meta.info
+        for key, video in self.videos.items():
+            video.close()
+            move_into_place(meta.root, [self._video_path(key)])
+            if info.total_episodes == 0 and encoder is not None:
+                meta.update_video_info(key, video_encoder=encoder)
+        write_tasks(tasks_frame(tasks), self._staging)
+        self._data.close()
+        table = pa.Table.from_pylist(self.rows, schema=_episodes_schema(meta.root))
+        pq.write_table(table, self._stage(self._episodes_path))
+        meta.stats = aggregate_stats([*([meta.stats] if meta.stats else []), *self.stats])
+        info.total_episodes += len(self.rows)
+        info.total_frames += self.num_frames
+        staged = [DEFAULT_TASKS_PATH, self._data_path, self._episodes_path, *stage_summary(meta, tasks)]
+        move_into_place(meta.root, staged)
+
+    def abandon(self) -> None:
+        """Close the files after a failure, whatever is in them."""
+        for file in (self._data, *self.videos.values()):
+            with contextlib.suppress(Exception):
+                file.close()
+
+    def _bookkeeping(self, length: int, task_index: int) -> dict[str, np.ndarray]:
+        """LeRobot's own columns of the next episode."""
         frame_index = np.arange(length)
-        columns = {
-            **frames,
+        return {
             "timestamp": (frame_index / self._meta.fps).astype(np.float32),
             "frame_index": frame_index,
-            "episode_index": np.full(length, episode),
-            "index": start + frame_index,
+            "episode_index": np.full(length, self._meta.info.total_episodes + len(self.rows)),
+            "index": self._meta.info.total_frames + self.num_frames + frame_index,
             "task_index": np.full(length, task_index),
         }
+
+    def _append(
+        self, table: pa.Table, videos: Mapping[str, Any], task: str, metadata: Mapping[str, Any], stats: Stats
+    ) -> None:
         # One row group per episode, as LeRobot's own writer does, for readers that want single episodes.
-        table = _to_table(columns, self._schema)
         self._data.write_table(table)
         self.num_bytes += table.nbytes
+        start, fps = self._meta.info.total_frames + self.num_frames, self._meta.fps
         row: dict[str, Any] = {
-            "episode_index": episode,
+            "episode_index": self._meta.info.total_episodes + len(self.rows),
             "tasks": [task],
-            "length": length,
+            "length": table.num_rows,
             **{f"data/{key}": value for key, value in self._place.items()},
             "dataset_from_index": start,
-            "dataset_to_index": start + length,
+            "dataset_to_index": start + table.num_rows,
         }
-        for key, video in self._videos.items():
+        for key, video in self.videos.items():
             row |= {f"videos/{key}/{name}": value for name, value in self._place.items()}
-            row[f"videos/{key}/from_timestamp"] = video.num_frames / self._meta.fps
-            video.append(frames[key])
-            row[f"videos/{key}/to_timestamp"] = video.num_frames / self._meta.fps
-        stats = episode_stats(columns, self._meta.features)
+            row[f"videos/{key}/from_timestamp"] = video.num_frames / fps
+            video.append(videos[key])
+            row[f"videos/{key}/to_timestamp"] = video.num_frames / fps
         row |= metadata
         row |= {key: value.tolist() for key, value in flatten_dict({"stats": stats}).items()}
         row |= {f"meta/episodes/{key}": value for key, value in self._place.items()}
         self.rows.append(row)
         self.stats.append(stats)
-        self.num_frames += length
-
-    def publish(self, tasks: Mapping[str, int], encoder: RGBEncoderConfig) -> None:
-        """Move the shard into the dataset and count it in `info.json`, which makes it part of the dataset."""
-        meta, info = self._meta, self._meta.info
-        for key, video in self._videos.items():
-            video.close()
-            self._move(self._video_path(key))
-            if info.total_episodes == 0:
-                meta.update_video_info(key, video_encoder=encoder)
-        write_tasks(tasks_frame(tasks), self._staging)
-        self._move("meta/tasks.parquet")
-        self._data.close()
-        self._move(self._data_path)
-        table = pa.Table.from_pylist(self.rows, schema=_episodes_schema(meta.root))
-        pq.write_table(table, self._stage(self._episodes_path))
-        self._move(self._episodes_path)
-        meta.stats = aggregate_stats([*([meta.stats] if meta.stats else []), *self.stats])
-        info.total_episodes += len(self.rows)
-        info.total_frames += self.num_frames
-        publish_summary(meta, tasks)
-
-    def _open_video(self, key: str, encoder: RGBEncoderConfig) -> VideoFile:
-        height, width, _ = self._meta.features[key]["shape"]
-        return VideoFile(self._stage(self._video_path(key)), self._meta.fps, height, width, encoder)
+        self.num_frames += table.num_rows
 
     def _video_path(self, key: str) -> str:
         return DEFAULT_VIDEO_PATH.format(video_key=key, **self._place)
 
     def _stage(self, relative: str) -> Path:
         return stage(self._meta.root, relative)
-
-    def _move(self, relative: str) -> None:
-        move_into_place(self._meta.root, relative)
 
 
 def stage(root: Path, relative: str) -> Path:
@@ -151,27 +206,29 @@ def stage(root: Path, relative: str) -> Path:
     return path
 
 
-def move_into_place(root: Path, relative: str) -> None:
-    """Replace `<root>/<relative>` by its staged version in one step."""
-    target = root / relative
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with open(root / INCOMPLETE / relative, "rb") as staged:
-        os.fsync(staged.fileno())
-    os.replace(root / INCOMPLETE / relative, target)
+def move_into_place(root: Path, staged: Sequence[str]) -> None:
+    """Put staged files at `<root>/<relative>`, in this order, each in one step and with its content on disk."""
+    for relative in staged:
+        (root / relative).parent.mkdir(parents=True, exist_ok=True)
+        with open(root / INCOMPLETE / relative, "rb") as file:
+            os.fsync(file.fileno())
+    for relative in staged:
+        os.replace(root / INCOMPLETE / relative, root / relative)
 
 
-def publish_summary(meta: LeRobotDatasetMetadata, tasks: Mapping[str, int]) -> None:
-    """Write `stats.json`, then `info.json` with its totals, each in one step."""
+def stage_summary(meta: LeRobotDatasetMetadata, tasks: Mapping[str, int]) -> list[str]:
+    """Stage `stats.json` and `info.json` with its totals; returns them in the order to move them."""
     info = meta.info
     info.total_tasks = len(tasks)
     info.splits = {"train": f"0:{info.total_episodes}"}
+    staged = [INFO_PATH]
     if meta.stats:
         stage(meta.root, STATS_PATH)
         write_stats(meta.stats, meta.root / INCOMPLETE)
-        move_into_place(meta.root, STATS_PATH)
+        staged.insert(0, STATS_PATH)
     stage(meta.root, INFO_PATH)
     write_info(info, meta.root / INCOMPLETE)
-    move_into_place(meta.root, INFO_PATH)
+    return staged
 
 
 def tasks_frame(tasks: Mapping[str, int]) -> pd.DataFrame:
@@ -199,8 +256,8 @@ def truncate(meta: LeRobotDatasetMetadata, num_episodes: int) -> None:
     rows = [row for table in kept.values() for row in table.to_pylist()]
     info.total_episodes = len(rows)
     info.total_frames = sum(row["length"] for row in rows)
-    meta.stats = aggregate_stats([_stats_of_row(row) for row in rows]) if rows else None
-    publish_summary(meta, {} if meta.tasks is None else dict(meta.tasks["task_index"]))
+    meta.stats = aggregate_stats([stats_of_row(row) for row in rows]) if rows else None
+    move_into_place(root, stage_summary(meta, {} if meta.tasks is None else dict(meta.tasks["task_index"])))
     if not rows:
         (root / STATS_PATH).unlink(missing_ok=True)
 
@@ -235,14 +292,15 @@ def _replace_or_delete(root: Path, path: Path, table: pa.Table, write: Callable[
         return
     relative = str(path.relative_to(root))
     write(table, stage(root, relative))
-    move_into_place(root, relative)
+    move_into_place(root, [relative])
 
 
 def _place(row: Mapping[str, Any], prefix: str) -> dict[str, int]:
     return {name: row[f"{prefix}/{name}"] for name in ("chunk_index", "file_index")}
 
 
-def _stats_of_row(row: Mapping[str, Any]) -> Stats:
+def stats_of_row(row: Mapping[str, Any]) -> Stats:
+    """The statistics in a row of `meta/episodes`."""
     flat = {key: np.array(value) for key, value in row.items() if key.startswith("stats/")}
     return unflatten_dict(flat)["stats"]
 

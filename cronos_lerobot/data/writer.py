@@ -3,9 +3,11 @@
 `StreamRecorder` (recorder.py), the observer that a training loop calls once per step, sits on top of this.
 """
 
+import contextlib
 import queue
 import shutil
 import threading
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +20,15 @@ from lerobot.datasets.utils import INFO_PATH
 
 from cronos_lerobot.data.schema import Features, frame_format
 from cronos_lerobot.data.storage import INCOMPLETE, Shard, next_shard_index, truncate
-from cronos_lerobot.data.video import MAX_FILE_DURATION_S, fast_encoder
+from cronos_lerobot.data.video import MAX_FILE_DURATION_S, VideoFile, fast_encoder
+
+FLUSH_INTERVAL_S = 20.0
+"""Age of the oldest segment not on disk at which all are written [s]. A full queue takes a few seconds more to
+encode, so that what ended 30 s ago is on disk."""
+
+
+class RecordingError(RuntimeError):
+    """The dataset can no longer be written; what was flushed before stays and loads."""
 
 
 @dataclass
@@ -26,6 +36,7 @@ class _Segment:
     frames: Mapping[str, np.ndarray]
     task: str
     metadata: Mapping[str, Any]
+    ended: float = field(default_factory=time.monotonic)
 
     @property
     def num_bytes(self) -> int:
@@ -43,7 +54,7 @@ class SegmentWriter:
     A thread of its own encodes, in memory, and writes. Pixels go where their feature's dtype says: `video` into
     mp4 files, `image` as PNG into the data files, which are then lossless and fast to read at random. Episodes
     share files: many in one mp4, one parquet and one episodes file per flush (or per 1000 s of video, or per
-    `data_files_size_in_mb` of data).
+    `data_files_size_in_mb` of data). It flushes by itself when a segment has waited for `flush_interval_s`.
     """
 
     def __init__(
@@ -56,6 +67,7 @@ class SegmentWriter:
         robot_type: str | None = None,
         encoder: RGBEncoderConfig | None = None,
         max_pending_bytes: int = 256 * 2**20,
+        flush_interval_s: float = FLUSH_INTERVAL_S,
     ) -> None:
         """Start a new dataset.
 
@@ -67,15 +79,17 @@ class SegmentWriter:
             robot_type: for `info.json`.
             encoder: of the videos; `fast_encoder()` when None.
             max_pending_bytes: segments waiting for the encoder; `add_segment` blocks when it is exceeded.
+            flush_interval_s: the longest that a segment waits for a flush [s].
 
         Raises:
             FileExistsError: `root` exists.
+            OSError: it cannot be made.
         """
         has_video = any(feature["dtype"] == "video" for feature in features.values())
         meta = LeRobotDatasetMetadata.create(
             repo_id, fps, features, robot_type=robot_type, root=Path(root), use_videos=has_video
         )
-        self._start(meta, encoder, max_pending_bytes)
+        self._start(meta, encoder, max_pending_bytes, flush_interval_s)
 
     @classmethod
     def resume(
@@ -86,6 +100,7 @@ class SegmentWriter:
         *,
         encoder: RGBEncoderConfig | None = None,
         max_pending_bytes: int = 256 * 2**20,
+        flush_interval_s: float = FLUSH_INTERVAL_S,
     ) -> Self:
         """Go on with the dataset in `root` as it was at `state`; what was written after it is dropped.
 
@@ -95,6 +110,7 @@ class SegmentWriter:
             state: of `state_dict()`; None keeps every episode that was flushed.
             encoder: as for a new dataset; it must match, LeRobot assumes one encoding per camera.
             max_pending_bytes: as for a new dataset.
+            flush_interval_s: as for a new dataset.
 
         Raises:
             FileNotFoundError: there is no dataset in `root`.
@@ -105,7 +121,7 @@ class SegmentWriter:
         meta = LeRobotDatasetMetadata(repo_id, root=Path(root))
         truncate(meta, meta.info.total_episodes if state is None else state["num_episodes"])
         writer = cls.__new__(cls)
-        writer._start(meta, encoder, max_pending_bytes)
+        writer._start(meta, encoder, max_pending_bytes, flush_interval_s)
         return writer
 
     @property
@@ -116,12 +132,12 @@ class SegmentWriter:
     @property
     def num_episodes(self) -> int:
         """Episodes on disk, as of the last flush."""
-        return self._meta.info.total_episodes
+        return self._on_disk[0]
 
     @property
     def num_frames(self) -> int:
         """Frames on disk, as of the last flush."""
-        return self._meta.info.total_frames
+        return self._on_disk[1]
 
     def add_segment(
         self,
@@ -140,7 +156,8 @@ class SegmentWriter:
 
         Raises:
             ValueError: a feature is missing, unknown, or of another dtype or shape.
-            RuntimeError: the writer is finalized, or its thread has failed.
+            RecordingError: its thread has failed: the disk is full, say.
+            RuntimeError: the writer is finalized.
         """
         self._check_alive()
         self._check_frames(frames)
@@ -191,10 +208,19 @@ class SegmentWriter:
         """Finalize, also after an exception: what was recorded until then stays."""
         self.finalize()
 
-    def _start(self, meta: LeRobotDatasetMetadata, encoder: RGBEncoderConfig | None, max_pending: int) -> None:
+    def _start(
+        self,
+        meta: LeRobotDatasetMetadata,
+        encoder: RGBEncoderConfig | None,
+        max_pending: int,
+        flush_interval_s: float,
+    ) -> None:
+        if flush_interval_s <= 0:
+            raise ValueError(f"flush_interval_s must be more than 0 s, got {flush_interval_s}")
         self._meta = meta
         self._encoder = encoder or fast_encoder()
         self._max_pending = max_pending
+        self._flush_interval_s = flush_interval_s
         self.features: Features = {
             key: feature for key, feature in meta.features.items() if key not in _BOOKKEEPING
         }
@@ -202,6 +228,8 @@ class SegmentWriter:
         self._metadata_keys: set[str] | None = None
         self._max_shard_frames = int(MAX_FILE_DURATION_S * meta.fps)
         self._shard: Shard | None = None
+        self._oldest = 0.0
+        self._on_disk = meta.info.total_episodes, meta.info.total_frames
         self._next_shard = next_shard_index(meta)
         self._failure: BaseException | None = None
         self._pending = 0
@@ -217,7 +245,7 @@ class SegmentWriter:
 
     def _check_failure(self) -> None:
         if self._failure is not None:
-            raise RuntimeError(f"writing to {self.root} failed: {self._failure}") from self._failure
+            raise RecordingError(f"writing to {self.root} failed: {self._failure}") from self._failure
 
     def _check_frames(self, frames: Mapping[str, np.ndarray]) -> None:
         if set(frames) != set(self.features):
@@ -233,18 +261,35 @@ class SegmentWriter:
                 raise ValueError(f"{key} must be {dtype} {(length, *shape)}, got {array.dtype} {array.shape}")
 
     def _work(self) -> None:
-        while (item := self._queue.get()) is not None:
+        while (item := self._next_item()) is not None:
             try:
                 if self._failure is None:
                     self._handle(item)
             except BaseException as failure:  # handed to the caller's thread by `_check_failure`
-                self._failure = failure
+                self._fail(failure)
             if isinstance(item, _Flush):
                 item.done.set()
             else:
                 with self._room:
                     self._pending -= item.num_bytes
                     self._room.notify_all()
+
+    def _next_item(self) -> _Segment | _Flush | None:
+        if self._shard is None:
+            return self._queue.get()
+        remaining = self._oldest + self._flush_interval_s - time.monotonic()
+        if remaining > 0:
+            with contextlib.suppress(queue.Empty):
+                return self._queue.get(timeout=remaining)
+        return _Flush()
+
+    def _fail(self, failure: BaseException) -> None:
+        """Give up, and what was being written with it: on a full disk others may need the room."""
+        self._failure = failure
+        shard, self._shard = self._shard, None
+        if shard is not None:
+            shard.abandon()
+        shutil.rmtree(self.root / INCOMPLETE, ignore_errors=True)
 
     def _handle(self, item: _Segment | _Flush) -> None:
         if isinstance(item, _Flush):
@@ -257,15 +302,21 @@ class SegmentWriter:
         ):
             self._publish()
         if self._shard is None:
-            self._shard = Shard(self._meta, self._next_shard, self._encoder)
+            self._shard = Shard(self._meta, self._next_shard, self._open_video)
+            self._oldest = item.ended
             self._next_shard += 1
         task_index = self._tasks.setdefault(item.task, len(self._tasks))
         self._shard.append(item.frames, item.task, task_index, item.metadata)
 
     def _publish(self) -> None:
         if self._shard is not None:
-            shard, self._shard = self._shard, None
-            shard.publish(self._tasks, self._encoder)
+            self._shard.publish(self._tasks, self._encoder)
+            self._shard = None
+            self._on_disk = self._meta.info.total_episodes, self._meta.info.total_frames
+
+    def _open_video(self, key: str, path: Path) -> VideoFile:
+        height, width, _ = self._meta.features[key]["shape"]
+        return VideoFile(path, self._meta.fps, height, width, self._encoder)
 
 
 _BOOKKEEPING = {"timestamp", "frame_index", "episode_index", "index", "task_index"}

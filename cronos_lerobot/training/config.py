@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,12 @@ import draccus
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import WandBConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.datasets.utils import INFO_PATH
 from lerobot.envs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
+from cronos_lerobot.data.writer import FLUSH_INTERVAL_S
 from cronos_lerobot.protocol import ProtocolConfig
 from cronos_lerobot.resets import check_extra_resets
 from cronos_lerobot.rl.ppo_config import PPOConfig
@@ -35,6 +38,18 @@ class RecordConfig:
     """Folder of the dataset; <output_dir>/streams by default."""
     streams: str = "1"
     """How many of the streams to record, the first ones: a number or `all`."""
+    filmed_streams: int = 0
+    """Record the first so many streams once more, with pictures of env.render_size (480 x 640) in place of the
+    observation's: a dataset of its own, repo_id and root with _640x480 at the end."""
+    flush_interval_s: float = FLUSH_INTERVAL_S
+    """The longest that a finished segment waits to be written [s]; a killed run loses what waits."""
+
+    def __post_init__(self) -> None:
+        _ = self.num_streams
+        if self.filmed_streams < 0:
+            raise ValueError(f"record.filmed_streams must be >= 0, got {self.filmed_streams}.")
+        if self.flush_interval_s <= 0:
+            raise ValueError(f"record.flush_interval_s must be > 0, got {self.flush_interval_s}.")
 
     @property
     def num_streams(self) -> int | str:
@@ -46,6 +61,36 @@ class RecordConfig:
         if self.streams == "all" or str(self.streams).isdigit():
             return "all" if self.streams == "all" else int(self.streams)
         raise ValueError(f"record.streams must be a number or 'all', got {self.streams!r}.")
+
+    def root_in(self, output_dir: Path) -> Path:
+        """The folder of the dataset of a run in `output_dir`."""
+        return Path(self.root or output_dir / "streams")
+
+    def check(self, output_dir: Path, num_envs: int, *, resume: bool) -> None:
+        """Tell now what recording would stumble over later.
+
+        Raises:
+            ValueError: more streams are to be recorded than there are.
+            OSError: the dataset cannot be made: it exists, or its folder cannot be written to; or it is not
+                there to be resumed.
+        """
+        if self.repo_id is None:
+            return
+        for name, number in (("streams", self.num_streams), ("filmed_streams", self.filmed_streams)):
+            if isinstance(number, int) and number > num_envs:
+                raise ValueError(f"record.{name} must be at most num_envs={num_envs}, got {number}.")
+        root = self.root_in(output_dir)
+        if resume:
+            if not (root / INFO_PATH).is_file():
+                raise FileNotFoundError(f"no recording to resume in {root}.")
+            return
+        if root.exists():
+            raise FileExistsError(f"{root} exists; choose another --record.root.")
+        parent = next(folder for folder in root.absolute().parents if folder.exists())
+        try:
+            tempfile.TemporaryDirectory(dir=parent).cleanup()
+        except OSError as error:
+            raise OSError(f"cannot record to {root}: {error}") from error
 
 
 @dataclass
@@ -93,7 +138,7 @@ class CronosTrainConfig:
     steps: int = 1_300_000
     """S: interaction steps, summed over the streams; rounded up to whole policy updates."""
     num_envs: int = 64
-    """N: parallel streams."""
+    """N: parallel streams, of all processes together."""
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     """When a stream switches task, when the policy learns, and what help a stream gets."""
     algorithm: RLAlgorithmConfig = field(default_factory=PPOConfig)
@@ -118,7 +163,7 @@ class CronosTrainConfig:
     wandb: WandBConfig = field(default_factory=WandBConfig)
     """Weights & Biases."""
     torch_threads: int | None = None
-    """Threads of PyTorch on the CPU; null leaves PyTorch's default."""
+    """Threads of PyTorch on the CPU, in each process; null leaves PyTorch's default."""
     checkpoint_path: Path | None = field(init=False, default=None)
     """The checkpoint to resume from, set by `validate`."""
 
@@ -133,7 +178,6 @@ class CronosTrainConfig:
             raise ValueError(f"keep_checkpoints must be >= 1 or null, got {self.keep_checkpoints}.")
         check_task_order(self.protocol.task_order)
         check_extra_resets(self.protocol.extra_resets)
-        _ = self.record.num_streams
 
     @property
     def steps_per_update(self) -> int:
@@ -150,7 +194,7 @@ class CronosTrainConfig:
 
         Raises:
             ValueError: the policy, the environment or, when resuming, the checkpoint is missing.
-            FileExistsError: the output folder exists and the run is not a resumed one.
+            OSError: the output folder exists and the run is not a resumed one, or recording would fail.
         """
         if self.env is None:
             raise ValueError("Choose an environment: --env.type=cronos --env.scene=kitchen_2x2.")
@@ -169,6 +213,7 @@ class CronosTrainConfig:
             self.output_dir = Path("outputs/train") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_{self.job_name}"
         if not self.resume and Path(self.output_dir).exists():
             raise FileExistsError(f"{self.output_dir} exists; choose another --output_dir or --resume=true.")
+        self.record.check(Path(self.output_dir), self.num_envs, resume=self.resume)
 
     def _resolve_checkpoint(self) -> None:
         given = parser.parse_arg("config_path")

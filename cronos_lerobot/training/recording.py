@@ -1,49 +1,145 @@
-"""Hands the steps of the main loop to the StreamRecorder."""
+"""Hands the steps of the main loop to the StreamRecorder; a recording that fails does not stop the run."""
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from lerobot.envs.utils import parse_camera_names
+from lerobot_env_cronos import CronosEnvConfig
 
 from cronos_lerobot.data.recorder import StreamRecorder
+from cronos_lerobot.data.writer import RecordingError
 from cronos_lerobot.loop_state import Step
 from cronos_lerobot.training.config import CronosTrainConfig
+
+FILM = "film"
+"""Key of the filmed streams' frames in an observation; policies never see it."""
+
+
+class FilmedEnv:
+    """An environment whose observations also hold frames of its first streams, at its `render_size`.
+
+    Args:
+        env: the streams.
+        num_streams: how many of them to film.
+    """
+
+    def __init__(self, env: Any, num_streams: int) -> None:
+        self._env = env
+        self._streams = np.arange(num_streams)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._env, name)
+
+    def observe(self) -> dict[str, Any]:
+        """The observation of all streams, and the frames."""
+        return self._film(self._env.observe())
+
+    def step(self, actions: np.ndarray) -> tuple:
+        """Step all streams, see `CronosVectorEnv.step`."""
+        observation, *outcome = self._env.step(actions)
+        return (self._film(observation), *outcome)
+
+    def _film(self, observation: dict[str, Any]) -> dict[str, Any]:
+        with self._env.timer("record"):
+            return observation | {FILM: self._env.render_streams(self._streams)}
 
 
 class StreamObserver:
     """Records the streams of a run, or nothing at all.
 
+    When writing fails (a full disk, say) that recording ends where it was last flushed, and the run goes on.
+
     Args:
-        recorder: writes the dataset; None records nothing.
+        recorders: write the datasets, by name; the name FILM takes the filmed streams. None records nothing.
+        camera: what the filmed camera is called.
+        stopped: why recordings have ended early, by name.
+        report: called with the name and the reason when a recording ends early.
     """
 
-    def __init__(self, recorder: StreamRecorder | None) -> None:
-        self._recorder = recorder
+    def __init__(
+        self,
+        recorders: dict[str, StreamRecorder] | None,
+        camera: str = "",
+        stopped: dict[str, str] | None = None,
+        report: Callable[[dict[str, str]], None] | None = None,
+    ) -> None:
+        self._recorders = recorders or {}
+        self._camera = camera
+        self._stopped = dict(stopped or {})
+        self._report = report
+        for name, reason in self._stopped.items():
+            logging.warning(f"The recording {name!r} ended before the checkpoint and is not resumed: {reason}")
 
     @classmethod
-    def open(cls, config: CronosTrainConfig, env: Any, state: dict[str, Any] | None) -> Self:
-        """Begin the dataset of a run, or continue it from a checkpoint's `state`."""
-        if config.record.repo_id is None:
+    def open(
+        cls,
+        config: CronosTrainConfig,
+        env: Any,
+        state: dict[str, Any] | None,
+        report: Callable[[dict[str, str]], None] | None = None,
+    ) -> Self:
+        """Begin the datasets of a run, or continue them from a checkpoint's `state`."""
+        record, state = config.record, state or {}
+        if record.repo_id is None:
             return cls(None)
         assert config.output_dir is not None
-        recorder = StreamRecorder.open(
-            env,
-            config.record.repo_id,
-            config.record.root or Path(config.output_dir) / "streams",
-            segment_length=config.protocol.task_switch_interval,
-            streams=config.record.num_streams,  # ty: ignore[invalid-argument-type]
-            state=state,
-        )
-        return cls(recorder)
+        root = record.root_in(Path(config.output_dir))
+        stopped = state.get("stopped", {})
+        recorders = {}
+        common: dict[str, Any] = {
+            "segment_length": config.protocol.task_switch_interval,
+            "flush_interval_s": record.flush_interval_s,
+        }
+        camera = ""
+        if "streams" not in stopped:
+            recorders["streams"] = StreamRecorder.open(
+                env, record.repo_id, root, streams=record.num_streams, state=state.get("streams"), **common
+            )
+        if record.filmed_streams and FILM not in stopped:
+            assert isinstance(config.env, CronosEnvConfig)
+            camera = parse_camera_names(config.env.camera_name)[0]
+            height, width = config.env.render_size
+            suffix = f"_{width}x{height}"
+            recorders[FILM] = StreamRecorder.open(
+                env,
+                record.repo_id + suffix,
+                root.with_name(root.name + suffix),
+                streams=record.filmed_streams,
+                cameras={camera: (height, width)},
+                state=state.get(FILM),
+                **common,
+            )
+        return cls(recorders, camera, stopped, report)
 
     def on_step(self, step: Step) -> None:
         """Record one control step of the streams."""
-        if self._recorder is None:
-            return
-        self._recorder.on_step(
-            step.observation,
+        for name in list(self._recorders):
+            self._try(name, lambda recorder, name=name: self._record(recorder, name, step))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Flush, and return what `open` needs to continue."""
+        states = {name: self._try(name, StreamRecorder.state_dict) for name in list(self._recorders)}
+        return {name: states[name] for name in self._recorders} | {"stopped": self._stopped}
+
+    def close(self) -> None:
+        """Finish the datasets."""
+        for name in list(self._recorders):
+            self._try(name, StreamRecorder.close)
+        for name, reason in self._stopped.items():
+            logging.warning(f"The recording {name!r} of this run is not complete: {reason}")
+
+    def _record(self, recorder: StreamRecorder, name: str, step: Step) -> None:
+        observation = step.observation
+        if name == FILM:
+            observation = {key: value for key, value in observation.items() if key not in ("pixels", FILM)}
+            observation["pixels"] = {self._camera: step.observation[FILM]}
+        recorder.on_step(
+            observation,
             step.instructions,
             step.action.action,
             step.reward,
@@ -59,11 +155,15 @@ class StreamObserver:
             segment_ends=step.cut,
         )
 
-    def state_dict(self) -> dict[str, Any] | None:
-        """Flush, and return what `open` needs to continue."""
-        return None if self._recorder is None else self._recorder.state_dict()
-
-    def close(self) -> None:
-        """Finish the dataset."""
-        if self._recorder is not None:
-            self._recorder.close()
+    def _try(self, name: str, use: Callable[[StreamRecorder], Any]) -> Any:
+        """Use a recorder; if it fails, do without it from now on."""
+        try:
+            return use(self._recorders[name])
+        except RecordingError as error:
+            recorder = self._recorders.pop(name)
+            reason = f"{error}; {recorder.writer.num_episodes} segments are safe"
+            self._stopped[name] = reason
+            logging.warning(f"RECORDING STOPPED, the training goes on without it: {reason}")
+            if self._report is not None:
+                self._report({"recording": name, "reason": reason})
+            return None

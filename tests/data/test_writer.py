@@ -1,4 +1,5 @@
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -223,14 +224,14 @@ def test_truncates_to_nothing(tmp_path, segments, video):
 def test_killed_while_publishing_it_still_loads_and_resumes(tmp_path, segments, monkeypatch, relative, video):
     """The process dies right before one of the files of the second flush is moved into place."""
     writer = write(tmp_path / "d", segments[:2], flush_after=[1], video=video)
-    move = storage.move_into_place
+    replace = os.replace
 
-    def die(root, path):
-        if path == relative:
+    def die(source, target):
+        if str(target).endswith(relative):
             raise OSError("killed here")
-        move(root, path)
+        replace(source, target)
 
-    monkeypatch.setattr(storage, "move_into_place", die)
+    monkeypatch.setattr(os, "replace", die)
     writer.add_segment(*segments[2], episode_metadata={"number": 2})
     with pytest.raises(RuntimeError, match="killed here"):
         writer.flush()

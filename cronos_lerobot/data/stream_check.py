@@ -1,0 +1,105 @@
+"""Checks that recorded streams are whole: every step once, every annotation where it belongs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from cronos_lerobot.data.schema import (
+    INTERVENTION,
+    SEGMENT_INDEX,
+    STEP,
+    STREAM_ID,
+    STREAM_INTERVENTIONS,
+    TOTAL_INTERVENTIONS,
+    Intervention,
+)
+from cronos_lerobot.protocol import COUNTED_INTERVENTIONS
+
+if TYPE_CHECKING:
+    from cronos_lerobot.data.streams import StreamDataset
+
+
+class StreamError(ValueError):
+    """A recorded stream is not whole."""
+
+
+def check(streams: StreamDataset) -> None:
+    """Check every frame's place in its stream.
+
+    - LeRobot's indices count frames and episodes without a gap, and an episode is one segment of one stream.
+    - The steps of each stream go from 0 up by 1, its segments too.
+    - An intervention stands on the first frame of every segment and on no other, INITIAL on step 0 alone.
+    - The counts of interventions never fall, and rise where an intervention that counts stands.
+
+    Args:
+        streams: of a whole recording; a filtered one has gaps.
+
+    Raises:
+        StreamError: names the stream, the step and what is wrong there.
+    """
+    names = ["index", "episode_index", "frame_index", STREAM_ID, STEP, SEGMENT_INDEX]
+    names += [INTERVENTION, STREAM_INTERVENTIONS, TOTAL_INTERVENTIONS]
+    frames = streams.annotations(names)
+    meta = streams.meta
+    if len(frames) != meta.total_frames:
+        raise StreamError(f"the data files hold {len(frames)} frames, info.json counts {meta.total_frames}")
+    _expect(frames, frames["index"] == np.arange(len(frames)), "its index is not its row, {index}")
+    _check_episodes(frames, meta.total_episodes)
+    ids = frames[STREAM_ID].unique()
+    if missing := sorted(set(range(int(ids.max()) + 1)) - set(ids.tolist())):
+        raise StreamError(f"the streams {missing} are missing; recorded are the first ones up to {ids.max()}")
+    for _, stream in frames.groupby(STREAM_ID, sort=True):
+        _check_stream(stream.sort_values(STEP, kind="stable").reset_index(drop=True))
+
+
+def _check_episodes(frames: pd.DataFrame, total: int) -> None:
+    first = frames["frame_index"] == 0
+    _expect(frames, frames["episode_index"] == first.cumsum() - 1, "it is in episode {episode_index}")
+    if (count := int(first.sum())) != total:
+        raise StreamError(f"the data files hold {count} episodes, info.json counts {total}")
+    same = frames[[STREAM_ID, SEGMENT_INDEX]].diff().eq(0).all(axis=1)
+    _expect(frames, first | same, "segment {cronos.segment_index} begins inside episode {episode_index}")
+    follows = frames[STEP].diff().eq(1) & frames["frame_index"].diff().eq(1)
+    _expect(frames, first | follows, "it does not follow the frame before it in episode {episode_index}")
+
+
+def _check_stream(frames: pd.DataFrame) -> None:
+    step, before = frames[STEP].to_numpy(), np.arange(len(frames))
+    twice = np.flatnonzero(np.diff(step) == 0)
+    if len(twice):
+        raise StreamError(f"{_place(frames, twice[0] + 1)}: it is there twice")
+    if (gaps := np.flatnonzero(step != before)).size:
+        at = int(gaps[0])
+        missing = f"{at}" if step[at] == at + 1 else f"{at} to {step[at] - 1}"
+        raise StreamError(f"stream {frames[STREAM_ID][0]}: step {missing} is missing")
+    first = frames["frame_index"] == 0
+    _expect(frames, frames[SEGMENT_INDEX] == first.cumsum() - 1, "it is in segment {cronos.segment_index}")
+    kind = frames[INTERVENTION]
+    _expect(
+        frames, (kind != Intervention.NONE) == first, "intervention {cronos.intervention} on frame {frame_index}"
+    )
+    _expect(frames, (kind == Intervention.INITIAL) == (before == 0), "intervention {cronos.intervention}")
+    for name in (STREAM_INTERVENTIONS, TOTAL_INTERVENTIONS):
+        rise = frames[name].diff().fillna(0)
+        # Several kinds may come together; the frame carries the strongest. Other streams count at any time.
+        may_rise = first | (name == TOTAL_INTERVENTIONS)
+        holds = (rise >= kind.isin(COUNTED_INTERVENTIONS)) & (may_rise | (rise == 0))
+        _expect(frames, holds, f"{name} is {{{name}}}, not what the interventions add up to")
+
+
+def _expect(frames: pd.DataFrame, holds: pd.Series, message: str) -> None:
+    """Raise a StreamError about the first frame where something does not hold."""
+    wrong = np.flatnonzero(~holds.to_numpy(bool))
+    if len(wrong):
+        values = {name: frames[name].iloc[wrong[0]] for name in frames.columns}
+        text = message
+        for name, value in values.items():
+            text = text.replace("{" + name + "}", str(value))
+        raise StreamError(f"{_place(frames, wrong[0])}: {text}")
+
+
+def _place(frames: pd.DataFrame, row: int) -> str:
+    return f"stream {frames[STREAM_ID].iloc[row]}, step {frames[STEP].iloc[row]}"

@@ -1,0 +1,90 @@
+"""What happened in recorded streams, counted: successes and interventions."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from lerobot_env_cronos.statistics import wilson_interval
+from rich.table import Table
+
+from cronos_lerobot.data.schema import Intervention
+from cronos_lerobot.data.streams import Segment, StreamDataset
+
+NUM_PERIODS = 10
+"""Parts of the recording that interventions are counted in."""
+
+
+def statistics(streams: StreamDataset) -> dict[str, Any]:
+    """Count successes and interventions of recorded streams.
+
+    Returns:
+        `streams`, `segments`, `frames`; `success` and `success_by_{position,task,policy_version,stream}`:
+        [successes, of these complete from the start, segments], by the number of task switches since the scene
+        reset, and so on; `interventions`: the number of each kind; `interventions_over_time`: the same for each
+        tenth of the steps, by its first step.
+    """
+    segments = streams.segments
+    keys: dict[str, Callable[[Segment], Any]] = {
+        "position": lambda s: s.position,
+        "task": lambda s: s.task,
+        "policy_version": lambda s: s.policy_version,
+        "stream": lambda s: s.stream,
+    }
+    steps = max(s.step + s.length for s in segments)
+    period = -(-steps // NUM_PERIODS)
+    over_time = {start: _kinds(s for s in segments if s.step // period == start // period)
+                 for start in range(0, steps, period)}  # fmt: skip
+    return {
+        "streams": len(streams.streams),
+        "segments": len(segments),
+        "frames": sum(s.length for s in segments),
+        "success": _successes(segments),
+        **{f"success_by_{name}": _by(segments, key) for name, key in keys.items()},
+        "interventions": _kinds(segments),
+        "interventions_over_time": over_time,
+    }
+
+
+def make_tables(result: dict[str, Any]) -> list[Table]:
+    """The statistics for the console, with 95 % intervals."""
+    title = f"{result['streams']} streams, {result['segments']} segments, {result['frames']} frames"
+    tables = []
+    headings = {
+        "position": "task switches since the scene reset",
+        "task": "instruction",
+        "policy_version": "policy version",
+    }
+    for name, heading in headings.items():
+        table = Table(heading, "success", "95 %", "complete from the start", "segments", title=title)
+        for key, counts in [*result[f"success_by_{name}"].items(), ("all", result["success"])]:
+            table.add_row(str(key), *_cells(*counts))
+        tables.append(table)
+        title = ""
+    kinds = [kind.name.lower() for kind in Intervention if kind is not Intervention.NONE]
+    table = Table("interventions from step", *kinds)
+    for key, counts in [*result["interventions_over_time"].items(), ("all", result["interventions"])]:
+        table.add_row(str(key), *(str(counts.get(kind, 0)) for kind in kinds))
+    return [*tables, table]
+
+
+def _by(segments: Iterable[Segment], key: Callable[[Segment], Any]) -> dict[Any, list[int]]:
+    groups: dict[Any, list[Segment]] = {}
+    for segment in segments:
+        groups.setdefault(key(segment), []).append(segment)
+    return {name: _successes(groups[name]) for name in sorted(groups)}
+
+
+def _successes(segments: list[Segment]) -> list[int]:
+    return [sum(s.success for s in segments), sum(s.found_complete for s in segments), len(segments)]
+
+
+def _kinds(segments: Iterable[Segment]) -> dict[str, int]:
+    counts = Counter(segment.intervention for segment in segments)
+    return {kind.name.lower(): counts[kind] for kind in sorted(counts)}
+
+
+def _cells(successes: int, found: int, n: int) -> tuple[str, ...]:
+    low, high = wilson_interval(successes, n)
+    return f"{successes / n:.3f}", f"[{low:.2f}, {high:.2f}]", str(found), str(n)

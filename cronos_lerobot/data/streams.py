@@ -1,0 +1,306 @@
+"""Puts recorded streams back together, from a folder or the Hub, downloaded or streamed.
+
+```python
+streams = StreamDataset("me/stream", root="outputs/train/eer/streams")
+streams.check()                                           # nothing is missing, nothing is there twice
+for segment in streams.segments_of(0):                    # stream 0 from its first step to its last
+    print(segment.step, segment.task, segment.intervention.name, segment.success)
+actions = streams.columns(segment, ["action"])["action"]  # (T, 7)
+```
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import IO, Any, cast
+
+import fsspec
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+from huggingface_hub import HfFileSystem
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+
+from cronos_lerobot.data.schema import (
+    INTERVENTION,
+    POLICY_VERSION,
+    SEGMENT_INDEX,
+    STEP,
+    STREAM_COLUMNS,
+    STREAM_ID,
+    SUCCESS,
+    SUCCESS_FRAME,
+    Intervention,
+)
+from cronos_lerobot.data.video import Clip, read_frames
+
+SCENE_RESETS = (Intervention.INITIAL, Intervention.SCENE_RESET, Intervention.DIVERGENCE)
+"""After these the whole scene is new."""
+
+_SUMMARY = (STREAM_ID, SEGMENT_INDEX, STEP, INTERVENTION, POLICY_VERSION, SUCCESS, SUCCESS_FRAME)
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One piece of a stream, one LeRobot episode: contiguous in time, under one instruction."""
+
+    stream: int
+    index: int
+    """Pieces of this stream before it."""
+    step: int
+    """Control steps of this stream before it."""
+    length: int
+    """Frames [control steps]."""
+    task: str
+    """The instruction."""
+    intervention: Intervention
+    """What happened between the segment before and this one."""
+    position: int
+    """Task switches since the last scene reset: 0 for the first segment after it."""
+    success_frame: int | None
+    """The first frame after which the task was complete; None if it never was."""
+    policy_version: int
+    """Policy updates before its first action."""
+    episode: int
+    """LeRobot's episode index."""
+    start: int
+    """LeRobot's index of its first frame."""
+
+    @property
+    def success(self) -> bool:
+        """Whether the task was complete at any step."""
+        return self.success_frame is not None
+
+    @property
+    def found_complete(self) -> bool:
+        """A success for which nothing had to be done: no task can be done in one step."""
+        return self.success_frame == 0
+
+    @property
+    def frames(self) -> range:
+        """LeRobot's indices of its frames."""
+        return range(self.start, self.start + self.length)
+
+
+@dataclass(frozen=True)
+class Switch:
+    """The place between two segments of a stream."""
+
+    before: Segment
+    after: Segment
+
+    @property
+    def intervention(self) -> Intervention:
+        """What happened there; a new instruction at least."""
+        return self.after.intervention
+
+
+class StreamDataset:
+    """Recorded streams, in order. Without the pixels, reading a segment takes a few milliseconds.
+
+    Args:
+        repo_id: the dataset's name, "owner/name".
+        root: its folder; None looks where LeRobot keeps its datasets, then on the Hub.
+        revision: of the repo on the Hub.
+        streaming: read single segments from the files where they are, on the Hub with range requests, without
+            downloading the rest; `dataset` is then out of reach.
+
+    Raises:
+        ValueError: the dataset has no recorded streams.
+    """
+
+    def __init__(
+        self,
+        repo_id: str,
+        root: str | Path | None = None,
+        revision: str | None = None,
+        *,
+        streaming: bool = False,
+    ) -> None:
+        self.repo_id = repo_id
+        self._dataset = None if streaming else LeRobotDataset(repo_id, root=root, revision=revision)
+        self.meta = self._dataset.meta if self._dataset else LeRobotDatasetMetadata(repo_id, root, revision)
+        lacking = [name for name in STREAM_COLUMNS if name not in self.meta.features]
+        if lacking:
+            raise ValueError(f"{repo_id} has no recorded streams: it lacks the columns {lacking}")
+        # Metadata that came from the Hub lies in LeRobot's cache, without the data.
+        is_local = (self.meta.root / "data").is_dir()
+        self._files: Any = fsspec.filesystem("file") if is_local else HfFileSystem()
+        self._base = str(self.meta.root) if is_local else f"datasets/{repo_id}@{self.meta.revision}"
+
+    @property
+    def dataset(self) -> LeRobotDataset:
+        """LeRobot's own view: `dataset[i]` for `i` in `segment.frames`."""
+        if self._dataset is None:
+            raise ValueError(f"{self.repo_id} is streamed; open it with streaming=False for LeRobot's own view")
+        return self._dataset
+
+    @cached_property
+    def segments(self) -> list[Segment]:
+        """All segments, stream by stream, each stream in the order of time."""
+        rows = self._episodes()
+        # In the order of the steps, not of the segments' numbers, which `check` verifies.
+        rows = rows.sort_values([STREAM_ID, STEP], kind="stable")
+        segments: list[Segment] = []
+        for row in rows.to_dict("records"):
+            before = segments[-1] if segments and segments[-1].stream == row[STREAM_ID] else None
+            segments.append(_segment(row, before))
+        return segments
+
+    @cached_property
+    def streams(self) -> list[int]:
+        """The ids of the recorded streams."""
+        return sorted({segment.stream for segment in self.segments})
+
+    def segments_of(self, stream: int) -> list[Segment]:
+        """One stream, from its first step to its last.
+
+        Raises:
+            ValueError: it was not recorded.
+        """
+        if stream not in self.streams:
+            raise ValueError(f"stream {stream} is not in {self.repo_id}; it has {self.streams}")
+        return [segment for segment in self.segments if segment.stream == stream]
+
+    def switches(self, stream: int | None = None) -> Iterator[Switch]:
+        """The places between two segments, of one stream or of all."""
+        for before, after in pairwise(self.segments if stream is None else self.segments_of(stream)):
+            if before.stream == after.stream:
+                yield Switch(before, after)
+
+    def reset_free_episodes(self, stream: int | None = None) -> Iterator[list[Segment]]:
+        """What lies between two scene resets: the segments of a stream from one to the next."""
+        episode: list[Segment] = []
+        for segment in self.segments if stream is None else self.segments_of(stream):
+            if episode and (segment.position == 0 or segment.stream != episode[0].stream):
+                yield episode
+                episode = []
+            episode.append(segment)
+        if episode:
+            yield episode
+
+    def columns(self, segment: Segment, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """Columns of a segment, (T, ...) each; all but pixels if no names are given.
+
+        Raises:
+            ValueError: there is no such column.
+        """
+        stored = [name for name, feature in self.meta.features.items() if feature["dtype"] != "video"]
+        if unknown := set(names or []) - set(stored):
+            raise ValueError(f"{self.repo_id} has no columns {sorted(unknown)}; it has {stored}")
+        table = pq.read_table(
+            f"{self._base}/{self.meta.get_data_file_path(segment.episode)}",
+            columns=list(names or stored),
+            filesystem=self._files,
+            filters=[("episode_index", "=", segment.episode)],
+        )
+        return {name: to_array(table[name]) for name in table.column_names}
+
+    def stream_columns(self, stream: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Columns of a whole stream, from its first step to its last."""
+        parts = [self.columns(segment, names) for segment in self.segments_of(stream)]
+        return {name: np.concatenate([part[name] for part in parts]) for name in names}
+
+    def pixels(self, segment: Segment, camera: str, frames: slice = slice(None)) -> np.ndarray:
+        """Pictures of a segment, uint8 (T, H, W, 3).
+
+        Args:
+            segment: of this dataset.
+            camera: the column, `observation.images.front` say.
+            frames: which of its frames, in steps of 1.
+
+        Raises:
+            ValueError: there is no such camera.
+        """
+        if camera not in self.meta.video_keys:
+            raise ValueError(f"{self.repo_id} has no pixels {camera!r}; it has {self.meta.video_keys}")
+        clip = self.clip(segment, camera)
+        start, stop, _ = frames.indices(segment.length)
+        with self._files.open(f"{self._base}/{self.meta.get_video_file_path(segment.episode, camera)}") as file:
+            return read_frames(cast(IO[bytes], file), clip.start + start, stop - start, self.meta.fps)
+
+    def clip(self, segment: Segment, camera: str) -> Clip:
+        """Where the pictures of a segment lie."""
+        assert self.meta.episodes is not None
+        first = self.meta.episodes[segment.episode][f"videos/{camera}/from_timestamp"]
+        path = self.meta.root / self.meta.get_video_file_path(segment.episode, camera)
+        return Clip(path, round(first * self.meta.fps), segment.length)
+
+    def switch_frames(self, switch: Switch) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """The last frame before a switch and the first after it, every column and picture."""
+        frames = []
+        for segment, at in ((switch.before, switch.before.length - 1), (switch.after, 0)):
+            frame = {name: column[at] for name, column in self.columns(segment).items()}
+            for camera in self.meta.video_keys:
+                frame[camera] = self.pixels(segment, camera, slice(at, at + 1))[0]
+            frames.append(frame)
+        return frames[0], frames[1]
+
+    def annotations(self, names: Sequence[str]) -> pd.DataFrame:
+        """Columns of single numbers, of all frames that `info.json` counts, in LeRobot's order."""
+        assert self.meta.episodes is not None
+        paths = [f"{self._base}/{self.meta.get_data_file_path(i)}" for i in range(self.meta.total_episodes)]
+        # Each file once; they are in the order of their episodes.
+        tables = [
+            pq.read_table(path, columns=list(names), filesystem=self._files) for path in dict.fromkeys(paths)
+        ]
+        # A killed recording may have left rows behind that it had not counted yet.
+        return pa.concat_tables(tables).slice(0, self.meta.total_frames).to_pandas()
+
+    def check(self) -> None:
+        """Check that every stream is whole.
+
+        Raises:
+            StreamError: a step is missing or there twice, or an annotation is wrong.
+        """
+        from cronos_lerobot.data.stream_check import check
+
+        check(self)
+
+    def _episodes(self) -> pd.DataFrame:
+        """One row per segment: LeRobot's columns and ours."""
+        assert self.meta.episodes is not None
+        names = ["episode_index", "dataset_from_index", "length", "tasks"]
+        has_ours = all(name in self.meta.episodes.column_names for name in _SUMMARY)
+        wanted = self.meta.episodes.select_columns([*names, *(_SUMMARY if has_ours else ())])
+        rows = cast(pd.DataFrame, wanted.to_pandas()).iloc[: self.meta.total_episodes]
+        if has_ours:
+            return rows
+        # LeRobot's dataset tools drop columns they do not know from the episodes, but not from the frames.
+        frames = self.annotations(["episode_index", *(name for name in _SUMMARY if name != SUCCESS_FRAME)])
+        first = frames.groupby("episode_index").first()
+        number = frames.groupby("episode_index").cumcount()
+        succeeded = number[frames[SUCCESS]].groupby(frames["episode_index"]).first()
+        first[SUCCESS_FRAME] = succeeded.reindex(first.index, fill_value=-1)
+        return rows.merge(first, left_on="episode_index", right_index=True)
+
+
+def to_array(column: pa.ChunkedArray) -> np.ndarray:
+    """A column of a data file as an array (T, ...)."""
+    if pa.types.is_fixed_size_list(column.type) or pa.types.is_list(column.type):
+        values = column.combine_chunks()
+        return np.asarray(values.flatten()).reshape(len(values), -1)
+    return column.to_numpy()
+
+
+def _segment(row: dict[str, Any], before: Segment | None) -> Segment:
+    intervention = Intervention(int(row[INTERVENTION]))
+    is_new = before is None or intervention in SCENE_RESETS
+    return Segment(
+        stream=int(row[STREAM_ID]),
+        index=int(row[SEGMENT_INDEX]),
+        step=int(row[STEP]),
+        length=int(row["length"]),
+        task=str(row["tasks"][0]),
+        intervention=intervention,
+        position=0 if is_new or before is None else before.position + 1,
+        success_frame=int(row[SUCCESS_FRAME]) if row[SUCCESS_FRAME] >= 0 else None,
+        policy_version=int(row[POLICY_VERSION]),
+        episode=int(row["episode_index"]),
+        start=int(row["dataset_from_index"]),
+    )

@@ -1,0 +1,173 @@
+"""`cronos-streams`: looks into recorded training streams, checks them, and makes training data of them.
+
+cronos-streams statistics   successes by segment since the scene reset, by task and policy version; interventions
+cronos-streams check        that nothing is missing, nothing there twice, every annotation where it belongs
+cronos-streams filter       some of the segments as an ordinary LeRobotDataset, for lerobot-train
+
+examples:
+  what happened in a run
+      cronos-streams statistics --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams
+  is a recording on the Hub whole? (reads only the numbers)
+      cronos-streams check --dataset.repo_id=me/stream
+  what the policy brought about itself, cut 8 frames after the success, as training data
+      cronos-streams filter --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams \\
+          --filter.success=true --filter.found_complete=false --frames_after_success=8 \\
+          --output.repo_id=me/successes --output.root=outputs/successes
+  the failures of a late policy in scenes that nobody had tidied up
+      cronos-streams filter --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams \\
+          --filter.success=false --filter.min_policy_version=10 --filter.interventions='[end_effector_reset]' \\
+          --output.repo_id=me/failures --output.root=outputs/failures
+
+`cronos-streams filter --help` has the flags of a command, docs/streams.md the rest.
+"""
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import draccus
+from draccus.utils import ParsingError
+from lerobot.utils.constants import HF_LEROBOT_HOME
+from rich.console import Console
+
+from cronos_lerobot.data.stream_filter import SegmentFilter, filter_streams
+from cronos_lerobot.data.stream_statistics import make_tables, statistics
+from cronos_lerobot.data.streams import StreamDataset
+
+
+@dataclass
+class SourceConfig:
+    """A dataset of recorded streams, named as LeRobot does."""
+
+    repo_id: str | None = None
+    """Its name, user/name."""
+    root: Path | None = None
+    """Its folder; null looks where LeRobot keeps its datasets, then on the Hub."""
+    revision: str | None = None
+    """Branch, tag or commit on the Hub."""
+
+    def open(self, *, streaming: bool) -> StreamDataset:
+        """Open it.
+
+        Raises:
+            ValueError: no name is given, or it has no recorded streams.
+            FileNotFoundError: there is no dataset in `root`.
+        """
+        if self.repo_id is None:
+            raise ValueError(
+                "choose a dataset: --dataset.repo_id=<user/name>, and --dataset.root=<folder> if local"
+            )
+        if self.root is not None and not (self.root / "meta/info.json").is_file():
+            raise FileNotFoundError(f"no LeRobotDataset in {self.root}")
+        return StreamDataset(self.repo_id, self.root, self.revision, streaming=streaming)
+
+
+@dataclass
+class OutputConfig:
+    """The dataset to write."""
+
+    repo_id: str | None = None
+    """Its name, user/name."""
+    root: Path | None = None
+    """Its folder, which must not exist; null is where LeRobot keeps its datasets."""
+
+
+@dataclass
+class CheckConfig:
+    """Check that recorded streams are whole."""
+
+    dataset: SourceConfig = field(default_factory=SourceConfig)
+    """The streams."""
+
+
+@dataclass
+class StatisticsConfig:
+    """Count successes and interventions."""
+
+    dataset: SourceConfig = field(default_factory=SourceConfig)
+    """The streams."""
+    output: Path | None = None
+    """Write the counts to this JSON file, too."""
+
+
+@dataclass
+class FilterConfig:
+    """Write some segments as an ordinary LeRobotDataset."""
+
+    dataset: SourceConfig = field(default_factory=SourceConfig)
+    """The streams."""
+    output: OutputConfig = field(default_factory=OutputConfig)
+    """The dataset to write."""
+    filter: SegmentFilter = field(default_factory=SegmentFilter)
+    """Which segments; everything given must fit."""
+    frames_after_success: int | None = None
+    """Cut a segment so many frames after the first in which its task was complete; null keeps it whole."""
+
+    def __post_init__(self) -> None:
+        if self.frames_after_success is not None and self.frames_after_success < 0:
+            raise ValueError(f"frames_after_success must be >= 0 or null, got {self.frames_after_success}")
+
+
+def print_statistics(config: StatisticsConfig) -> None:
+    """`cronos-streams statistics`."""
+    result = statistics(config.dataset.open(streaming=True))
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    for table in make_tables(result):
+        console.print(table)
+    if config.output is not None:
+        partial = config.output.with_name(f".{config.output.name}.partial")
+        partial.write_text(json.dumps(result, indent=2))
+        partial.replace(config.output)
+
+
+def check(config: CheckConfig) -> None:
+    """`cronos-streams check`."""
+    streams = config.dataset.open(streaming=True)
+    streams.check()
+    frames = sum(segment.length for segment in streams.segments)
+    print(f"whole: {len(streams.streams)} streams, {len(streams.segments)} segments, {frames} frames")
+
+
+def filter_segments(config: FilterConfig) -> None:
+    """`cronos-streams filter`."""
+    if config.output.repo_id is None:
+        raise ValueError("name the dataset to write: --output.repo_id=<user/name>, and --output.root=<folder>")
+    root = config.output.root or HF_LEROBOT_HOME / config.output.repo_id
+    # What is on this machine need not be loaded as a whole.
+    streams = config.dataset.open(streaming=config.dataset.root is not None)
+    total = len(streams.segments)
+    written = filter_streams(
+        streams, config.filter, config.output.repo_id, root, frames_after_success=config.frames_after_success
+    )
+    print(f"{written} of {total} segments in {root}")
+
+
+COMMANDS: dict[str, tuple[type, Callable[[Any], None]]] = {
+    "statistics": (StatisticsConfig, print_statistics),
+    "check": (CheckConfig, check),
+    "filter": (FilterConfig, filter_segments),
+}
+
+
+def main() -> None:
+    """Entry point of `cronos-streams`."""
+    command, *arguments = sys.argv[1:] or ["--help"]
+    if command in ("--help", "-h"):
+        print(__doc__)
+        return
+    if command not in COMMANDS:
+        sys.exit(f"error: unknown command {command!r}; valid commands: {list(COMMANDS)}")
+    config_class, run = COMMANDS[command]
+    try:
+        run(draccus.parse(config_class, args=arguments))
+    except ParsingError as error:
+        sys.exit(f"error: {error.__cause__ or error}")
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()
