@@ -74,7 +74,7 @@ class EvaluationRun:
     suite: str
     """LeRobot's task group, e.g. `independent_held_out`."""
     successes: dict[str, list[bool]]
-    """By instruction: one flag for each episode."""
+    """By instruction, or ordering of a sequential suite: one flag for each episode."""
     videos: dict[str, list[Path]]
     """By instruction: the videos of the first episodes, in their order."""
 
@@ -201,7 +201,10 @@ def read_evaluation_runs(folder: Path, scene: str = "kitchen_2x2") -> list[Evalu
     for entry in json.loads((folder / EVAL_INFO).read_text())["per_task"]:
         suite, number = entry["task_group"], entry["task_id"]
         run = runs.setdefault(suite, EvaluationRun(folder, suite, {}, {}))
-        task = instructions[number] if number < len(instructions) else f"task {number}"
+        if suite.startswith("sequential"):
+            task = f"ordering {number}"  # an episode is a chain of all tasks
+        else:
+            task = instructions[number] if number < len(instructions) else f"task {number}"
         run.successes[task] = [bool(flag) for flag in entry["metrics"]["successes"]]
         paths = [Path(path) for path in entry["metrics"].get("video_paths", [])]
         # The paths are as seen when the evaluation ran; the folder may have moved since.

@@ -55,6 +55,12 @@ def test_runs_are_found_below_a_folder_once(tmp_path):
         find_runs([tmp_path / "nothing"])
 
 
+def test_the_episodes_of_a_sequential_suite_are_named_after_their_ordering(tmp_path):
+    write_evaluation(tmp_path, "sequential_held_out")
+    _, [evaluation], _ = find_runs([tmp_path])
+    assert list(evaluation.tasks) == ["ordering 0", "ordering 1", "ordering 2", "ordering 3"]
+
+
 def test_unfinished_last_line_is_skipped(tmp_path):
     run = write_training_run(tmp_path / "a")
     with (run / "metrics.jsonl").open("a") as file:
