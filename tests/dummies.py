@@ -89,10 +89,10 @@ class DummyEnv:
     def get_state(self):
         everything = TASKS + RESET_TASKS
         tasks = np.array([everything.index(task) for task in self.tasks])
-        return {"x": self.x.copy(), "t": np.array(self.t), "task": tasks}
+        return {"x": self.x.copy(), "t": np.full(self.num_envs, self.t), "task": tasks}
 
     def set_state(self, state):
-        self.x, self.t = state["x"].copy(), int(state["t"])
+        self.x, self.t = state["x"].copy(), int(state["t"][0])
         self.tasks = [(TASKS + RESET_TASKS)[i] for i in state["task"]]
 
     def close(self):

@@ -74,7 +74,6 @@ class PPOAgent:
         """Learn from the buffer and clear it."""
         with self.stopwatch("update"):
             metrics = self.ppo.update(self.buffer)
-            metrics["reward_mean"] = float(self.buffer.rewards[: self.buffer.rows].mean())
             self.buffer.clear()
             return metrics
 

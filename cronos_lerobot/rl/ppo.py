@@ -13,10 +13,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
+from cronos_lerobot.processes import Processes
 from cronos_lerobot.rl.policy import check_trainable
 from cronos_lerobot.rl.ppo_config import PPOConfig
 from cronos_lerobot.rl.processing import PolicyProcessors
-from cronos_lerobot.rl.rollout_buffer import Minibatch, RolloutBuffer
+from cronos_lerobot.rl.rollout_buffer import Columns, Minibatch, RolloutBuffer
 
 
 def clipped_objective(log_ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
@@ -79,6 +80,12 @@ class _Means:
     def result(self) -> dict[str, float]:
         return {name: total / self.weights[name] for name, total in self.sums.items()}
 
+    def result_of_all(self, processes: Processes) -> dict[str, float]:
+        together = _Means()
+        for result in processes.gather(self.result()):
+            together.add(result)
+        return together.result()
+
 
 class PPO:
     """Updates a policy from rollouts.
@@ -88,19 +95,27 @@ class PPO:
         processors: from stored observations to the policy's batches.
         config: see PPOConfig.
         rng: draws the order of the minibatches.
+        processes: each learns from its own rollout, in minibatches of its own; they take every optimizer step
+            together, with the mean of their gradients. Their rollouts have the same size.
 
     Raises:
         TypeError: the policy is not trainable.
     """
 
     def __init__(
-        self, policy: Any, processors: PolicyProcessors, config: PPOConfig, rng: np.random.Generator
+        self,
+        policy: Any,
+        processors: PolicyProcessors,
+        config: PPOConfig,
+        rng: np.random.Generator,
+        processes: Processes | None = None,
     ) -> None:
         check_trainable(policy)
         self.policy = policy
         self.processors = processors
         self.config = config
         self.rng = rng
+        self.processes = processes or Processes()
         self.num_updates = 0
         lrs = {"policy": config.policy_lr, "value": config.value_lr}
         self._params: dict[str, list[Tensor]] = {"policy": [], "value": []}
@@ -119,16 +134,17 @@ class PPO:
         """Learn from every transition in `buffer`, which is left as it is, and return metrics."""
         config = self.config
         buffer.compute_advantages(config.gamma, config.gae_lambda)
-        metrics = _describe_rollout(buffer)
+        rollout = {name: self.processes.concatenate(array, axis=1) for name, array in buffer.results().items()}
+        metrics = _describe_rollout(rollout)
         if config.normalize_advantage:
-            buffer.normalize_advantages()
+            buffer.normalize_advantages(rollout["advantages"].mean(), rollout["advantages"].std())
         means = _Means()
         warming_up = self.num_updates < config.value_warmup_updates
         epochs = 0 if warming_up else self._train_policy(buffer, means)
         for _ in range(max(config.value_epochs, config.epochs) if warming_up else config.value_epochs):
             self._value_epoch(buffer, means)
         self.num_updates += 1
-        metrics |= means.result() | {"policy_epochs": epochs, "policy_lr": self.policy_lr}
+        metrics |= means.result_of_all(self.processes) | {"policy_epochs": epochs, "policy_lr": self.policy_lr}
         return metrics | {"value_lr": self._group("value")["lr"]}
 
     @property
@@ -166,7 +182,7 @@ class PPO:
         return float(config.epochs)
 
     def _accumulate_gradients(self, group: list[Minibatch], means: _Means) -> float:
-        """Backpropagate the mean loss over a group of minibatches; returns its KL divergence."""
+        """Backpropagate the mean loss over a group of minibatches; returns the KL divergence of all processes'."""
         self.optimizer.zero_grad(set_to_none=True)
         size = sum(len(minibatch.indices) for minibatch in group)
         kl = 0.0
@@ -178,7 +194,7 @@ class PPO:
             (loss * weight).backward()
             means.add(metrics, len(minibatch.indices))
             kl += metrics["approx_kl"] * weight
-        return kl
+        return float(self.processes.concatenate(np.array([kl])).mean())
 
     def _loss(self, minibatch: Minibatch) -> tuple[Tensor, dict[str, float]]:
         config = self.config
@@ -226,6 +242,7 @@ class PPO:
 
     def _optimizer_step(self, means: _Means, norm_name: str = "grad_norm") -> None:
         params = self._params["policy"] + self._params["value"]
+        self.processes.average_gradients(params)
         norm = torch.nn.utils.clip_grad_norm_(params, self.config.max_grad_norm)
         means.add({norm_name: norm.item()})
         self.optimizer.step()
@@ -245,13 +262,13 @@ class PPO:
         return torch.from_numpy(array).to(self.processors.device)
 
 
-def _describe_rollout(buffer: RolloutBuffer) -> dict[str, float]:
-    values, returns = buffer.values[: buffer.rows], buffer.returns[: buffer.rows]
+def _describe_rollout(rollout: Columns) -> dict[str, float]:
     return {
-        "explained_variance": explained_variance(values, returns),
-        "value_mean": float(values.mean()),
-        "return_mean": float(returns.mean()),
-        "advantage_std": float(buffer.advantages[: buffer.rows].std()),
+        "reward_mean": float(rollout["rewards"].mean()),
+        "explained_variance": explained_variance(rollout["values"], rollout["returns"]),
+        "value_mean": float(rollout["values"].mean()),
+        "return_mean": float(rollout["returns"].mean()),
+        "advantage_std": float(rollout["advantages"].std()),
     }
 
 

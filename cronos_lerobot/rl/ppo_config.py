@@ -23,9 +23,9 @@ class PPOConfig(RLAlgorithmConfig):
     value_warmup_updates: int = 2
     """Updates at the start of a run that train the value alone, because it starts from noise."""
     minibatch_size: int = 2048
-    """Transitions in one backward pass."""
+    """Transitions in one backward pass of one process."""
     grad_accumulation: int = 1
-    """Minibatches in one optimizer step."""
+    """Minibatches of each process in one optimizer step."""
     clip: float = 0.2
     """The probability ratio is clipped to 1 - clip .. 1 + clip."""
     gamma: float = 0.99

@@ -110,10 +110,15 @@ class RolloutBuffer:
             gae_lambda,
         )
 
-    def normalize_advantages(self) -> None:
-        """Shift and scale the advantages of the buffer to mean 0 and standard deviation 1."""
+    def results(self) -> Columns:
+        """Return `rewards`, `values`, `advantages` and `returns` of the rows in use, (rows, num_streams) each."""
+        names = ("rewards", "values", "advantages", "returns")
+        return {name: getattr(self, name)[: self.rows] for name in names}
+
+    def normalize_advantages(self, mean: float, std: float) -> None:
+        """Shift and scale the advantages so that `mean` becomes 0 and `std` 1."""
         advantages = self.advantages[: self.rows]
-        advantages[:] = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        advantages[:] = (advantages - mean) / (std + 1e-8)
 
     def minibatches(self, batch_size: int, rng: np.random.Generator) -> Iterator[Minibatch]:
         """Yield every transition exactly once, in an order drawn from `rng`; the last batch may be smaller."""

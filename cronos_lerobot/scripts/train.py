@@ -14,7 +14,9 @@ from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import init_logging
+from lerobot_env_cronos import CronosVectorEnv
 
+from cronos_lerobot.processes import join_processes
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.factory import make_env, make_policy_and_processors
 from cronos_lerobot.training.trainer import Trainer
@@ -25,20 +27,33 @@ def train(config: CronosTrainConfig) -> None:
     """Train as `config` says, from the start or from a checkpoint."""
     try:
         config.validate()
-    except (ValueError, FileExistsError) as error:
+        assert config.policy is not None
+        # Nobody gets past this before all have seen that the output folder does not exist yet.
+        processes = join_processes(config.policy.device)
+        mine = processes.share_of(config.num_envs)
+    except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")
-    init_logging()
+    config.output_dir = processes.broadcast(config.output_dir)
+    init_logging(console_level="INFO" if processes.is_main else "ERROR")
     if config.torch_threads is not None:
         torch.set_num_threads(config.torch_threads)
     set_seed(config.seed)
     policy, preprocessor, postprocessor = make_policy_and_processors(config)
-    env = make_env(config, config.num_envs)
-    trainer = Trainer(config, env, lambda n: make_env(config, n), policy, preprocessor, postprocessor)
+    if not processes.is_main:
+        set_seed(config.seed + processes.rank)
+
+    def make_own_env(num_envs: int) -> CronosVectorEnv:
+        return make_env(config, num_envs, processes.local_count)
+
+    env = make_own_env(mine.stop - mine.start)
+    trainer = Trainer(config, env, make_own_env, policy, preprocessor, postprocessor, processes)
     try:
         trainer.train()
     finally:
         env.close()
-    push_to_hub(config, policy, preprocessor, postprocessor)
+    if processes.is_main:
+        push_to_hub(config, policy, preprocessor, postprocessor)
+    processes.leave()
 
 
 def push_to_hub(config: CronosTrainConfig, policy: Any, preprocessor: Any, postprocessor: Any) -> None:

@@ -5,22 +5,25 @@ checkpoints/
     pretrained_model/   config.json, model.safetensors, processors, train_config.json: what LeRobot loads
     training_state/     optimizer, RNGs, loop.json, env_state.npz, observers.pt, training_step.json
   last -> 0102400
+
+Of a run on many processes it holds the streams and random numbers of all of them, written by the first one.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import shutil
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from lerobot.common.train_utils import get_step_identifier, save_training_step
+from lerobot.common.train_utils import get_step_identifier, load_training_num_processes, save_training_step
 from lerobot.optim import load_optimizer_state, save_optimizer_state
 from lerobot.utils.constants import (
     CHECKPOINTS_DIR,
@@ -28,10 +31,12 @@ from lerobot.utils.constants import (
     PRETRAINED_MODEL_DIR,
     TRAINING_STATE_DIR,
 )
-from lerobot.utils.random_utils import load_rng_state, save_rng_state
-from safetensors.torch import load_model, save_model
+from lerobot.utils.random_utils import deserialize_rng_state, load_rng_state, save_rng_state, serialize_rng_state
+from lerobot.utils.utils import flatten_dict, unflatten_dict
+from safetensors.torch import load_file, load_model, save_file, save_model
 
 from cronos_lerobot.loop_state import LoopState
+from cronos_lerobot.processes import Processes
 from cronos_lerobot.rl.ppo import PPO
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.seeding import NamedGenerators
@@ -40,6 +45,8 @@ BASE_POLICY = "base_policy.safetensors"
 ENV_STATE = "env_state.npz"
 LOOP = "loop.json"
 OBSERVERS = "observers.pt"
+PROCESS_RNG = "rng_state_process_{rank}.safetensors"
+"""State of Python's, NumPy's and PyTorch's own generators of the processes after the first."""
 PARTIAL = ".partial_"
 """Prefix of folders that a kill may leave behind; the next checkpoint removes them."""
 
@@ -54,12 +61,13 @@ class RunState:
     env: Any
     preprocessor: Any
     postprocessor: Any
+    processes: Processes = field(default_factory=Processes)
 
 
 def save_checkpoint(
     run: RunState, config: CronosTrainConfig, observers: dict[str, Any], env_state: dict[str, np.ndarray]
 ) -> Path:
-    """Write a checkpoint and point `last` at it; returns its folder.
+    """Write a checkpoint and point `last` at it; returns its folder. All processes call it, the first one writes.
 
     A kill at any moment leaves either the whole checkpoint or none: it is written beside its place and
     renamed into it, and `last` changes hands in one step.
@@ -72,13 +80,19 @@ def save_checkpoint(
     """
     assert config.output_dir is not None
     folder = Path(config.output_dir) / CHECKPOINTS_DIR
-    folder.mkdir(parents=True, exist_ok=True)
     final = folder / get_step_identifier(run.loop.n, config.total_steps)
+    generators = _merge(run.processes.gather(run.generators.state_dict()))
+    other_rngs = run.processes.gather(serialize_rng_state())[1:]
+    if not run.processes.is_main:
+        return final
+    folder.mkdir(parents=True, exist_ok=True)
     _remove_partial(folder)
     partial = Path(tempfile.mkdtemp(prefix=PARTIAL, dir=folder))
     try:
         _write_model(run, config, partial / PRETRAINED_MODEL_DIR)
-        _write_training_state(run, partial / TRAINING_STATE_DIR, observers, env_state)
+        _write_training_state(run, partial / TRAINING_STATE_DIR, observers, env_state, generators)
+        for rank, rng in enumerate(other_rngs, start=1):
+            save_file(flatten_dict(rng), partial / TRAINING_STATE_DIR / PROCESS_RNG.format(rank=rank))
         partial.chmod(0o755)
         _flush_to_disk(partial)
         if final.exists():
@@ -111,6 +125,7 @@ def load_checkpoint(run: RunState, folder: Path) -> dict[str, Any]:
             raise ValueError(
                 f"The checkpoint has {name}={state['loop'][name]}, this run {getattr(run.loop, name)}."
             )
+    _warn_of_other_count(folder, run.processes)
     load_model(run.ppo.policy, str(folder / PRETRAINED_MODEL_DIR / "model.safetensors"))
     load_optimizer_state(run.ppo.optimizer, state_dir)
     if run.ppo.base_policy is not None:
@@ -120,7 +135,7 @@ def load_checkpoint(run: RunState, folder: Path) -> dict[str, Any]:
     run.generators.load_state_dict(state["generators"])
     with np.load(state_dir / ENV_STATE) as arrays:
         run.env.set_state(dict(arrays))
-    load_rng_state(state_dir)
+    _load_rng_state(state_dir, run.processes.rank)
     return _map_leaves(torch.load(state_dir / OBSERVERS), torch.Tensor, lambda tensor: tensor.numpy())
 
 
@@ -137,12 +152,16 @@ def _write_model(run: RunState, config: CronosTrainConfig, folder: Path) -> None
 
 
 def _write_training_state(
-    run: RunState, folder: Path, observers: dict[str, Any], env_state: dict[str, np.ndarray]
+    run: RunState,
+    folder: Path,
+    observers: dict[str, Any],
+    env_state: dict[str, np.ndarray],
+    generators: dict[str, Any],
 ) -> None:
     folder.mkdir()
     save_optimizer_state(run.ppo.optimizer, folder)
     save_rng_state(folder)
-    save_training_step(run.loop.n, folder)
+    save_training_step(run.loop.n, folder, num_processes=run.processes.count)
     if run.ppo.base_policy is not None:
         save_model(run.ppo.base_policy, str(folder / BASE_POLICY))
     np.savez(folder / ENV_STATE, allow_pickle=False, **env_state)
@@ -151,9 +170,32 @@ def _write_training_state(
     state = {
         "loop": run.loop.state_dict(),
         "num_updates": run.ppo.num_updates,
-        "generators": run.generators.state_dict(),
+        "generators": generators,
     }
     (folder / LOOP).write_text(json.dumps(state))
+
+
+def _merge(states: list[dict[str, Any]]) -> dict[str, Any]:
+    """Join the generators of all processes; those they have in common are alike."""
+    return {kind: {name: s for state in states for name, s in state[kind].items()} for kind in ("numpy", "torch")}
+
+
+def _load_rng_state(folder: Path, rank: int) -> None:
+    path = folder / PROCESS_RNG.format(rank=rank)
+    if path.exists():
+        deserialize_rng_state(unflatten_dict(load_file(path)))
+    else:
+        load_rng_state(folder)
+
+
+def _warn_of_other_count(folder: Path, processes: Processes) -> None:
+    saved = load_training_num_processes(folder) or 1
+    if saved != processes.count and processes.is_main:
+        logging.warning(
+            f"The checkpoint is of {saved} processes, this run has {processes.count}: the streams go on where "
+            "they were, but with other random numbers, and an optimizer step now takes algorithm.minibatch_size * "
+            f"algorithm.grad_accumulation transitions of {processes.count} processes."
+        )
 
 
 def _map_leaves(tree: Any, leaf: type, convert: Callable[[Any], Any]) -> Any:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,6 +16,7 @@ from lerobot_env_cronos import STEPS_PER_TASK
 
 from cronos_lerobot.data.schema import observation_columns
 from cronos_lerobot.evaluation.rates import SuccessRate
+from cronos_lerobot.processes import Processes
 from cronos_lerobot.rl.processing import PolicyProcessors
 
 
@@ -56,11 +58,12 @@ def evaluate_independent(
     temperature: float = 0.6,
     seed: int = 1000,
     num_steps: int = STEPS_PER_TASK,
+    processes: Processes | None = None,
 ) -> EvaluationResult:
     """Evaluate a policy on every task from every configuration.
 
     The sampling is seeded, so the same policy gets the same result whenever it is asked, as long as
-    `env.num_envs` and the order of tasks and configurations stay the same.
+    `env.num_envs`, the order of tasks and configurations and the number of processes stay the same.
 
     Args:
         env: environments of the evaluation's own, never those of a training stream.
@@ -72,20 +75,30 @@ def evaluate_independent(
         temperature: of the sampling, 0 for the likeliest action.
         seed: of the sampling.
         num_steps: control steps of an episode.
+        processes: that share out the episodes; all call this and get the whole result.
     """
+    processes = processes or Processes()
     was_training = policy.training
     policy.eval()
     generator = torch.Generator(device=processors.device)
-    generator.manual_seed(seed)
+    generator.manual_seed(seed + processes.rank)
     result = EvaluationResult(split, temperature, list(configurations), {task.instruction: [] for task in tasks})
     jobs = [(task, configuration) for task in tasks for configuration in configurations]
-    for batch in _batches(jobs, env.num_envs):
+    flags: list[bool] = []
+    for batch in _batches(_share_of(jobs, processes), env.num_envs):
         _place(env, batch, split)
         succeeded = _rollout(env, policy, processors, temperature, generator, num_steps, len(batch))
-        for (task, _), success in zip(batch, succeeded[: len(batch)], strict=True):
-            result.successes[task.instruction].append(bool(success))
+        flags += succeeded[: len(batch)].tolist()
     policy.train(was_training)
+    for (task, _), success in zip(jobs, itertools.chain(*processes.gather(flags)), strict=True):
+        result.successes[task.instruction].append(success)
     return result
+
+
+def _share_of(jobs: list[tuple[Any, int]], processes: Processes) -> list[tuple[Any, int]]:
+    """The episodes of this process: neighbours, about as many as the others'."""
+    first, last = (len(jobs) * rank // processes.count for rank in (processes.rank, processes.rank + 1))
+    return jobs[first:last]
 
 
 def _batches(jobs: list[tuple[Any, int]], size: int) -> Iterator[list[tuple[Any, int]]]:

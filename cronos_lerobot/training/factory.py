@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from typing import Any
 
 from lerobot.policies import make_policy, make_pre_post_processors
@@ -13,8 +14,10 @@ from cronos_lerobot.rl.policy import check_trainable
 from cronos_lerobot.training.config import CronosTrainConfig
 
 
-def make_env(config: CronosTrainConfig, num_envs: int) -> CronosVectorEnv:
+def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1) -> CronosVectorEnv:
     """Return `num_envs` streams of the config's scene; they never reset themselves.
+
+    `local_processes` of this node share its cores, unless the config says how many threads each takes.
 
     Raises:
         ValueError: the environment is not a CRONOS scene.
@@ -23,9 +26,10 @@ def make_env(config: CronosTrainConfig, num_envs: int) -> CronosVectorEnv:
     if not isinstance(env_config, CronosEnvConfig):
         name = env_config.type if env_config else None
         raise ValueError(f"Reset-free training needs --env.type=cronos, got {name!r}.")
-    return CronosVectorEnv(
-        num_envs, scene=env_config.scene, reward=config.protocol.reward, **env_config.gym_kwargs
-    )
+    options = env_config.gym_kwargs
+    if options["num_threads"] == 0 and local_processes > 1:
+        options["num_threads"] = max(1, len(os.sched_getaffinity(0)) // local_processes)
+    return CronosVectorEnv(num_envs, scene=env_config.scene, reward=config.protocol.reward, **options)
 
 
 def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any]:

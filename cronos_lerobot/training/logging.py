@@ -200,7 +200,27 @@ class RunLogger:
         return WandBLogger(self.config)  # ty: ignore[invalid-argument-type]
 
 
-def write_manifest(config: CronosTrainConfig) -> None:
+class SilentLogger:
+    """Stands in for RunLogger in every process but the first."""
+
+    def log(self, kind: str, values: dict[str, Any]) -> None:
+        """Log nothing."""
+
+    def progress(self, values: dict[str, Any]) -> None:
+        """Show nothing."""
+
+    def log_checkpoint(self, folder: Path) -> None:
+        """Send nothing."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return nothing: a checkpoint has the first process's."""
+        return {}
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def write_manifest(config: CronosTrainConfig, num_processes: int = 1) -> None:
     """Write what is needed to tell this run from another, once for each start, into manifest.json.
 
     A resumed run appends to `starts`, so that a change of machine or version in between is on record.
@@ -216,6 +236,7 @@ def write_manifest(config: CronosTrainConfig) -> None:
         "versions": {"python": platform.python_version()} | package_versions(),
         "git_commit": git_commit(),
         "machine": {"platform": platform.platform(), "cpu_count": os.cpu_count()},
+        "num_processes": num_processes,
         "renderer": os.environ.get("MUJOCO_GL"),
         "policy_device": config.policy.device if config.policy else None,
         "config": config.to_dict(),

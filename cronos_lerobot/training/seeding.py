@@ -45,11 +45,13 @@ class NamedGenerators:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue every generator where `state_dict` left it."""
-        for name, bits in state["numpy"].items():
-            self.for_numpy(name).bit_generator.state = bits
-        for name, bits in state["torch"].items():
-            self.for_torch(name).set_state(torch.tensor(bits, dtype=torch.uint8))
+        """Continue every generator made so far where `state` has it; one that it does not know begins anew."""
+        for name, rng in self._numpy.items():
+            if name in state["numpy"]:
+                rng.bit_generator.state = state["numpy"][name]
+        for name, generator in self._torch.items():
+            if name in state["torch"]:
+                generator.set_state(torch.tensor(state["torch"][name], dtype=torch.uint8))
 
     def _sequence(self, name: str) -> np.random.SeedSequence:
         return np.random.SeedSequence([self.seed, zlib.crc32(name.encode())])

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from cronos_lerobot.loop_state import Event, SegmentEnd, Step, Update
+from cronos_lerobot.processes import Processes, bit_sum
 from cronos_lerobot.resets import make_resets
 from cronos_lerobot.rf_mtrl import rf_mtrl
 from cronos_lerobot.rl.agent import PPOAgent
@@ -20,9 +21,10 @@ from cronos_lerobot.task_orders import TaskSet, make_task_order
 from cronos_lerobot.training.checkpoint import RunState, load_checkpoint, save_checkpoint
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.evaluation import evaluate_independent
-from cronos_lerobot.training.logging import RolloutStatistics, RunLogger, write_manifest
-from cronos_lerobot.training.recording import StreamObserver
+from cronos_lerobot.training.logging import RolloutStatistics, RunLogger, SilentLogger, write_manifest
+from cronos_lerobot.training.recording import FilmedEnv, StreamObserver
 from cronos_lerobot.training.seeding import NamedGenerators
+from cronos_lerobot.training.sharding import ShardedAgent, ShardedEnv, whole_step
 
 
 class Trainer:
@@ -30,11 +32,12 @@ class Trainer:
 
     Args:
         config: validated; its output folder is made.
-        env: the N streams; never reset by anyone but the run.
+        env: the N streams, or those of this process; never reset by anyone but the run.
         make_eval_env: makes the evaluation's own environments, n of them, when first needed.
         policy: a LeRobot policy that is a TrainablePolicy.
         preprocessor: the policy's LeRobot preprocessor.
         postprocessor: the policy's LeRobot postprocessor.
+        processes: that train together, this one among them; each makes its own Trainer.
 
     Raises:
         TypeError: the policy is not trainable.
@@ -49,23 +52,33 @@ class Trainer:
         policy: Any,
         preprocessor: Any,
         postprocessor: Any,
+        processes: Processes | None = None,
     ) -> None:
         assert isinstance(config.algorithm, PPOConfig)
         self.config = config
+        self.policy = policy
+        self.processes = processes or Processes()
         self.stopwatch = Stopwatch()
-        self.env = env
         env.timer = self.stopwatch
         self.task_set = TaskSet.of(env.scene, config.protocol)
         self._make_eval_env = make_eval_env
         self._eval_env: Any = None
-        device = str(next(policy.parameters()).device)
-        self.generators = NamedGenerators(config.seed, device)
+        self.generators = NamedGenerators(config.seed, str(next(policy.parameters()).device))
         self.processors = make_processors(policy, preprocessor, postprocessor)
-        ppo = PPO(policy, self.processors, config.algorithm, self.generators.for_numpy("minibatches"))
-        buffer = RolloutBuffer(config.protocol.update_interval, config.num_envs)
-        self.agent = PPOAgent(ppo, buffer, self.generators.for_torch("actions"), self.stopwatch)
+        self.processes.copy_from_main([*policy.parameters(), *policy.buffers()])
+        # Every process draws its own minibatches and actions; configurations and tasks are drawn alike in all.
+        minibatches = self.generators.for_numpy(self.processes.own("minibatches"))
+        actions = self.generators.for_torch(self.processes.own("actions"))
+        ppo = PPO(policy, self.processors, config.algorithm, minibatches, self.processes)
+        buffer = RolloutBuffer(config.protocol.update_interval, env.num_envs)
+        self.env, self.agent = env, PPOAgent(ppo, buffer, actions, self.stopwatch)
+        if self.processes.count > 1:
+            self.env = ShardedEnv(env, self.processes)
+            self.agent = ShardedAgent(self.agent, self.env.mine)
         self.loop = self.task_set.new_loop(config.num_envs)
-        self.run_state = RunState(ppo, self.loop, self.generators, env, preprocessor, postprocessor)
+        self.run_state = RunState(
+            ppo, self.loop, self.generators, self.env, preprocessor, postprocessor, self.processes
+        )
         self.statistics = RolloutStatistics([t.instruction for t in self.task_set.all], len(self.task_set.tasks))
         # Every named generator exists before a checkpoint is loaded into them.
         self._resets = make_resets(config.protocol, self.generators.for_numpy("configurations"))
@@ -77,9 +90,7 @@ class Trainer:
         observers: dict[str, Any] = {}
         if self.config.checkpoint_path is not None:
             observers = load_checkpoint(self.run_state, self.config.checkpoint_path)
-        write_manifest(self.config)
-        self.logger = RunLogger(self.config, self.loop, observers.get("logger", {}).get("offset"))
-        self.recorder = StreamObserver.open(self.config, self.env, observers.get("recorder"))
+        self._open_observers(observers)
         try:
             if self.loop.t == 0:
                 self._evaluate()
@@ -87,6 +98,17 @@ class Trainer:
         finally:
             self.recorder.close()
             self.logger.close()
+
+    def _open_observers(self, states: dict[str, Any]) -> None:
+        """Continue the observers from their `states`; those of a run that begins have none."""
+        self.logger: RunLogger | SilentLogger = SilentLogger()
+        self.recorder = StreamObserver(None)
+        if self.processes.is_main:
+            write_manifest(self.config, self.processes.count)
+            self.logger = RunLogger(self.config, self.loop, states.get("logger", {}).get("offset"))
+            self.recorder = StreamObserver.open(
+                self.config, self.env, states.get("recorder"), lambda why: self.logger.log("recording", why)
+            )
 
     def _run(self) -> None:
         last_eval = last_save = self.loop.n
@@ -101,6 +123,7 @@ class Trainer:
             # Reading the simulations' state wakes sleeping bodies, so it is done at every update: the run
             # must not depend on how often it is saved.
             env_state = self.env.get_state()
+            self._check_processes()
             self._log_update()
             if _due(self.loop.n, last_eval, self.config.eval_freq):
                 self._evaluate()
@@ -114,8 +137,10 @@ class Trainer:
             self._save(self.env.get_state())
 
     def _events(self) -> Any:
+        record = self.config.record
+        filmed = record.filmed_streams if record.repo_id is not None and self.processes.is_main else 0
         return rf_mtrl(
-            self.env,
+            FilmedEnv(self.env, filmed) if filmed else self.env,
             self.task_set.all,
             self.agent,
             self._task_order,
@@ -129,9 +154,24 @@ class Trainer:
         self.statistics.on_event(event)
         if isinstance(event, Step):
             with self.stopwatch("record"):
+                if self.config.record.repo_id is not None:
+                    event = whole_step(event, self.processes)
                 self.recorder.on_step(event)
         elif isinstance(event, Update):
             self._update_metrics = event.metrics
+
+    def _check_processes(self) -> None:
+        if self.processes.count == 1:
+            return
+        generators = self.generators.state_dict()["numpy"]
+        generators.pop(self.processes.own("minibatches"))
+        self.processes.check_alike(
+            {
+                "the loop's state": self.loop.state_dict(),
+                "the random numbers": generators,
+                "the policy": bit_sum(p for p in self.policy.parameters() if p.requires_grad),
+            }
+        )
 
     def _log_update(self) -> None:
         wall, seconds = self.stopwatch.lap()
@@ -148,17 +188,18 @@ class Trainer:
             return
         options = self.config.eval
         if self._eval_env is None:
-            num_episodes = len(self.task_set.tasks) * options.n_episodes
+            num_episodes = -(-len(self.task_set.tasks) * options.n_episodes // self.processes.count)
             self._eval_env = self._make_eval_env(min(options.batch_size, num_episodes))
         result = evaluate_independent(
             self._eval_env,
             self.task_set.tasks,
-            self.agent.ppo.policy,
+            self.policy,
             self.processors,
             configurations=range(options.n_episodes),
             split=options.split,
             temperature=options.temperature,
             seed=options.seed,
+            processes=self.processes,
         )
         self.logger.log("evaluation", result.to_dict())
         self.stopwatch.lap()

@@ -56,7 +56,8 @@ def test_normalised_advantages():
     buffer = filled(rows=4)
     buffer.compute_advantages(0.99, 0.95)
     returns = buffer.returns.copy()
-    buffer.normalize_advantages()
+    advantages = buffer.results()["advantages"]
+    buffer.normalize_advantages(advantages.mean(), advantages.std())
     assert abs(buffer.advantages[:4].mean()) < 1e-6
     assert buffer.advantages[:4].std() == pytest.approx(1, abs=1e-5)
     np.testing.assert_array_equal(buffer.returns, returns)

@@ -1,0 +1,196 @@
+"""The processes of a run: one, or those that `accelerate launch` started, each with its own streams.
+
+The little that is shared at every step (rewards, successes) goes through the CPU (Gloo), gradients through
+whatever Accelerate chose for the policy's device (NCCL on GPUs).
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+TIMEOUT = dt.timedelta(hours=1)
+"""How long a process waits for the others: while the first one writes a checkpoint, say."""
+
+BUCKET_BYTES = 64 * 2**20
+"""Gradients travel in pieces of about this size."""
+
+
+class Processes:
+    """One process: what it shares with the others is its own."""
+
+    rank = 0
+    """Number of this process, from 0."""
+    count = 1
+    """Processes of the run, on all nodes."""
+    local_count = 1
+    """Processes of the run on this node."""
+
+    @property
+    def is_main(self) -> bool:
+        """Whether this is the one that logs and writes."""
+        return self.rank == 0
+
+    def share_of(self, num_envs: int) -> slice:
+        """The streams of this process among `num_envs`.
+
+        Raises:
+            ValueError: they cannot be shared out evenly.
+        """
+        if num_envs % self.count:
+            raise ValueError(
+                f"num_envs is the number of streams of all processes together: {num_envs} cannot be shared out "
+                f"evenly over {self.count} processes; take a multiple of {self.count}."
+            )
+        size = num_envs // self.count
+        return slice(self.rank * size, (self.rank + 1) * size)
+
+    def own(self, name: str) -> str:
+        """`name` for what every process has of its own: the first one's is `name` itself."""
+        return name if self.is_main else f"{name}/process_{self.rank}"
+
+    def concatenate(self, array: np.ndarray, axis: int = 0) -> np.ndarray:
+        """All processes' arrays, of one shape and type, joined along `axis` in the order of the ranks."""
+        return array
+
+    def gather(self, value: Any) -> list[Any]:
+        """All processes' values, in the order of the ranks."""
+        return [value]
+
+    def broadcast(self, value: Any, source: int = 0) -> Any:
+        """The value of process `source`."""
+        return value
+
+    def average_gradients(self, parameters: Sequence[Tensor]) -> None:
+        """Replace every gradient by its mean over the processes."""
+
+    def copy_from_main(self, tensors: Iterable[Tensor]) -> None:
+        """Overwrite `tensors` by those of the first process."""
+
+    def check_alike(self, state: dict[str, Any]) -> None:
+        """Check that `state` is the same in all processes.
+
+        Raises:
+            RuntimeError: it is not; a run that went on would be neither one run nor several.
+        """
+
+    def leave(self) -> None:
+        """Part from the other processes."""
+
+
+class LaunchedProcesses(Processes):
+    """Processes that run in step: every method but `share_of` and `own` waits until all have called it.
+
+    Args:
+        rank: of this one.
+        count: of all.
+        local_count: of those on this node.
+    """
+
+    def __init__(self, rank: int, count: int, local_count: int) -> None:
+        self.rank, self.count, self.local_count = rank, count, local_count
+        self._control = dist.new_group(backend="gloo", timeout=TIMEOUT)
+
+    def concatenate(self, array: np.ndarray, axis: int = 0) -> np.ndarray:
+        """All processes' arrays, of one shape and type, joined along `axis` in the order of the ranks."""
+        array = np.ascontiguousarray(array)
+        own = torch.from_numpy(array.reshape(-1).view(np.uint8))
+        parts = [torch.empty_like(own) for _ in range(self.count)]
+        dist.all_gather(parts, own, group=self._control)
+        return np.concatenate([part.numpy().view(array.dtype).reshape(array.shape) for part in parts], axis=axis)
+
+    def gather(self, value: Any) -> list[Any]:
+        """All processes' values, in the order of the ranks."""
+        values: list[Any] = [None] * self.count
+        dist.all_gather_object(values, value, group=self._control)
+        return values
+
+    def broadcast(self, value: Any, source: int = 0) -> Any:
+        """The value of process `source`."""
+        values = [value]
+        dist.broadcast_object_list(values, src=source, group=self._control)
+        return values[0]
+
+    def average_gradients(self, parameters: Sequence[Tensor]) -> None:
+        """Replace every gradient by its mean over the processes; one that a process has not counts as 0."""
+        has_gradient = np.array([[parameter.grad is not None for parameter in parameters]])
+        gradients = []
+        for i in np.flatnonzero(self.concatenate(has_gradient).any(axis=0)):
+            if parameters[i].grad is None:
+                parameters[i].grad = torch.zeros_like(parameters[i])
+            gradients.append(parameters[i].grad)
+        for bucket in _buckets(gradients):
+            mean = torch.cat([gradient.reshape(-1) for gradient in bucket]) / self.count
+            dist.all_reduce(mean)
+            for gradient, part in zip(bucket, mean.split([gradient.numel() for gradient in bucket]), strict=True):
+                gradient.copy_(part.view_as(gradient))
+
+    def copy_from_main(self, tensors: Iterable[Tensor]) -> None:
+        """Overwrite `tensors` by those of the first process."""
+        for tensor in tensors:
+            contiguous = tensor.detach().contiguous()
+            dist.broadcast(contiguous, src=0)
+            tensor.detach().copy_(contiguous)
+
+    def check_alike(self, state: dict[str, Any]) -> None:
+        """Check that `state` is the same in all processes.
+
+        Raises:
+            RuntimeError: it is not; a run that went on would be neither one run nor several.
+        """
+        for rank, other in enumerate(self.gather(state)):
+            if other != state:
+                names = sorted(name for name in state | other if state.get(name) != other.get(name))
+                raise RuntimeError(
+                    f"Processes {self.rank} and {rank} no longer agree on: {', '.join(names)}. Task orders and "
+                    "reset strategies of your own must decide alike in every process: by the loop's state, the "
+                    "environment's answers and the generator they are given, and nothing else."
+                )
+
+    def leave(self) -> None:
+        """Part from the other processes."""
+        dist.destroy_process_group()
+
+
+def join_processes(device: str | None) -> Processes:
+    """Join the processes that `accelerate launch` (or torchrun) started; one process without it.
+
+    Args:
+        device: of the policy; `cpu` keeps Accelerate from taking a GPU.
+    """
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return Processes()
+    from accelerate import Accelerator, InitProcessGroupKwargs
+
+    accelerator = Accelerator(cpu=device == "cpu", kwargs_handlers=[InitProcessGroupKwargs(timeout=TIMEOUT)])
+    if accelerator.num_processes == 1:
+        return Processes()
+    local_count = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    return LaunchedProcesses(accelerator.process_index, accelerator.num_processes, local_count)
+
+
+def bit_sum(tensors: Iterable[Tensor]) -> int:
+    """A number that tells tensors apart down to the last bit, whatever device adds it up."""
+    as_int = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
+    sums = [t.detach().contiguous().view(as_int[t.element_size()]).sum(dtype=torch.int64) for t in tensors]
+    return int(torch.stack(sums).sum())
+
+
+def _buckets(tensors: Iterable[Tensor]) -> Iterator[list[Tensor]]:
+    """Group neighbours of one type and device up to BUCKET_BYTES."""
+    bucket: list[Tensor] = []
+    for tensor in tensors:
+        is_alike = bucket and (tensor.dtype, tensor.device) == (bucket[0].dtype, bucket[0].device)
+        if bucket and not (is_alike and sum(t.nbytes for t in [*bucket, tensor]) <= BUCKET_BYTES):
+            yield bucket
+            bucket = []
+        bucket.append(tensor)
+    if bucket:
+        yield bucket

@@ -1,0 +1,173 @@
+"""Streams shared out over processes: the main loop counts all of them, this process simulates its own.
+
+Every process runs Algorithm 1 in step with the others, on the same counters and the same random numbers, so that
+all decide alike: which task, which configuration, when to stop. The observations and the actions are each
+process's own; rewards, successes and divergences are exchanged at every step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from cronos_lerobot.loop_state import Step
+from cronos_lerobot.processes import Processes
+from cronos_lerobot.rl.policy import ActionSample, Agent
+from cronos_lerobot.training.recording import FILM
+
+INFO = ("is_success", "is_grasped", "diverged")
+
+
+class ShardedEnv:
+    """All N streams of a run to whoever counts and intervenes, this process's to whoever looks and acts.
+
+    Stream ids are those of all N streams. Observations and actions have a row for each stream of this process,
+    everything else for each of the N. All processes must make the same calls.
+
+    Args:
+        env: the streams of this process.
+        processes: that share out the streams; each has as many.
+
+    Attributes:
+        timer: that of `env`; it is told the time spent in waiting for the others ("wait").
+    """
+
+    def __init__(self, env: Any, processes: Processes) -> None:
+        self._env = env
+        self._processes = processes
+        self.timer: Callable[[str], AbstractContextManager] = env.timer
+        self.num_envs = env.num_envs * processes.count
+        self.mine = processes.share_of(self.num_envs)
+        self.scene = env.scene
+        self.metadata = env.metadata
+        self.single_observation_space = env.single_observation_space
+
+    def step(self, actions: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict]:
+        """Act on the streams of this process; the reward (N,) and the info's arrays (N,) are of all."""
+        observation, reward, _, _, info = self._env.step(actions)
+        table = self._concatenate(np.stack([reward, *(info[name] for name in INFO)], axis=1, dtype=np.float32))
+        never = np.zeros(self.num_envs, np.bool_)
+        flags = {name: table[:, i] > 0 for i, name in enumerate(INFO, start=1)}
+        return observation, table[:, 0], never, never.copy(), flags
+
+    def observe(self) -> dict[str, Any]:
+        """The observation now, of the streams of this process."""
+        return self._env.observe()
+
+    def set_task(self, ids: Iterable[int], tasks: Sequence[Any]) -> None:
+        """Give the streams `ids` their tasks."""
+        given = {int(i): task for i, task in zip(ids, tasks, strict=True)}
+        own = self._own(list(given))
+        if len(own):
+            self._env.set_task(own - self.mine.start, [given[int(i)] for i in own])
+
+    def scene_reset(self, ids: np.ndarray, configurations: np.ndarray, split: str = "train") -> None:
+        """Put every body of the streams `ids` at configurations (k,) of a split, and the arm home."""
+        ids = np.asarray(ids)
+        own = self._own(ids)
+        if len(own):
+            self._env.scene_reset(own - self.mine.start, np.asarray(configurations)[np.isin(ids, own)], split)
+
+    def end_effector_reset(self, ids: np.ndarray) -> None:
+        """Put the arm of the streams `ids` home."""
+        own = self._own(ids)
+        if len(own):
+            self._env.end_effector_reset(own - self.mine.start)
+
+    def unsuitable_bodies(self) -> np.ndarray:
+        """Bodies that no task can reach any more, (N, bodies) bool."""
+        return self._concatenate(self._env.unsuitable_bodies())
+
+    def put_back(self, stream: int, body: str, rng: np.random.Generator) -> None:
+        """Put one body of a stream at a free place; `rng` goes on alike in all processes."""
+        owner = stream // self._env.num_envs
+        if owner == self._processes.rank:
+            self._env.put_back(stream - self.mine.start, body, rng)
+        with self.timer("wait"):
+            # How many numbers it takes to find a free place only the owner knows.
+            rng.bit_generator.state = self._processes.broadcast(rng.bit_generator.state, source=owner)
+
+    def render_streams(self, ids: np.ndarray) -> np.ndarray:
+        """Frames (k, height, width, 3) uint8 of the streams `ids`, all of this process.
+
+        Raises:
+            ValueError: one of them is another process's.
+        """
+        if len(self._own(ids)) < len(ids):
+            raise ValueError(
+                f"A process renders its own streams, {self.mine.start} to {self.mine.stop - 1} here, "
+                f"got {np.asarray(ids).tolist()}."
+            )
+        return self._env.render_streams(np.asarray(ids) - self.mine.start)
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """The state of all N streams, as one process with N streams has it."""
+        return {name: self._concatenate(array) for name, array in self._env.get_state().items()}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """Continue from a state of all N streams."""
+        self._env.set_state({name: array[self.mine] for name, array in state.items()})
+
+    def _own(self, ids: Any) -> np.ndarray:
+        ids = np.asarray(ids, np.int64)
+        return ids[(ids >= self.mine.start) & (ids < self.mine.stop)]
+
+    def _concatenate(self, array: np.ndarray) -> np.ndarray:
+        with self.timer("wait"):
+            return self._processes.concatenate(array)
+
+
+class ShardedAgent:
+    """Acts for the streams of this process and learns with the other processes.
+
+    Args:
+        agent: of the streams of this process; its `update` learns together with the others'.
+        mine: those streams among all N.
+    """
+
+    def __init__(self, agent: Agent, mine: slice) -> None:
+        self._agent = agent
+        self._mine = mine
+
+    def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
+        """Sample an action for each stream of this process; `tau` has all N instructions."""
+        return self._agent.act(o_t, tau[self._mine])
+
+    def store(
+        self,
+        o_t: dict[str, Any],
+        tau: list[str],
+        a_t: ActionSample,
+        r_t: np.ndarray,
+        o_tp1: dict[str, Any],
+        cut_t: np.ndarray,
+        diverged_t: np.ndarray,
+    ) -> None:
+        """Keep one transition of every stream of this process."""
+        mine = self._mine
+        self._agent.store(o_t, tau[mine], a_t, r_t[mine], o_tp1, cut_t[mine], diverged_t[mine])
+
+    def update(self) -> dict[str, float]:
+        """Learn from what all processes have stored."""
+        return self._agent.update()
+
+
+def whole_step(step: Step, processes: Processes) -> Step:
+    """Return `step` with the observations and actions of all N streams, to be recorded by the first process.
+
+    Films are that process's own.
+    """
+    action = ActionSample(**{name: processes.concatenate(array) for name, array in vars(step.action).items()})
+    seen = {name: value for name, value in step.observation.items() if name != FILM}
+    observation = step.observation | _map_arrays(seen, processes.concatenate)
+    return replace(step, observation=observation, action=action)
+
+
+def _map_arrays(tree: Any, convert: Callable[[np.ndarray], np.ndarray]) -> Any:
+    if isinstance(tree, dict):
+        return {name: _map_arrays(value, convert) for name, value in tree.items()}
+    return convert(tree)

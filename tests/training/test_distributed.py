@@ -1,0 +1,353 @@
+"""Two processes that train together, against one process with all of their streams."""
+
+import json
+import multiprocessing
+import os
+import re
+import socket
+import subprocess
+import sys
+import traceback
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from dummies import TASKS, DummyEnv, DummyPolicy, identity_processors
+from lerobot.datasets import LeRobotDataset
+from lerobot.utils.random_utils import set_seed
+from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
+from test_trainer import STEPS_PER_UPDATE, STREAMS, KilledError, assert_same_run, config, metrics, weights
+
+from cronos_lerobot import processes as processes_module
+from cronos_lerobot.data.schema import Intervention
+from cronos_lerobot.processes import Processes, bit_sum, join_processes
+from cronos_lerobot.protocol import ProtocolConfig
+from cronos_lerobot.rl.policy import ActionSample
+from cronos_lerobot.rl.ppo import PPO
+from cronos_lerobot.rl.ppo_config import PPOConfig
+from cronos_lerobot.rl.processing import PolicyProcessors
+from cronos_lerobot.rl.rollout_buffer import RolloutBuffer
+from cronos_lerobot.training.config import RecordConfig
+from cronos_lerobot.training.trainer import Trainer
+
+DIVERGE_AT = {(5, 1), (21, 2)}
+"""Stream 1 is the first process's of two, stream 2 the second's."""
+
+
+def together(function, *args, count=2):
+    """Run `function(processes, *args)` in `count` processes as `accelerate launch` starts them; their results."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    # Forked, so that nobody imports LeRobot again.
+    context = multiprocessing.get_context("fork")
+    results = context.Queue()
+    children = [
+        context.Process(target=_child, args=(rank, count, port, results, function, args)) for rank in range(count)
+    ]
+    for child in children:
+        child.start()
+    try:
+        answers = dict(results.get(timeout=120) for _ in children)
+        for child in children:
+            child.join(timeout=60)
+    finally:
+        for child in children:
+            child.kill()
+    for rank, (_, error) in sorted(answers.items()):
+        assert error is None, f"process {rank}:\n{error}"
+    return [answers[rank][0] for rank in range(count)]
+
+
+def _child(rank, count, port, results, function, args):
+    torch.set_num_threads(1)
+    os.environ |= {
+        "RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count),
+        "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "OMP_NUM_THREADS": "1",
+    }  # fmt: skip
+    try:
+        joined = join_processes("cpu")
+        answer = function(joined, *args), None
+        joined.leave()
+    except BaseException:
+        answer = None, traceback.format_exc()
+    results.put((rank, answer))
+
+
+class WanderingEnv(DummyEnv):
+    """Part of a world of streams, in which body "a" is lost beyond 1.4 and put back at a random place."""
+
+    def __init__(self, num_envs, first=0, dies_at=None):
+        diverge_at = {(t, i - first) for t, i in DIVERGE_AT if first <= i < first + num_envs}
+        super().__init__(num_envs, diverge_at=diverge_at)
+        self.dies_at = dies_at
+
+    def step(self, actions):
+        if self.t == self.dies_at:
+            raise KilledError
+        return super().step(3 * actions)
+
+    def _observation(self):
+        observation = super()._observation()
+        observation["agent_pos"][:, 1] = self.t / 32
+        return observation
+
+    def unsuitable_bodies(self):
+        return np.stack([np.abs(self.x) > 1.4, *[np.zeros(self.num_envs, bool)] * 2], axis=1)
+
+    def put_back(self, stream, body, rng):
+        # Rejection sampling: how many numbers it takes depends on what is drawn.
+        while (place := rng.uniform(-3, 3)) > 0.7:
+            pass
+        self.x[stream] = max(place, -1.0)
+
+
+class ScriptedPolicy(DummyPolicy):
+    """Acts by what it sees, not by chance or by its weights, so that its streams are the same in any process."""
+
+    def sample_actions(self, batch, *, temperature=1.0, generator=None):
+        noise = torch.sin(777 * batch["observation.state"][:, :2].sum(dim=1, keepdim=True) + torch.arange(7.0))
+        tokens = ((noise + 1) / 2 * 3).long().clamp(0, 2)
+        log_prob = self._distribution(batch, temperature or 1.0).log_prob(tokens).sum(dim=1)
+        value = self.predict_values(batch)
+        return {"action": tokens.float() - 1, "tokens": tokens, "log_prob": log_prob, "value": value}
+
+
+def train(processes, cfg, policy_class=ScriptedPolicy, dies_at=None):
+    """Train in this process; returns what all processes should agree on, or None if it died."""
+    mine = processes.share_of(cfg.num_envs)
+    set_seed(cfg.seed)
+    env = WanderingEnv(mine.stop - mine.start, mine.start, dies_at)
+    # The processes begin with the weights of the first one.
+    policy = policy_class(seed=processes.rank)
+    trainer = Trainer(cfg, env, DummyEnv, policy, *identity_processors(), processes)
+    try:
+        trainer.train()
+    except KilledError:
+        return None
+    parameters = torch.cat([parameter.detach().flatten() for parameter in policy.parameters()])
+    return trainer.loop.state_dict(), parameters.tolist()
+
+
+def settings(folder, minibatch_size, *, resume=None, budget=None, algorithm=None, **options):
+    """A run with heuristic resets; `minibatch_size` is that of one process."""
+    protocol = ProtocolConfig(
+        task_switch_interval=4, update_interval=8, scene_reset_interval=16, heuristic_reset=True,
+        task_order="random", reset_budget=budget,
+    )  # fmt: skip
+    ppo = {"minibatch_size": minibatch_size, "policy_lr": 1e-2, "kl_base_coef": 0.1} | (algorithm or {})
+    cfg = config(folder, protocol=protocol, algorithm=PPOConfig(**ppo), **options)
+    cfg.checkpoint_path = resume
+    return cfg
+
+
+def columns(folder):
+    data = LeRobotDataset("me/stream", root=folder / "streams").hf_dataset.with_format("numpy")[:]
+    order = np.lexsort([data["cronos.step"], data["cronos.stream_id"]])
+    return {name: column[order] for name, column in data.items() if name.startswith(("cronos", "action", "obs"))}
+
+
+# At a policy_lr of 0.3 the updates stop early.
+@pytest.mark.parametrize("algorithm", [{}, {"policy_lr": 0.3, "lr_schedule": "kl_step"}], ids=["", "early_stop"])
+def test_two_processes_are_one_run(tmp_path, algorithm):
+    """Counters, draws, logs, recordings, evaluations and, but for rounding, the policy."""
+    options = {"record": RecordConfig(repo_id="me/stream", streams="all"), "algorithm": algorithm}
+    loop, policy = train(Processes(), settings(tmp_path / "one", 32, **options))
+    answers = together(train, settings(tmp_path / "two", 16, **options))
+    assert answers[0] == answers[1]
+    assert answers[0][0] == loop
+    assert answers[0][1] == pytest.approx(policy, rel=1e-3, abs=1e-5)
+    one, two = metrics(tmp_path / "one"), metrics(tmp_path / "two")
+    for a, b in zip(one, two, strict=True):
+        assert a.pop("ppo", {}) == pytest.approx(b.pop("ppo", {}), rel=1e-3, abs=1e-5)
+        assert a == b
+    first, second = columns(tmp_path / "one"), columns(tmp_path / "two")
+    assert first["cronos.stream_id"].tolist() == np.repeat(range(STREAMS), 32).tolist()
+    for name, column in first.items():
+        np.testing.assert_allclose(second[name], column, rtol=1e-3, atol=1e-5, err_msg=name)
+
+
+def test_the_runs_compared_have_everything_that_is_counted(tmp_path):
+    trainer_loop, _ = train(Processes(), settings(tmp_path / "run", 32))
+    counts = np.array(trainer_loop["interventions"])
+    assert counts[:, Intervention.SCENE_RESET].tolist() == [2] * 4
+    assert counts[:, Intervention.DIVERGENCE].tolist() == [0, 1, 1, 0]
+    put_back = counts[:, Intervention.HEURISTIC_RESET]
+    assert put_back[:2].sum() > 0
+    assert put_back[2:].sum() > 0
+    assert np.sum(trainer_loop["successes"]) > 0
+    early = settings(tmp_path / "early", 32, algorithm={"policy_lr": 0.3, "lr_schedule": "kl_step"})
+    train(Processes(), early)
+    epochs = [line["ppo"]["policy_epochs"] for line in metrics(tmp_path / "early") if line["kind"] == "update"]
+    assert min(epochs[2:]) < 4
+
+
+def test_budget_stops_all_processes_at_the_same_step(tmp_path):
+    loop, _ = train(Processes(), settings(tmp_path / "one", 32, budget=3))
+    answers = together(train, settings(tmp_path / "two", 16, budget=3))
+    assert [answer[0] for answer in answers] == [loop, loop]
+    spent = metrics(tmp_path / "two")[-1]
+    assert spent["interventions"] >= 3
+    assert spent["interaction_steps"] < 4 * STEPS_PER_UPDATE
+
+
+def test_resumed_run_of_two_processes_equals_the_unbroken_one(tmp_path):
+    """With actions and minibatches of chance, which differ between the processes."""
+    unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
+    answers = together(train, settings(unbroken, 4), DummyPolicy)
+    assert together(train, settings(broken, 4), DummyPolicy, 21) == [None, None]
+    checkpoint = (broken / "checkpoints/last").resolve()
+    assert checkpoint.name == f"{2 * STEPS_PER_UPDATE:06d}"
+    assert together(train, settings(broken, 4, resume=checkpoint), DummyPolicy) == answers
+    assert_same_run(unbroken, broken)
+    starts = json.loads((broken / "manifest.json").read_text())["starts"]
+    assert [start["num_processes"] for start in starts] == [2, 2]
+
+
+def test_a_run_of_two_processes_goes_on_in_one(tmp_path, caplog):
+    together(train, settings(tmp_path / "run", 16, steps=2 * STEPS_PER_UPDATE))
+    resumed = settings(tmp_path / "run", 32, resume=(tmp_path / "run/checkpoints/last").resolve())
+    loop, policy = train(Processes(), resumed)
+    assert "of 2 processes, this run has 1" in caplog.text
+    expected, weights = train(Processes(), settings(tmp_path / "one", 32))
+    assert loop == expected
+    assert policy == pytest.approx(weights, rel=1e-3, abs=1e-5)
+
+
+def test_every_process_draws_its_own_actions(tmp_path):
+    def first_actions(processes, cfg):
+        mine = processes.share_of(cfg.num_envs)
+        trainer = Trainer(cfg, DummyEnv(mine.stop - mine.start), DummyEnv, DummyPolicy(), *identity_processors(),
+                          processes)  # fmt: skip
+        tau = [TASKS[0].instruction] * cfg.num_envs
+        return trainer.agent.act(trainer.env.observe(), tau).tokens.tolist()
+
+    tokens = together(first_actions, settings(tmp_path / "run", 16))
+    assert np.shape(tokens) == (2, 2, 7)
+    assert tokens[0] != tokens[1]
+
+
+def rollout(first, last):
+    """Columns `first` to `last` of a rollout of 8 rows and 6 streams whose returns are its rewards."""
+    rng = np.random.default_rng(3)
+    buffer, mine = RolloutBuffer(8, last - first), slice(first, last)
+    for _ in range(8):
+        columns = {"observation.state": rng.normal(size=(6, 2)).astype(np.float32)[mine]}
+        instructions = [TASKS[i].instruction for i in rng.integers(4, size=6)][mine]
+        tokens, reward = rng.integers(3, size=(6, 7)), rng.normal(size=6).astype(np.float32)
+        log_prob, value = -7.7 + 0.1 * rng.normal(size=(2, 6)).astype(np.float32)
+        sample = ActionSample(np.zeros((last - first, 7), np.float32), tokens[mine], log_prob[mine], value[mine])
+        buffer.add(
+            columns, instructions, sample, reward[mine], np.full(last - first, True), np.zeros(last - first)
+        )
+    return buffer
+
+
+def gradients(processes, options):
+    """Those of the last optimizer step of an update, and the update's metrics."""
+    ppo = PPO(
+        DummyPolicy(), PolicyProcessors(*identity_processors()),
+        PPOConfig(epochs=1, value_epochs=0, value_warmup_updates=0, lr_schedule="fixed", target_kl=None,
+                  max_grad_norm=1e9, **options),
+        np.random.default_rng(processes.rank), processes,
+    )  # fmt: skip
+    mine = processes.share_of(6)
+    result = ppo.update(rollout(mine.start, mine.stop))
+    return torch.cat([parameter.grad.flatten() for parameter in ppo.policy.parameters()]).tolist(), result
+
+
+@pytest.mark.parametrize("options", [{"minibatch_size": 24}, {"minibatch_size": 7, "grad_accumulation": 4}])
+def test_gradients_are_those_of_one_process_on_all_transitions(options):
+    """In the second case, the last of a process's four minibatches has three transitions."""
+    expected, expected_metrics = gradients(Processes(), {"minibatch_size": 48})
+    for gradient, result in together(gradients, options):
+        assert gradient == pytest.approx(expected, abs=1e-6, rel=1e-5)
+        names = ["grad_norm", "policy_loss", "value_loss", "approx_kl", "advantage_std", "explained_variance"]
+        names += ["reward_mean", "ratio_max"] if len(options) == 1 else ["reward_mean"]
+        assert {k: result[k] for k in names} == pytest.approx({k: expected_metrics[k] for k in names}, rel=1e-4)
+
+
+def test_mean_of_gradients_by_hand(monkeypatch):
+    """In buckets of two numbers; the last parameter is used by the second process only, the one before by none."""
+    monkeypatch.setattr(processes_module, "BUCKET_BYTES", 8)
+
+    def average(processes):
+        rank = processes.rank
+        parameters = [torch.zeros(2), torch.zeros(1), torch.zeros(3).bfloat16(), torch.zeros(1), torch.zeros(1)]
+        grads = [
+            torch.tensor([1.0, 2.0]) + rank, torch.full((1,), 4.0 * rank), torch.full((3,), 1.0 - rank).bfloat16(),
+            None, torch.tensor([6.0]) if rank else None,
+        ]  # fmt: skip
+        for parameter, grad in zip(parameters, grads, strict=True):
+            parameter.grad = grad
+        processes.average_gradients(parameters)
+        return [None if p.grad is None else p.grad.tolist() for p in parameters]
+
+    assert together(average) == [[[1.5, 2.5], [2.0], [0.5, 0.5, 0.5], None, [3.0]]] * 2
+
+
+def test_processes_that_drift_apart_are_stopped():
+    def drift(processes):
+        processes.check_alike({"the policy": 1, "the loop's state": {"t": 8}})
+        try:
+            processes.check_alike({"the policy": processes.rank, "the loop's state": {"t": 8}})
+        except RuntimeError as error:
+            return str(error)
+
+    messages = together(drift)
+    assert all("no longer agree on: the policy." in message for message in messages)
+
+
+def test_exchange_keeps_types_and_order():
+    def exchange(processes):
+        mine = np.arange(4).reshape(2, 2) + 10 * processes.rank
+        return (
+            processes.concatenate(mine).tolist(),
+            processes.concatenate(mine > 10, axis=1).tolist(),
+            processes.broadcast({"rank": processes.rank}, source=1),
+        )
+
+    rows, flags = [[0, 1], [2, 3], [10, 11], [12, 13]], [[False, False, False, True], [False, False, True, True]]
+    assert together(exchange) == [(rows, flags, {"rank": 1})] * 2
+
+
+def test_bits_tell_weights_apart():
+    weights = [torch.tensor([1.0, 2.0]), torch.ones(2, 2).T.bfloat16()]
+    nudged = [weights[0].clone(), weights[1]]
+    nudged[0][0] += torch.finfo(torch.float32).eps
+    assert bit_sum(weights) == bit_sum([weight.clone() for weight in weights])
+    assert bit_sum(nudged) == bit_sum(weights) + 1
+
+
+def test_streams_that_cannot_be_shared_out_are_refused():
+    processes = Processes()
+    processes.count = 3
+    with pytest.raises(ValueError, match="64 cannot be shared out evenly over 3 processes; take a multiple of 3"):
+        processes.share_of(64)
+
+
+def test_accelerate_launch(tmp_path, monkeypatch):
+    """The command of docs/distributed.md on two CPU processes; what it leaves goes on in one."""
+    folder = tmp_path / "run"
+    flags = [*SMALL, *OBSERVATIONS["state"], "--num_envs=4", "--steps=64", f"--output_dir={folder}"]
+    scripts = Path(sys.executable).parent
+    launch = [
+        str(scripts / "accelerate"), "launch", "--multi_gpu", "--num_processes=2", "--num_machines=1",
+        "--main_process_port=0", "--mixed_precision=no", "--dynamo_backend=no",
+    ]  # fmt: skip
+    result = subprocess.run([*launch, str(scripts / "cronos-train"), *flags], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr[-3000:]
+    assert re.findall(r"^(\d+)/64 steps", result.stdout, re.MULTILINE) == ["32", "64"]
+    updates = metrics(folder)
+    assert [line["interaction_steps"] for line in updates] == [32, 64]
+    # Sixteen steps of four streams, T = 8.
+    assert updates[-1]["interventions_by_kind"]["scene_reset"] == 8
+    assert updates[-1]["interventions_by_kind"]["end_effector_reset"] == 16
+    (start,) = json.loads((folder / "manifest.json").read_text())["starts"]
+    assert start["num_processes"] == 2
+    before = weights(folder)
+    last = folder / "checkpoints/last/pretrained_model/train_config.json"
+    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}", "--steps=96")
+    assert [line["interaction_steps"] for line in metrics(folder)] == [32, 64, 96]
+    assert any(not torch.equal(tensor, before[name]) for name, tensor in weights(folder).items())
