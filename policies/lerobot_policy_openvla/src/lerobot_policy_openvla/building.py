@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,6 +11,7 @@ from lerobot_policy_openvla.architecture import Architecture
 from lerobot_policy_openvla.checkpoint import load_network, read_checkpoint
 from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
 from lerobot_policy_openvla.network import OpenVLANetwork
+from lerobot_policy_openvla.prompt import PromptTokenizer
 from lerobot_policy_openvla.quantization import quantize
 
 
@@ -22,8 +22,8 @@ def resolve_dtype(config: OpenVLAConfig) -> torch.dtype:
     return getattr(torch, config.dtype)
 
 
-def build_network(config: OpenVLAConfig) -> tuple[OpenVLANetwork, Path]:
-    """Return the network as `config` asks for it, and the folder with its tokenizer.
+def build(config: OpenVLAConfig) -> tuple[OpenVLANetwork, PromptTokenizer]:
+    """Return the network and the tokenizer as `config` asks for them.
 
     Raises:
         ValueError: the config names no checkpoint.
@@ -35,15 +35,20 @@ def build_network(config: OpenVLAConfig) -> tuple[OpenVLANetwork, Path]:
     # What is to be quantised waits in ordinary memory: a GPU that needs it may not hold it as it is.
     staging = device if config.quantization == "none" else "cpu"
     network = load_network(checkpoint, config.attention, resolve_dtype(config), staging)
+    finish_network(network, config)
+    return network, PromptTokenizer(checkpoint.folder, network.bos_token_id)
+
+
+def finish_network(network: OpenVLANetwork, config: OpenVLAConfig) -> None:
+    """Do to a network what `config` asks for: merge, quantise, adapt, checkpoint gradients."""
     if config.adapter and config.merge_adapter:
         load_adapter(network, config.adapter, merge=True)
     if config.quantization != "none":
-        quantize(network, config.quantization, device)
+        quantize(network, config.quantization, config.device or "cpu")
         network.requires_grad_(False)
     _add_adapters(network, config)
     if config.gradient_checkpointing:
         network.enable_gradient_checkpointing()
-    return network, checkpoint.folder
 
 
 def _add_adapters(network: OpenVLANetwork, config: OpenVLAConfig) -> None:

@@ -30,7 +30,8 @@ def resize(images: Tensor, size: int) -> Tensor:
     """
     for shape in ((images.shape[-2], size), (size, size)):
         images = interpolate(images.float(), size=shape, mode="bicubic", antialias=True)
-        images = images.round().clamp(0, 255)
+        # Halves up: with whole sizes on both sides they are frequent.
+        images = (images + 0.5).floor().clamp(0, 255)
     return images
 
 

@@ -16,12 +16,11 @@ from torch.nn.functional import cross_entropy
 
 from lerobot_policy_openvla.action_tokens import ActionTokenizer
 from lerobot_policy_openvla.adapters import has_adapter, is_adapter_tensor, linear_names, save_adapter
-from lerobot_policy_openvla.building import architecture_of, build_network, resolve_dtype
+from lerobot_policy_openvla.building import architecture_of, build, resolve_dtype
 from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
 from lerobot_policy_openvla.distribution import TokenDistribution
 from lerobot_policy_openvla.images import prepare_images
 from lerobot_policy_openvla.loading import config_for, load_saved_tensors
-from lerobot_policy_openvla.prompt import PromptTokenizer
 from lerobot_policy_openvla.sequence import Prompts, generate_actions, prompt_hidden, score_actions
 from lerobot_policy_openvla.value_head import ValueHead
 
@@ -47,16 +46,21 @@ class OpenVLAPolicy(PreTrainedPolicy):
     name = "openvla"  # ty: ignore[invalid-assignment]
 
     def __init__(self, config: OpenVLAConfig, **kwargs: Any) -> None:
-        """Load the checkpoint; of LeRobot's further arguments only `dataset_stats` matters."""
+        """Load the checkpoint.
+
+        Args:
+            config: its `architecture` and `action_statistics` are filled in.
+            **kwargs: `dataset_stats` of LeRobot, for `unnorm_key=dataset`; `parts`, a network and a prompt
+                tokenizer to use in place of the checkpoint's; LeRobot's others do not matter.
+        """
         super().__init__(config)
         config.resolve(kwargs.get("dataset_stats"))
         config.validate_features()
         self.config: OpenVLAConfig = config
         self.architecture = architecture_of(config)
         self.dtype = resolve_dtype(config)
-        self.network, folder = build_network(config)
+        self.network, self.prompt_tokenizer = kwargs.get("parts") or build(config)
         self.value_head = ValueHead(self.network.text_width)
-        self.prompt_tokenizer = PromptTokenizer(folder, self.network.bos_token_id)
         self.action_tokenizer = ActionTokenizer(self.architecture.vocabulary_size, self.architecture.n_action_bins)
         # PEFT notes it as the model below an adapter that LeRobot puts around this policy.
         self.name_or_path = config.checkpoint

@@ -1,0 +1,166 @@
+"""`lerobot-train`, `cronos-train` and `lerobot-eval` with a tiny OpenVLA, as a user would call them."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot_env_cronos import CronosEnvConfig
+from lerobot_policy_openvla import OpenVLAPolicy
+from openvla_samples import CAMERA, TASKS, make_batch, make_config
+from peft import PeftModel
+from safetensors.torch import load_file
+
+from cronos_lerobot.rl.agent import PPOAgent
+from cronos_lerobot.rl.ppo import PPO
+from cronos_lerobot.rl.ppo_config import PaperPPOConfig
+from cronos_lerobot.rl.processing import make_processors
+from cronos_lerobot.rl.rollout_buffer import RolloutBuffer
+from cronos_lerobot.scripts import train as cronos_script
+
+SMALL_LOOP = (
+    "--env.type=cronos", "--env.observation_height=64", "--env.observation_width=64", "--num_envs=2",
+    "--protocol.task_switch_interval=2", "--protocol.update_interval=4", "--protocol.scene_reset_interval=4",
+    "--save_freq=8", "--eval_freq=0", "--tensorboard=false", "--policy.push_to_hub=false",
+    "--algorithm.minibatch_size=2", "--algorithm.grad_accumulation=2", "--algorithm.entropy_coef=0.1",
+)  # fmt: skip
+PRESET = Path(__file__).parents[3] / "policies/lerobot_policy_openvla/presets/cronos_paper.yaml"
+
+
+def cronos_train(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["cronos-train", *map(str, arguments)])
+    cronos_script.main()
+
+
+def updates_of(folder: Path) -> list[dict]:
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [line for line in lines if line["kind"] == "update"]
+
+
+@pytest.fixture(scope="module")
+def cloned(published, demonstrations, tmp_path_factory) -> Path:
+    """What `lerobot-train` with LeRobot's PEFT options leaves."""
+    output = tmp_path_factory.mktemp("openvla") / "clone"
+    command = [
+        *(sys.executable, "-m", "lerobot.scripts.lerobot_train", "--policy.type=openvla"),
+        *(f"--policy.checkpoint={published}", "--peft.r=4", "--peft.method_type=LORA", "--policy.device=cpu"),
+        *("--dataset.repo_id=local/openvla", f"--dataset.root={demonstrations}", f"--output_dir={output}"),
+        *("--policy.push_to_hub=false", "--num_workers=0", "--batch_size=4", "--steps=3", "--log_freq=1"),
+        *("--save_checkpoint=true", "--wandb.enable=false", "--env_eval_freq=0"),
+    ]
+    environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=180)
+    assert done.returncode == 0, done.stderr[-4000:]
+    assert "step:3" in done.stderr + done.stdout
+    return output / "checkpoints" / "last" / "pretrained_model"
+
+
+def test_what_lerobot_train_leaves(cloned, published):
+    """A PEFT adapter, which LeRobot's own factory and this policy load to the same."""
+    assert not (cloned / "model.safetensors").exists()
+    config = PreTrainedConfig.from_pretrained(cloned)
+    config.pretrained_path = cloned
+    assert config.use_peft
+    wrapped = make_policy(config, env_cfg=CronosEnvConfig(observation_height=48, observation_width=40))
+    assert isinstance(wrapped, PeftModel)
+    own = OpenVLAPolicy.from_pretrained(cloned)
+    assert isinstance(own, OpenVLAPolicy)
+    batch = make_batch(2)
+    tokens = own.sample_actions(batch)["tokens"]
+    with torch.no_grad():
+        expected = own.evaluate_actions(batch, tokens)["log_prob"]
+        torch.testing.assert_close(wrapped.eval().evaluate_actions(batch, tokens)["log_prob"], expected)
+        fresh = OpenVLAPolicy.from_pretrained(published, config=make_config(published))
+        assert (fresh.evaluate_actions(batch, tokens)["log_prob"] - expected).abs().max() > 1e-3
+    preprocessor, postprocessor = make_pre_post_processors(config, pretrained_path=str(cloned))
+    action = postprocessor(
+        own.select_action(preprocessor({CAMERA: torch.rand(2, 3, 48, 40), "task": list(TASKS)}))
+    )
+    assert action.shape == (2, 7)
+    assert (action[:, :6].abs() < 0.21).all()
+
+
+def test_clone_then_train_kill_resume(cloned, tmp_path, monkeypatch):
+    """PPO goes on with the cloned adapter; a resumed run ends with the same weights to the bit."""
+    start = (f"--policy.path={cloned}", "--policy.use_peft=false", "--algorithm.type=ppo_paper", *SMALL_LOOP)
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    cronos_train(monkeypatch, *start, "--steps=16", f"--output_dir={whole}")
+    cronos_train(monkeypatch, *start, "--steps=8", f"--output_dir={broken}")
+    last = broken / "checkpoints/last/pretrained_model"
+    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=16")
+    after = load_file(whole / "checkpoints/last/pretrained_model/model.safetensors")
+    assert all(".lora_" in name or name.startswith("value_head.") for name in after)
+    for name, tensor in load_file(last / "model.safetensors").items():
+        assert torch.equal(tensor, after[name]), name
+    before = load_file(broken / "checkpoints/000008/pretrained_model/model.safetensors")
+    changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
+    # No reward so early: the value head, which says 0, is right.
+    assert changed == {"network"}
+    policy = OpenVLAPolicy.from_pretrained(whole / "checkpoints/last/pretrained_model")
+    assert torch.equal(policy.state_dict()["value_head.layers.4.bias"], after["value_head.layers.4.bias"])
+
+
+def test_the_papers_preset(published, tmp_path, monkeypatch):
+    """The file's flags reach the run; a frozen vision tower's features are kept, and the ratio starts at 1."""
+    output = tmp_path / "run"
+    small = [flag for flag in SMALL_LOOP if not flag.startswith("--env.type")]
+    cronos_train(
+        monkeypatch, f"--config_path={PRESET}", f"--policy.checkpoint={published}", "--policy.device=cpu",
+        "--policy.lora_rank=4", "--policy.lora_modules=[language]", "--policy.dtype=float32",
+        "--algorithm.grad_accumulation=4", "--steps=8", f"--output_dir={output}", "--env.type=cronos",
+        "--algorithm.type=ppo_paper", "--policy.type=openvla",
+        *[flag for flag in small if "grad_accumulation" not in flag],
+    )  # fmt: skip
+    (line,) = updates_of(output)
+    update = line["ppo"]
+    # All four minibatches are of the one optimizer step, so the policy is still the one that acted.
+    assert update["ratio_max"] == pytest.approx(1.0, abs=1e-4)
+    assert update["approx_kl"] < 1e-6
+    assert update["clip_fraction"] == 0.0
+    config = json.loads((output / "checkpoints/last/pretrained_model/train_config.json").read_text())
+    paper = {
+        "policy_lr": 1e-4,
+        "value_lr": 3e-3,
+        "clip": 0.2,
+        "max_grad_norm": 10.0,
+        "gae_lambda": 0.95,
+        "epochs": 1,
+    }
+    assert {name: config["algorithm"][name] for name in paper} == paper
+    assert config["protocol"]["end_effector_reset"] is True
+    assert config["policy"]["unnorm_key"] == "bridge_orig"
+
+
+def test_ppo_makes_rewarded_tokens_likelier(published):
+    """The trainer's own agent and update, without an environment: actions with a high first dimension pay."""
+    torch.manual_seed(0)
+    config = PreTrainedConfig.get_choice_class("openvla")(
+        checkpoint=str(published), device="cpu", lora_rank=8, lora_modules=["language"], dtype="float32"
+    )
+    policy = make_policy(config, env_cfg=CronosEnvConfig(observation_height=64, observation_width=64)).eval()
+    processors = make_processors(policy, *make_pre_post_processors(config))
+    algorithm = PaperPPOConfig(minibatch_size=8, grad_accumulation=2, policy_lr=3e-3)
+    agent = PPOAgent(
+        PPO(policy, processors, algorithm, np.random.default_rng(0)),
+        RolloutBuffer(4, 8),
+        torch.Generator().manual_seed(0),
+    )
+    images = np.random.default_rng(0).integers(0, 256, (8, 64, 64, 3), dtype=np.uint8)
+    observation = {"pixels": {"front": images}, "agent_pos": np.zeros((8, 13), np.float32)}
+    instructions, everywhere, means = [TASKS[i % 2] for i in range(8)], np.ones(8, bool), []
+    for _ in range(8):
+        total = []
+        for _ in range(4):
+            sample = agent.act(observation, instructions)
+            reward = (sample.action[:, 0] * 20).astype(np.float32)
+            agent.store(observation, instructions, sample, reward, observation, everywhere, ~everywhere)
+            total.append(reward.mean())
+        agent.update()
+        means.append(float(np.mean(total)))
+    assert np.mean(means[-2:]) > np.mean(means[:2]) + 0.1
