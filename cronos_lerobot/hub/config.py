@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import ClassVar
 
@@ -25,6 +26,8 @@ class PublishConfig:
     """Write what would be pushed to --output_dir, and push nothing."""
     output_dir: Path | None = None
     """Folder for the dry run; must be empty or not there."""
+    discover_packages_path: str | None = None
+    """Module to import first, one that registers a scene from outside the package."""
 
     repo_type: ClassVar[str] = "dataset"
 
@@ -34,6 +37,7 @@ class PublishConfig:
         Raises:
             ValueError: a flag is missing or in vain.
             FileExistsError: the dry run's folder is in use.
+            ImportError: the module cannot be imported.
         """
         if not self.repo_id:
             raise ValueError("--repo_id=<owner>/<name> is required, also in a dry run: the card names it")
@@ -43,6 +47,8 @@ class PublishConfig:
             raise ValueError("--dry_run=true and --output_dir=<folder> go together")
         if self.output_dir is not None and self.output_dir.exists() and any(self.output_dir.iterdir()):
             raise FileExistsError(f"{self.output_dir} is not empty; choose another --output_dir")
+        if self.discover_packages_path:
+            import_module(self.discover_packages_path)
 
     @property
     def target(self) -> Target:

@@ -101,14 +101,16 @@ def main() -> None:
     if command not in COMMANDS:
         sys.exit(f"error: unknown command {command!r}; valid commands: {list(COMMANDS)}")
     config_class, publish = COMMANDS[command]
-    register_third_party_plugins()
+    if command in ("benchmark", "results"):
+        # They may bring scenes with them.
+        register_third_party_plugins()
     try:
         config = draccus.parse(config_class, args=arguments)
         config.validate()
         publish(config)
     except ParsingError as error:
         sys.exit(f"error: {error.__cause__ or error}")
-    except (ValueError, OSError, PublishError) as error:
+    except (ValueError, OSError, ImportError, PublishError) as error:
         sys.exit(f"error: {error}")
 
 

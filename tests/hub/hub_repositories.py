@@ -52,6 +52,8 @@ class Repository:
         self.commits: dict[str, Commit] = {}
         self.branches: dict[str, str] = {}
         self.tags: dict[str, str] = {}
+        self.lfs: dict[str, bytes] = {}
+        """Uploads by sha256, committed or not."""
         self.commit("main", "initial commit", {".gitattributes": File(b"*.parquet filter=lfs\n", False)}, [])
 
     def find(self, revision: str) -> Commit | None:
@@ -102,9 +104,6 @@ class Hub:
 
     url: str = ""
     repositories: dict[tuple[str, str], Repository] = field(default_factory=dict)
-    lfs: dict[str, bytes] = field(default_factory=dict)
-    lfs_names: dict[str, str] = field(default_factory=dict)
-    """Path by sha256, as announced before the upload."""
     faults: Faults = field(default_factory=Faults)
     requests: list[str] = field(default_factory=list)
     """Method and path of every request, for tests that ask what was transferred."""

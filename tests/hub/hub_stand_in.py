@@ -52,8 +52,8 @@ ROUTES: list[tuple[str, str, str]] = [
     ("GET", rf"/api/{REPO}/tree/(?P<revision>[^/]+)(?:/(?P<path>.*))?", "list_tree"),
     ("POST", rf"/api/{REPO}/paths-info/(?P<revision>[^/]+)", "paths_info"),
     ("POST", r"/(?P<prefix>datasets/)?(?P<name>[^/]+/[^/]+)\.git/info/lfs/objects/batch", "lfs_batch"),
-    ("PUT", r"/lfs/(?P<oid>[0-9a-f]{64})", "lfs_put"),
-    ("POST", r"/lfs/verify", "lfs_verify"),
+    ("PUT", rf"/lfs/{REPO}/(?P<oid>[0-9a-f]{{64}})", "lfs_put"),
+    ("POST", rf"/lfs/{REPO}/verify", "lfs_verify"),
     ("GET", r"/(?P<prefix>datasets/)?(?P<name>[^/]+/[^/]+)/resolve/(?P<revision>[^/]+)/(?P<path>.+)", "resolve"),
 ]
 
@@ -245,18 +245,20 @@ class Handler(BaseHTTPRequestHandler):
         return self._json({"files": answers})
 
     def _lfs_batch(self, kind: str, name: str) -> Reply:
-        self._repository(kind, name, write=True)
+        stored = self._repository(kind, name, write=True).lfs
+        base = f"{self.hub.url}/lfs/{kind}/{name}"
         objects = []
         for item in json.loads(self._read())["objects"]:
             answer = {"oid": item["oid"], "size": item["size"]}
-            if item["oid"] not in self.hub.lfs:
-                upload = {"href": f"{self.hub.url}/lfs/{item['oid']}", "header": {}}
-                verify = {"href": f"{self.hub.url}/lfs/verify", "header": {}}
+            if item["oid"] not in stored:
+                upload = {"href": f"{base}/{item['oid']}", "header": {}}
+                verify = {"href": f"{base}/verify", "header": {}}
                 answer["actions"] = {"upload": upload, "verify": verify}
             objects.append(answer)
         return self._json({"transfer": "basic", "objects": objects})
 
-    def _lfs_put(self, oid: str) -> Reply:
+    def _lfs_put(self, kind: str, name: str, oid: str) -> Reply:
+        stored = self.hub.repositories[kind, name].lfs
         suffix = self.hub.faults.drop_uploads_of
         length = int(self.headers.get("Content-Length", 0))
         if suffix is not None:
@@ -266,14 +268,14 @@ class Handler(BaseHTTPRequestHandler):
                 self.rfile.read(length // 2)
                 raise DroppedError
             self._unread = False
-            self.hub.lfs[oid] = start + self.rfile.read(length - len(start))
+            stored[oid] = start + self.rfile.read(length - len(start))
         else:
-            self.hub.lfs[oid] = self._read()
+            stored[oid] = self._read()
         return self._json({})
 
-    def _lfs_verify(self) -> Reply:
+    def _lfs_verify(self, kind: str, name: str) -> Reply:
         item = json.loads(self._read())
-        if len(self.hub.lfs.get(item["oid"], b"")) != item["size"]:
+        if len(self.hub.repositories[kind, name].lfs.get(item["oid"], b"")) != item["size"]:
             raise HubError(400, "", f"LFS object {item['oid']} is not there")
         return self._json({})
 
@@ -294,9 +296,9 @@ class Handler(BaseHTTPRequestHandler):
             elif item["key"] == "file":
                 added[value["path"]] = File(base64.b64decode(value["content"]), is_lfs=False)
             elif item["key"] == "lfsFile":
-                if value["oid"] not in self.hub.lfs:
+                if value["oid"] not in repository.lfs:
                     raise HubError(400, "", f"LFS object of {value['path']} was not uploaded")
-                added[value["path"]] = File(self.hub.lfs[value["oid"]], is_lfs=True)
+                added[value["path"]] = File(repository.lfs[value["oid"]], is_lfs=True)
             else:
                 deleted.append(value["path"])
         with self.hub.lock:

@@ -1,0 +1,243 @@
+"""Everything that is published, pushed to a Hub over HTTP by the public commands, and loaded back elsewhere."""
+
+import json
+import re
+
+import pytest
+import yaml
+
+BENCHMARK = ("benchmark", "--repo_id=me/bench", "--scene=playroom_2x2", "--seed=5", "--num_configurations=2",
+             "--num_orderings=2", "--chain_length=2")  # fmt: skip
+TRAINING = (
+    "--policy.type=pocketvla", "--policy.device=cpu", "--policy.hidden_width=16", "--policy.hidden_depth=1",
+    "--policy.push_to_hub=false", "--env.type=cronos", "--num_envs=2", "--protocol.task_switch_interval=4",
+    "--protocol.update_interval=8", "--protocol.scene_reset_interval=8", "--steps=32", "--save_freq=16",
+    "--eval_freq=0", "--tensorboard=false", "--algorithm.minibatch_size=8", "--algorithm.value_warmup_updates=0",
+    "--record.repo_id=me/stream", "--record.streams=1", "--env.observation_height=32",
+    "--env.observation_width=32", "--protocol.num_configurations=2", "--protocol.end_effector_reset=true",
+)  # fmt: skip
+
+
+def tree(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def bench(served, commands, tmp_path_factory):
+    """A benchmark on the Hub, and its dry run."""
+    folder = tmp_path_factory.mktemp("dry") / "bench"
+    commands.run("cronos-publish", *BENCHMARK, "--dry_run=true", f"--output_dir={folder}")
+    assert ("datasets", "me/bench") not in served.repositories, "a dry run pushes nothing"
+    output = commands.run("cronos-publish", *BENCHMARK)
+    assert f"{served.url}/datasets/me/bench" in output
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(bench, commands, tmp_path_factory):
+    """A training run on the Hub's benchmark, too short to learn, with a recorded stream."""
+    folder = tmp_path_factory.mktemp("train") / "run"
+    commands.run("cronos-train", *TRAINING, "--env.benchmark=me/bench", f"--output_dir={folder}")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def policy(run, commands):
+    """The policy on the Hub."""
+    commands.run("cronos-publish", "policy", f"--path={run}", "--repo_id=me/policy")
+    return "me/policy"
+
+
+def test_a_benchmark_is_what_the_dry_run_showed_and_loads_with_datasets(hub, bench, commands):
+    assert hub.tree("datasets", "me/bench") == tree(bench)
+    commands.forget()
+    code = """
+from datasets import load_dataset
+chains = load_dataset("me/bench", "sequential", split="held_out")
+print([(row["ordering"], row["configuration"], len(row["instructions"])) for row in chains])
+rows = load_dataset("me/bench", "configurations", split="train")
+print(rows[1]["picture"].size, rows[1]["toy_bear_x_m"])
+print(load_dataset("me/bench", "independent", split="train").num_rows, load_dataset("me/bench").keys())
+"""
+    output = commands.run("python", code)
+    assert "[(0, 0, 2), (0, 1, 2), (1, 0, 2), (1, 1, 2)]" in output
+    assert re.search(r"\(320, 240\) 0\.[23]\d+", output)
+    assert "8 dict_keys(['train', 'held_out'])" in output
+    card = (bench / "eval.yaml").read_text()
+    tasks = yaml.safe_load(card)["tasks"]
+    assert {"id": "sequential_held_out", "config": "sequential", "split": "held_out"} in tasks
+
+
+def test_the_packages_sequential_suite_has_640_chains(hub, commands):
+    commands.run("cronos-publish", "benchmark", "--repo_id=me/kitchen", "--pictures=false", "--branch=dev")
+    where = '"me/kitchen", "sequential", split="held_out", revision="dev"'
+    assert "640" in commands.run("python", f"import datasets; print(len(datasets.load_dataset({where})))").split()
+    assert set(hub.tree("datasets", "me/kitchen")) == set(), "the main branch stays as it was"
+
+
+def test_lerobot_eval_runs_the_benchmark_from_the_hub(bench, policy, commands, tmp_path):
+    commands.forget()
+    commands.run(
+        "lerobot-eval", f"--policy.path={policy}", "--policy.device=cpu", "--env.type=cronos",
+        "--env.benchmark=me/bench@main", "--env.suite=sequential", "--env.split=held_out",
+        "--env.observation_height=32", "--env.observation_width=32", "--eval.n_episodes=2", "--eval.batch_size=2",
+        f"--output_dir={tmp_path / 'eval'}",
+    )  # fmt: skip
+    info = json.loads((tmp_path / "eval/eval_info.json").read_text())
+    assert [(task["task_group"], task["task_id"]) for task in info["per_task"]] == [
+        ("sequential_held_out", 0), ("sequential_held_out", 1)
+    ]  # fmt: skip
+
+
+def test_a_stream_is_loaded_back_whole(hub, run, commands, tmp_path):
+    publish = ("cronos-publish", "stream", f"--root={run / 'streams'}", "--repo_id=me/stream", "--private=true")
+    commands.run(*publish, "--dry_run=true", f"--output_dir={tmp_path / 'dry'}")
+    commands.run(*publish)
+    assert hub.tree("datasets", "me/stream") == tree(tmp_path / "dry")
+    repository = hub.repositories["datasets", "me/stream"]
+    assert repository.private
+    assert repository.tags["v3.0"] == repository.branches["main"]
+    commands.forget()
+    code = """
+from cronos_lerobot.data.streams import StreamDataset
+streams = StreamDataset("me/stream")
+streams.check()
+print([(s.step, s.length, s.intervention.name) for s in streams.segments_of(0)])
+print(streams.dataset[15]["observation.images.front"].shape)
+"""
+    output = commands.run("python", code)
+    assert "(0, 4, 'INITIAL'), (4, 4, 'END_EFFECTOR_RESET'), (8, 4, 'SCENE_RESET'), (12, 4," in output
+    assert "torch.Size([3, 32, 32])" in output
+    card = repository.find("main").files["README.md"].content.decode()
+    assert "1 of 2 parallel streams" in card
+    assert "4 segments, 16 frames at 5 Hz" in card
+
+
+def test_a_policy_is_loaded_back_with_its_card(hub, run, policy, commands, tmp_path):
+    commands.run("cronos-publish", "policy", f"--path={run}", "--repo_id=me/policy", "--dry_run=true",
+                 f"--output_dir={tmp_path / 'dry'}")  # fmt: skip
+    assert hub.tree("models", policy) == tree(tmp_path / "dry")
+    model = run / "checkpoints/last/pretrained_model"
+    assert tree(model).items() <= tree(tmp_path / "dry").items()
+    card = (tmp_path / "dry/README.md").read_text()
+    front = yaml.safe_load(card.split("---")[1])
+    assert front["datasets"] == ["me/stream"]
+    assert "base_model" not in front
+    # 32 steps are 16 of each of the 2 streams; the scene of each is reset after 8 and after 16.
+    assert "Interventions that count: **4**." in card
+    assert "| scene reset | 4 | yes |" in card
+    assert "| a stream switches its task every | 4 steps |" in card
+    first = commands.run("cronos-publish", "policy", f"--path={run / 'checkpoints/000016'}", "--repo_id=me/first",
+                         "--dry_run=true", f"--output_dir={tmp_path / 'first'}")  # fmt: skip
+    assert "after 16 interaction steps" in first
+    assert "Interventions that count: **2**." in (tmp_path / "first/README.md").read_text()
+
+
+@pytest.fixture(scope="module")
+def evaluation(policy, commands, tmp_path_factory):
+    """Results of the Hub's policy on the Hub's benchmark."""
+    folder = tmp_path_factory.mktemp("evaluation") / "eval"
+    commands.run("cronos-eval", f"--policy.path={policy}", "--env.benchmark=me/bench", "--eval.videos=0",
+                 "--eval.suites=independent", f"--output_dir={folder}")  # fmt: skip
+    return folder
+
+
+def test_results_join_those_of_others(hub, policy, evaluation, commands, tmp_path):
+    other = {
+        "dataset": {"id": "other/bench", "task_id": "t"},
+        "value": 3,
+        "source": {"url": "https://x", "user": "y"},
+    }
+    old = {"dataset": {"id": "me/bench", "task_id": "independent_train"}, "value": -1}
+    publish = ("cronos-publish", "results", f"--results={evaluation}", f"--repo_id={policy}")
+    commands.run("python", f"""
+from huggingface_hub import HfApi
+HfApi().upload_file(path_or_fileobj={yaml.safe_dump([old, other]).encode()!r}, repo_id="me/policy",
+    path_in_repo=".eval_results/cronos.yaml")
+""")  # fmt: skip
+    before = hub.tree("models", policy)
+    commands.run(*publish, "--dry_run=true", f"--output_dir={tmp_path / 'dry'}")
+    commands.run(*publish)
+    after = hub.tree("models", policy)
+    assert after == before | tree(tmp_path / "dry")
+    entries = yaml.safe_load(after[".eval_results/cronos.yaml"])
+    assert [entry["dataset"]["task_id"] for entry in entries] == ["independent_train", "t", "independent_held_out"]
+    assert entries[1] == other
+    results = json.loads((evaluation / "results.json").read_text())["independent"]
+    for i, split in ((0, "train"), (2, "held_out")):
+        assert entries[i]["value"] == pytest.approx(100 * results[split]["success"])
+        assert entries[i]["dataset"]["revision"] == hub.repositories["datasets", "me/bench"].branches["main"]
+        assert "n=8" in entries[i]["notes"]
+
+
+def test_results_of_another_benchmark_are_refused(policy, evaluation, commands, tmp_path):
+    commands.run("cronos-publish", *BENCHMARK, "--repo_id=me/other", "--seed=6", "--pictures=false")
+    publish = ("cronos-publish", "results", f"--results={evaluation}", f"--repo_id={policy}")
+    refused = commands.try_(*publish, "--benchmark=me/other")
+    assert refused.code == 1
+    assert re.search(
+        r"results are not of me/other: fingerprint \w+ was evaluated, me/other has \w+", refused.output
+    )
+    refused = commands.try_(*publish, "--benchmark=me/kitchen@dev")
+    assert "is of kitchen_2x2, not of playroom_2x2" in refused.output
+
+
+# Faults --------------------------------------------------------------------------------------------------
+
+
+def test_a_refused_token(hub, commands):
+    hub.faults.refuse_tokens = True
+    refused = commands.try_("cronos-publish", *BENCHMARK, "--pictures=false")
+    assert refused.code == 1
+    assert refused.output.startswith(f"error: {hub.url} refused the token, or there is none: set HF_TOKEN to one")
+    hub.faults.refuse_tokens, hub.faults.read_only_tokens = False, True
+    refused = commands.try_("cronos-publish", *BENCHMARK, "--pictures=false", "--repo_id=me/bench")
+    assert f"the token may not write to dataset me/bench on {hub.url}" in refused.output
+
+
+def test_missing_repositories_and_revisions(hub, bench, evaluation, commands):
+    results = ("cronos-publish", "results", f"--results={evaluation}")
+    assert f"there is no model me/nobody on {hub.url}" in commands.try_(*results, "--repo_id=me/nobody").output
+    output = commands.try_(*results, "--repo_id=me/policy", "--benchmark=me/bench@v9").output
+    assert "benchmark me/bench has no revision 'v9'" in output
+    output = commands.try_("cronos-publish", *BENCHMARK, "--pictures=false", "--branch=x", "--revision=v9").output
+    assert f"dataset me/bench has no revision 'v9' on {hub.url}" in output
+    output = commands.try_("cronos-eval", "--expert=true", "--env.benchmark=me/nobody").output
+    assert "no benchmark 'me/nobody': no such dataset on the Hub" in output
+
+
+def test_a_connection_lost_in_the_middle_of_an_upload(hub, run, commands):
+    publish = ("cronos-publish", "stream", f"--root={run / 'streams'}", "--repo_id=me/broken")
+    hub.faults.drop_uploads_of = ".mp4"
+    lost = commands.try_(*publish, impatient=True)
+    assert lost.code == 1
+    assert f"error: lost the connection to {hub.url} (" in lost.output
+    assert "run the same command again, it goes on with what is missing" in lost.output
+    assert "Traceback" not in lost.output
+    assert hub.tree("datasets", "me/broken") == {}, "there is no half of a dataset"
+    uploaded = set(hub.repositories["datasets", "me/broken"].lfs)
+    assert uploaded
+    hub.faults.drop_uploads_of = None
+    hub.requests.clear()
+    commands.run(*publish)
+    assert hub.tree("datasets", "me/broken") == hub.tree("datasets", "me/stream") | {
+        "README.md": hub.tree("datasets", "me/broken")["README.md"]
+    }
+    again = {request.rsplit("/", 1)[-1] for request in hub.requests if request.startswith("PUT")}
+    assert again, "the videos were missing"
+    assert not again & uploaded, "what had arrived was not sent again"
+
+
+def test_a_connection_lost_at_the_commit(hub, bench, commands):
+    hub.faults.drop_commits = 1
+    lost = commands.try_("cronos-publish", *BENCHMARK, "--repo_id=me/late")
+    assert (lost.code, "run the same command again" in lost.output) == (1, True)
+    commands.run("cronos-publish", *BENCHMARK, "--repo_id=me/late")
+    names = set(tree(bench))
+    assert set(hub.tree("datasets", "me/late")) == names
+    # Pushing the same again changes nothing; a smaller one leaves nothing of the larger one behind.
+    oid = hub.repositories["datasets", "me/late"].branches["main"]
+    commands.run("cronos-publish", *BENCHMARK, "--repo_id=me/late")
+    assert hub.tree("datasets", "me/late", oid) == hub.tree("datasets", "me/late")
+    commands.run("cronos-publish", *BENCHMARK, "--repo_id=me/late", "--pictures=false")
+    assert set(hub.tree("datasets", "me/late")) == {name for name in names if not name.startswith("pictures/")}
