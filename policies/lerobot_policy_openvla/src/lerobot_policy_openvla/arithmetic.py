@@ -1,6 +1,6 @@
 """Floating-point operations and bytes of an OpenVLA's acting and learning, by formula.
 
-A product of (n x a) with (a x b) counts 2 n a b operations. Attention is counted whole, as if it were not causal.
+A product of (n x a) with (a x b) counts 2 n a b operations. Attention is counted whole, as if it were not causal, and over all places of the cache.
 Norms, activations and softmaxes are left out: they are less than 1 %.
 """
 
@@ -17,8 +17,6 @@ from lerobot_policy_openvla.network import OpenVLANetwork, depth_of
 
 ADAM_BYTES = 4 * 7
 """Read and written for one adapter weight by AdamW: gradient, two moments, weight; float32."""
-KV_COPIES = 3
-"""A decoding step reads the keys and values, and appending to them copies them: reads and writes."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +31,8 @@ class Work:
     """Operations of Llama on the action tokens after the first, one at a time."""
     forward: float
     """Operations of projector and Llama on the whole sequence at once, as the update has it."""
+    layers: float
+    """Part of `forward` that is Llama's layers, which gradient checkpointing computes again."""
     vision_lora: float
     """Part of `vision` that is the adapters'."""
     lora: float
@@ -58,11 +58,10 @@ class Work:
             vision_kept: the towers' features come from the rollout.
             recompute: gradient checkpointing.
         """
-        trained, extra = self.forward, self.lora + self.attention
+        operations = 2 * self.forward + self.lora + self.attention + (self.layers if recompute else 0)
         if vision_trained:
-            trained, extra = trained + self.vision, extra + self.vision_lora + self.vision_attention
-        forward = self.forward + (0 if vision_kept else self.vision)
-        return forward + trained + extra + (trained if recompute else 0)
+            operations += self.vision * (2 if recompute else 1) + self.vision_lora + self.vision_attention
+        return operations + (0 if vision_kept else self.vision)
 
 
 def _linear(modules: Iterable[nn.Module], prefix: str = "") -> tuple[float, float]:
@@ -96,9 +95,10 @@ def work_of(network: OpenVLANetwork, prompt_tokens: int, action_tokens: int) -> 
     prompt, whole = prompt_tokens + patches, prompt_tokens + patches + action_tokens - 1
     return Work(
         vision=vision,
-        prompt=projector + prompt * layer + prompt**2 * attended + out,
-        decode=sum(layer + out + (prompt + i) * attended for i in range(1, action_tokens)),
+        prompt=projector + prompt * layer + prompt * whole * attended + out,
+        decode=(action_tokens - 1) * (layer + out + whole * attended),
         forward=projector + whole * layer + whole**2 * attended + action_tokens * out,
+        layers=whole * layer + whole**2 * attended,
         vision_lora=vision_lora,
         lora=projector_lora + whole * layer_lora + action_tokens * out_lora,
         vision_attention=vision_attention,
@@ -118,7 +118,7 @@ def rollout_bytes(network: OpenVLANetwork, prompt_tokens: int, action_tokens: in
     heads = (config.num_key_value_heads or config.num_attention_heads) * (config.head_dim or 0)
     kv = 2 * config.num_hidden_layers * heads * size * (prompt_tokens + network.vision_backbone.num_patches)
     weights = parameter_bytes(network) + (action_tokens - 1) * parameter_bytes(network.language_model)
-    return weights / batch + (action_tokens - 1) * KV_COPIES * kv
+    return weights / batch + (action_tokens - 1) * kv
 
 
 def update_bytes(network: OpenVLANetwork, minibatch: int, accumulation: int, *, recompute: bool) -> float:

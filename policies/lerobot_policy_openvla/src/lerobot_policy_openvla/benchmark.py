@@ -1,8 +1,8 @@
 """Memory and speed of OpenVLA's acting and learning with random weights, and what an H100 could do at best.
 
-    python -m lerobot_policy_openvla.benchmark --size=7b                     # one GPU with 40 GB or more
-    python -m lerobot_policy_openvla.benchmark --size=7b --device=cpu --streams=2 --minibatch_size=1 --seconds=1
-    python -m lerobot_policy_openvla.benchmark --size=tiny
+    python -m lerobot_policy_openvla.benchmark --size=7b               # on one GPU with 40 GB or more
+    python -m lerobot_policy_openvla.benchmark --size=7b_half --streams=2 --minibatch_size=2 --seconds=0
+    python -m lerobot_policy_openvla.benchmark --size=7b --formulas    # only counts
 
 It prints the rates of the rollout and of the update, where their time goes, what each of four measures is worth
 (measured with and without it), the operations and bytes by formula, and the hours for 1.3 million steps: as
@@ -41,10 +41,11 @@ CAMERA = "observation.images.front"
 ACTION_TOKENS = 7
 SIZES: dict[str, dict[str, Any]] = {
     "7b": {},
+    "7b_half": {"num_hidden_layers": 16},
     "1b": {"hidden_size": 2048, "intermediate_size": 5504, "num_hidden_layers": 12, "num_attention_heads": 16},
     "tiny": {"hidden_size": 128, "intermediate_size": 256, "num_hidden_layers": 4, "num_attention_heads": 4},
 }
-"""Llama's sizes; the vision towers are the published ones but for `tiny`."""
+"""Llama's sizes; `7b_half` has half of its layers. The towers are the published ones but for `tiny`."""
 
 
 class FixedPrompt:
@@ -86,10 +87,9 @@ def random_network(architecture: Architecture, config: OpenVLAConfig) -> OpenVLA
     return network.to(device).eval()
 
 
-def random_policy(args: argparse.Namespace) -> OpenVLAPolicy:
-    """Return the policy that the command line asks for."""
-    architecture = architecture_of_size(args.size)
-    config = OpenVLAConfig(
+def policy_config(args: argparse.Namespace) -> OpenVLAConfig:
+    """Return the configuration that the command line asks for."""
+    return OpenVLAConfig(
         device=args.device,
         dtype=args.dtype,
         lora_rank=args.lora_rank,
@@ -98,18 +98,23 @@ def random_policy(args: argparse.Namespace) -> OpenVLAPolicy:
         gradient_checkpointing=args.gradient_checkpointing,
         attention=args.attention,
         quantization=args.quantization,
-        architecture=architecture.to_dict(),
+        architecture=architecture_of_size(args.size).to_dict(),
         action_statistics={"q01": [-1.0] * ACTION_TOKENS, "q99": [1.0] * ACTION_TOKENS, "mask": [True] * 7},
         input_features={CAMERA: PolicyFeature(FeatureType.VISUAL, (3, 224, 224))},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (ACTION_TOKENS,))},
     )
-    network = random_network(architecture, config)
+
+
+def random_policy(args: argparse.Namespace) -> OpenVLAPolicy:
+    """Return a policy of random weights."""
+    config = policy_config(args)
+    network = random_network(architecture_of_size(args.size), config)
     finish_network(network, config)
     return OpenVLAPolicy(config, parts=(network, FixedPrompt(args.prompt_tokens))).eval()
 
 
 class Clock:
-    """Times calls on a device, each repeated for some seconds after one that is not counted."""
+    """Times calls on a device, each repeated for some seconds after one that is not counted; 0: a single call."""
 
     def __init__(self, device: str, seconds: float) -> None:
         self._cuda = torch.device(device).type == "cuda"
@@ -117,8 +122,9 @@ class Clock:
 
     def __call__(self, function: Callable[[], Any]) -> float:
         """Return the mean time of a call [s]."""
-        function()
-        self._wait()
+        if self._seconds:
+            function()
+            self._wait()
         start, calls = time.perf_counter(), 0
         while (elapsed := time.perf_counter() - start) < self._seconds or not calls:
             function()
@@ -255,6 +261,8 @@ def arithmetic(network: OpenVLANetwork, args: argparse.Namespace) -> dict[str, f
     learn_bytes = update_bytes(network, args.minibatch_size, args.grad_accumulation, recompute=recompute)
     # Prompt and update are bound by operations, decoding by the bytes of weights and cache.
     return {
+        "weight_bytes": parameter_bytes(network),
+        "trained": sum(p.numel() for p in network.parameters() if p.requires_grad),
         "vision_flop": work.vision,
         "prompt_flop": work.prompt,
         "decode_flop": work.decode,
@@ -267,13 +275,20 @@ def arithmetic(network: OpenVLANetwork, args: argparse.Namespace) -> dict[str, f
     }
 
 
+def count(args: argparse.Namespace) -> dict[str, Any]:
+    """Only the formulas, of a network that takes no memory."""
+    config = policy_config(args)
+    network = empty_network(architecture_of_size(args.size), args.attention).to(resolve_dtype(config))
+    finish_network(network, config)
+    return arithmetic(network, args)
+
+
 def report(result: dict[str, Any]) -> str:
-    """The result as a text for the console."""
+    """The result of `measure` as a text for the console."""
     rollout, update, work = result["rollout_s"], result["update_s"], result["arithmetic"]
     args, gib = result["settings"], 2.0**30
     flop = work["rollout_flop"] + work["update_flop"]
     step = rollout["whole"] + update["whole"]
-    bound = work["h100_rollout_s"] + work["h100_update_s"]
     lines = [
         f"OpenVLA {args['size']}, {result['parameters'] / 1e9:.2f} G parameters, {result['trained'] / 1e6:.1f} M "
         f"trained, on {result['machine'] or 'CPU'} ({args['device']}, {result['threads']} threads)",
@@ -284,15 +299,26 @@ def report(result: dict[str, Any]) -> str:
         f"{rollout['whole'] / step:.0%}, update {update['whole'] / step:.0%}",
         "measures, time without it / with it:",
         *(f"  {name:48s} {a / b:6.2f}" for name, (a, b) in result["before_after_s"].items()),
+        f"{TOTAL_STEPS / 1e6:.1f} M steps: {TOTAL_STEPS * step / 3600:.1f} h as measured",
+        report_of_formulas(work),
+    ]
+    return "\n".join(lines)
+
+
+def report_of_formulas(work: dict[str, float]) -> str:
+    """The result of `count` as a text for the console."""
+    bound = work["h100_rollout_s"] + work["h100_update_s"]
+    hours = f"{TOTAL_STEPS / 1e6:.1f} M steps on an H100"
+    best = TOTAL_STEPS * bound / 3600
+    lines = [
         f"operations a step [TFLOP]: rollout {work['rollout_flop'] / 1e12:.3f} (vision "
         f"{work['vision_flop'] / 1e12:.3f}, prompt {work['prompt_flop'] / 1e12:.3f}, decode "
         f"{work['decode_flop'] / 1e12:.3f}), update {work['update_flop'] / 1e12:.3f}",
         f"bytes a step [GB]: rollout {work['rollout_bytes'] / 1e9:.3f}, update {work['update_bytes'] / 1e9:.3f}",
+        f"weights {work['weight_bytes'] / 1e9:.2f} GB, {work['trained'] / 1e6:.1f} M trained",
         f"H100 at its limits: {1 / bound:.1f} steps/s (rollout {1e3 * work['h100_rollout_s']:.2f} ms, update "
         f"{1e3 * work['h100_update_s']:.2f} ms a step)",
-        f"{TOTAL_STEPS / 1e6:.1f} M steps: {TOTAL_STEPS * step / 3600:.1f} h as measured, "
-        f"{TOTAL_STEPS * bound / 3600:.1f} h on an H100 at its limits, "
-        f"{2.5 * TOTAL_STEPS * bound / 3600:.1f} h at 40 % of them",
+        f"{hours}: {best:.1f} h at its limits, {best / 0.4:.1f} h at 40 % of them",
     ]
     return "\n".join(lines)
 
@@ -318,7 +344,8 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--gradient_checkpointing", action="store_true")
     parser.add_argument("--attention", default="sdpa")
     parser.add_argument("--quantization", default="none")
-    parser.add_argument("--seconds", type=float, default=10.0, help="for each measurement, at least one call")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of each measurement; 0: one call, cold")
+    parser.add_argument("--formulas", action="store_true", help="measure nothing, only count")
     parser.add_argument("--output", type=Path, help="JSON file for the numbers")
     args = parser.parse_args(argv)
     if args.lora_rank < 1:
@@ -329,8 +356,8 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
 def main(argv: list[str] | None = None) -> None:
     """Measure and print."""
     args = parse_args(argv)
-    result = measure(args)
-    print(report(result))
+    result = count(args) if args.formulas else measure(args)
+    print(report_of_formulas(result) if args.formulas else report(result))
     if args.output:
         args.output.write_text(json.dumps(result, indent=2))
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from transformers import DynamicCache
+from transformers import StaticCache
 
 from lerobot_policy_openvla.network import OpenVLANetwork
 
@@ -118,10 +118,12 @@ def generate_actions(
         Tokens (B, A), logits (B, A, V) float32, and the hidden state (B, text width) of `score_actions`.
     """
     model, head = network.language_model.model, network.language_model.lm_head
-    cache = DynamicCache(config=network.language_model.config)
     mask = prompts.mask(patches.shape[1], num_actions - 1)
     positions = _positions(mask)
     inputs, start = _embed(network, prompts, patches, None), 0
+    # Room for all from the start: a cache that grows copies itself for every token.
+    length = inputs.shape[1] + num_actions - 1
+    cache = StaticCache(config=network.language_model.config, max_cache_len=length)
     tokens, logits, first = [], [], None
     for i in range(num_actions):
         stop = start + inputs.shape[1]
