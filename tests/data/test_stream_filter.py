@@ -1,0 +1,193 @@
+import json
+import sys
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from lerobot.datasets import LeRobotDataset
+from synthetic_streams import TASKS, K, record
+
+from cronos_lerobot.data.stats import image_stats, vector_stats
+from cronos_lerobot.data.stream_filter import PROVENANCE, SegmentFilter, filter_streams
+from cronos_lerobot.data.streams import StreamDataset
+from cronos_lerobot.data.video import Clip, CopiedVideoFile, read_frames
+from cronos_lerobot.scripts import streams as script
+
+FRONT = "observation.images.front"
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory) -> StreamDataset:
+    folder = tmp_path_factory.mktemp("recorded") / "streams"
+    record(folder, flush_at=(9, 20))
+    return StreamDataset("me/stream", folder, streaming=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, {(i, k) for i in range(3) for k in range(8)}),
+        ({"success": True}, {(i, k) for i in range(3) for k in range(8) if (i + k) % 2 == 0}),
+        ({"success": False, "streams": [0]}, {(0, 1), (0, 3), (0, 5), (0, 7)}),
+        (
+            {"success": True, "found_complete": False},
+            {(0, 0), (0, 2), (0, 4), (0, 6), (1, 1), (1, 3), (1, 5), (1, 7)},
+        ),
+        ({"found_complete": True}, {(2, 0), (2, 2), (2, 4), (2, 6)}),
+        ({"interventions": ["scene_reset", "initial"]}, {(i, k) for i in range(3) for k in (0, 4)}),
+        ({"min_policy_version": 2, "max_policy_version": 2}, {(i, k) for i in range(3) for k in (4, 5)}),
+        ({"min_position": 2, "max_position": 2, "streams": [1]}, {(1, 2), (1, 6)}),
+        ({"tasks": [TASKS[0]], "max_policy_version": 0}, {(0, 0), (1, 1), (2, 0)}),
+    ],
+    ids=str,
+)
+def test_what_is_kept(source, options, expected):
+    wanted = SegmentFilter(**options)
+    assert {(s.stream, s.index) for s in source.segments if wanted(s)} == expected
+
+
+def test_unknown_interventions_are_refused():
+    with pytest.raises(
+        ValueError, match=r"unknown interventions \['reset'\]; valid ones: \['task_switch', 'end_eff"
+    ):
+        SegmentFilter(interventions=["reset", "initial"])
+
+
+def test_a_filtered_dataset_is_an_ordinary_one(source, tmp_path):
+    wanted = SegmentFilter(success=True, found_complete=False)
+    assert filter_streams(source, wanted, "me/successes", tmp_path / "d") == 8
+    dataset = LeRobotDataset("me/successes", root=tmp_path / "d", delta_timestamps={"action": [0, 0.2, 0.4, 0.6]})
+    kept = sorted((s for s in source.segments if wanted(s)), key=lambda s: s.episode)
+    assert (dataset.num_episodes, len(dataset)) == (8, 8 * K)
+    assert list(dataset.meta.tasks.index) == [TASKS[0]]
+    original = LeRobotDataset("me/stream", root=source.meta.root)
+    for episode, segment in enumerate(kept):
+        for t in range(K):
+            mine, theirs = dataset[episode * K + t], original[segment.start + t]
+            assert (mine["episode_index"], mine["frame_index"], mine["index"]) == (episode, t, episode * K + t)
+            assert mine["task"] == segment.task
+            # Copied, not encoded again: the same pixels bit for bit.
+            np.testing.assert_array_equal(mine[FRONT], theirs[FRONT])
+            for key in (
+                "observation.state",
+                "cronos.step",
+                "cronos.log_prob",
+                "next.reward",
+                "next.done",
+                "timestamp",
+            ):
+                np.testing.assert_array_equal(mine[key], theirs[key], err_msg=key)
+    item = dataset[1]
+    assert item["action_is_pad"].tolist() == [False, False, False, True]
+    first = 1000 * kept[0].stream + kept[0].step
+    assert item["action"][:, 0].tolist() == [(first + t) / 2 for t in (1, 2, 3, 3)]
+    stats = vector_stats(np.concatenate([source.columns(s, ["action"])["action"] for s in kept]))
+    np.testing.assert_allclose(dataset.meta.stats["action"]["mean"], stats["mean"])
+    assert not list((tmp_path / "d").rglob(".incomplete"))
+
+
+def test_cut_after_the_success(source, tmp_path):
+    wanted = SegmentFilter(streams=[0, 1], max_policy_version=0)
+    assert filter_streams(source, wanted, "me/cut", tmp_path / "d", frames_after_success=0) == 4
+    cut = StreamDataset("me/cut", tmp_path / "d")
+    # Segments 0 and 1 of streams 0 and 1; (0, 0) and (1, 1) succeed in their third frame.
+    assert [(s.stream, s.index, s.length, s.success_frame) for s in cut.segments] == [
+        (0, 0, 3, 2), (0, 1, 4, None), (1, 0, 4, None), (1, 1, 3, 2),
+    ]  # fmt: skip
+    first = cut.segments_of(0)[0]
+    np.testing.assert_array_equal(cut.columns(first)["next.done"], [False, False, True])
+    pixels = cut.pixels(first, FRONT)
+    np.testing.assert_array_equal(pixels, source.pixels(source.segments_of(0)[0], FRONT, slice(0, 3)))
+    frames = [cut.dataset[i] for i in range(len(cut.dataset))]
+    assert [int(f["frame_index"]) for f in frames] == [0, 1, 2, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2][: len(frames)]
+    assert cut.dataset.meta.stats["action"]["count"] == 14
+    rows = np.concatenate([cut.pixels(s, FRONT) for s in sorted(cut.segments, key=lambda s: s.episode)])
+    np.testing.assert_allclose(cut.dataset.meta.stats[FRONT]["mean"], image_stats(rows)["mean"], atol=0.01)
+
+
+def test_files_that_would_grow_too_long_are_split(source, tmp_path, monkeypatch):
+    monkeypatch.setattr("cronos_lerobot.data.stream_filter.MAX_FILE_DURATION_S", 10 / 5)
+    filter_streams(source, SegmentFilter(streams=[1]), "me/split", tmp_path / "d")
+    split = StreamDataset("me/split", tmp_path / "d")
+    assert split.meta.episodes["data/file_index"] == [0, 0, 1, 1, 2, 2, 3, 3]
+    for mine, theirs in zip(split.segments, source.segments_of(1), strict=True):
+        np.testing.assert_array_equal(split.pixels(mine, FRONT), source.pixels(theirs, FRONT))
+
+
+def test_mistakes_leave_nothing_behind(source, tmp_path):
+    with pytest.raises(ValueError, match="none of the 24 segments fits"):
+        filter_streams(source, SegmentFilter(streams=[5]), "me/none", tmp_path / "d")
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(FileExistsError, match="exists; choose another folder"):
+        filter_streams(source, SegmentFilter(), "me/all", tmp_path)
+
+
+def test_clips_that_begin_between_keyframes_are_refused(source, tmp_path):
+    (path,) = sorted(source.meta.root.rglob("file-000.mp4"))
+    with pytest.raises(ValueError, match="cannot be copied without decoding from frame 1 on"):
+        CopiedVideoFile(tmp_path / "a.mp4", 5).append(Clip(path, 1, 2))
+    with pytest.raises(ValueError, match="ends after"):
+        CopiedVideoFile(tmp_path / "b.mp4", 5).append(Clip(path, 0, 1000))
+    with pytest.raises(ValueError, match="ends after"):
+        read_frames(path, 0, 1000, 5)
+
+
+def test_copied_frames_last_as_long_as_encoded_ones(source, tmp_path):
+    filter_streams(source, SegmentFilter(), "me/all", tmp_path / "d")
+    (path,) = (tmp_path / "d").rglob("*.mp4")
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert (stream.frames, float(stream.duration * stream.time_base)) == (96, 96 / 5)
+
+
+def cronos_streams(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["cronos-streams", *map(str, arguments)])
+    script.main()
+
+
+def test_command(source, tmp_path, monkeypatch, capsys):
+    dataset = ("--dataset.repo_id=me/stream", f"--dataset.root={source.meta.root}")
+    cronos_streams(monkeypatch, "check", *dataset)
+    assert capsys.readouterr().out == "whole: 3 streams, 24 segments, 96 frames\n"
+    cronos_streams(monkeypatch, "statistics", *dataset, f"--output={tmp_path / 'statistics.json'}")
+    assert "[0.31, 0.69]" in capsys.readouterr().out  # Wilson's interval of 12 of 24
+    assert json.loads((tmp_path / "statistics.json").read_text())["success"] == [12, 4, 24]
+    output = ("--output.repo_id=me/kept", f"--output.root={tmp_path / 'kept'}")
+    cronos_streams(monkeypatch, "filter", *dataset, *output, "--filter.success=true", "--frames_after_success=1")
+    assert capsys.readouterr().out == f"12 of 24 segments in {tmp_path / 'kept'}\n"
+    provenance = json.loads((tmp_path / "kept" / PROVENANCE).read_text())
+    assert (provenance["source"], provenance["segments"], provenance["filter"]["success"]) == (
+        "me/stream",
+        12,
+        True,
+    )
+    assert LeRobotDataset("me/kept", root=tmp_path / "kept").num_episodes == 12
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["chek"], r"unknown command 'chek'; valid commands: \['statistics', 'check', 'filter'\]"),
+        (["check"], "choose a dataset: --dataset.repo_id"),
+        (["check", "--dataset.repo_id=me/s", "--dataset.root=nowhere"], "no LeRobotDataset in nowhere"),
+        (
+            ["filter", "--dataset.repo_id=me/s", "--filter.interventions=[x]"],
+            r"unknown interventions \['x'\]; valid",
+        ),
+        (["filter", "--frames_after_success=-1"], "frames_after_success must be >= 0 or null, got -1"),
+        (["filter", "--dataset.repo_id=me/s"], "name the dataset to write: --output.repo_id"),
+    ],
+    ids=str,
+)
+def test_command_tells_mistakes(monkeypatch, arguments, message):
+    with pytest.raises(SystemExit, match=message):
+        cronos_streams(monkeypatch, *arguments)
+
+
+def test_help_teaches(monkeypatch, capsys):
+    cronos_streams(monkeypatch, "--help")
+    text = capsys.readouterr().out
+    assert "examples:" in text
+    assert Path(script.__file__).name == "streams.py"
+    assert all(command in text for command in script.COMMANDS)

@@ -1,0 +1,194 @@
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from lerobot.datasets import LeRobotDataset, StreamingLeRobotDataset
+from lerobot.datasets.dataset_tools import delete_episodes
+from synthetic_segments import FPS, features, segment
+from synthetic_streams import PICTURES, STEPS, STREAMS, TASKS, UPDATE, K, record
+
+from cronos_lerobot.data.schema import Intervention
+from cronos_lerobot.data.stream_check import StreamError
+from cronos_lerobot.data.stream_statistics import make_tables, statistics
+from cronos_lerobot.data.streams import StreamDataset
+from cronos_lerobot.data.writer import SegmentWriter
+
+FRONT = "observation.images.front"
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("recorded") / "streams"
+    record(folder, flush_at=(9, 20))
+    return folder
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["loaded", "streamed"])
+def streams(root, request) -> StreamDataset:
+    return StreamDataset("me/stream", root, streaming=request.param)
+
+
+def test_segments_come_in_the_order_of_their_stream(streams):
+    found = [(s.stream, s.index, s.step, s.length, s.task) for s in streams.segments]
+    expected = [(i, k, k * K, K, TASKS[(i + k) % 2]) for i in range(STREAMS) for k in range(8)]
+    assert found == expected
+    assert streams.streams == [0, 1, 2]
+    first = streams.segments_of(1)
+    assert [s.position for s in first] == [0, 1, 2, 3, 0, 1, 2, 3]
+    kinds = ["INITIAL", *["END_EFFECTOR_RESET"] * 3, "SCENE_RESET", *["END_EFFECTOR_RESET"] * 3]
+    assert [s.intervention.name for s in first] == kinds
+    assert [s.policy_version for s in first] == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert [s.success_frame for s in first] == [None, 2] * 4
+    assert [s.found_complete for s in streams.segments_of(2)] == [True, False] * 4
+
+
+def test_a_stream_is_whole(streams):
+    columns = streams.stream_columns(2, ["cronos.step", "action", "observation.state", "next.done"])
+    t = np.arange(STEPS)
+    np.testing.assert_array_equal(columns["cronos.step"], t)
+    np.testing.assert_array_equal(columns["action"], np.repeat((2000 + t)[:, None] / 2, 7, axis=1))
+    np.testing.assert_array_equal(columns["observation.state"][:, 4], 2000 + t)
+    np.testing.assert_array_equal(columns["next.done"], t % K == K - 1)
+    streams.check()
+
+
+def test_pixels_of_a_segment(streams):
+    segment = streams.segments_of(1)[6]
+    pictures = streams.pixels(segment, FRONT).astype(int)
+    assert np.abs(pictures - PICTURES[(1 + segment.step + np.arange(K)) % 7]).mean() < 2.5
+    np.testing.assert_array_equal(streams.pixels(segment, FRONT, slice(1, 3)), pictures[1:3])
+    with pytest.raises(ValueError, match=r"no pixels 'left'; it has \['observation.images.front'\]"):
+        streams.pixels(segment, "left")
+    with pytest.raises(ValueError, match=r"no columns \['nothing'\]"):
+        streams.columns(segment, ["nothing"])
+
+
+def test_transitions_across_a_switch(streams):
+    switches = list(streams.switches(0))
+    assert [s.after.step for s in switches] == [4, 8, 12, 16, 20, 24, 28]
+    assert switches[3].intervention == Intervention.SCENE_RESET
+    assert len(list(streams.switches())) == 7 * STREAMS
+    last, first = streams.switch_frames(switches[3])
+    assert (last["cronos.step"], first["cronos.step"]) == (15, 16)
+    assert (last["action"][0], first["action"][0]) == (7.5, 8)
+    assert np.abs(first[FRONT].astype(int) - PICTURES[16 % 7]).mean() < 2.5
+    assert np.abs(last[FRONT].astype(int) - PICTURES[15 % 7]).mean() < 2.5
+
+
+def test_episodes_between_scene_resets(streams):
+    episodes = list(streams.reset_free_episodes())
+    assert [(e[0].stream, e[0].step, len(e)) for e in episodes] == [(i, t, 4) for i in range(3) for t in (0, 16)]
+    assert list(streams.reset_free_episodes(1)) == episodes[2:4]
+
+
+def test_statistics(streams):
+    result = statistics(streams)
+    assert (result["streams"], result["segments"], result["frames"]) == (3, 24, 96)
+    # Segment k of stream i succeeds if i + k is even: in stream 2, from the start.
+    assert result["success"] == [12, 4, 24]
+    assert result["success_by_position"] == {0: [4, 2, 6], 1: [2, 0, 6], 2: [4, 2, 6], 3: [2, 0, 6]}
+    assert result["success_by_task"] == {TASKS[1]: [0, 0, 12], TASKS[0]: [12, 4, 12]}
+    assert result["success_by_policy_version"] == {v: [3, 1, 6] for v in range(STEPS // UPDATE)}
+    assert result["success_by_stream"] == {0: [4, 0, 8], 1: [4, 0, 8], 2: [4, 4, 8]}
+    assert result["interventions"] == {"end_effector_reset": 18, "scene_reset": 3, "initial": 3}
+    # Tenths of 32 steps, rounded up, are 4 steps: one segment of each stream.
+    assert result["interventions_over_time"][0] == {"initial": 3}
+    assert result["interventions_over_time"][16] == {"scene_reset": 3}
+    assert len(make_tables(result)) == 4
+
+
+def test_streamed_has_no_loaded_view(root):
+    streams = StreamDataset("me/stream", root, streaming=True)
+    with pytest.raises(ValueError, match="streaming=False"):
+        _ = streams.dataset
+    assert StreamDataset("me/stream", root).dataset[5]["index"] == 5
+    with pytest.raises(ValueError, match=r"stream 7 is not in me/stream; it has \[0, 1, 2\]"):
+        streams.segments_of(7)
+
+
+def test_lerobot_streams_the_numbers_of_a_recording_in_order(tmp_path):
+    """LeRobot's own streaming takes `index / fps` for the time inside a video file: right for one file only."""
+    record(tmp_path / "d", steps=K)
+    dataset = StreamingLeRobotDataset("me/stream", tmp_path / "d", shuffle=False, buffer_size=1, max_num_shards=1)
+    dataset.meta.info.features.pop(FRONT)  # its decoder needs torchcodec
+    found = [(int(item["cronos.stream_id"]), int(item["cronos.step"]), item["task"]) for item in dataset]
+    assert found == [(i, t, TASKS[i % 2]) for i in range(STREAMS) for t in range(K)]
+
+
+@pytest.mark.parametrize(
+    ("skip", "message"),
+    [
+        ([(1, 3)], "stream 1: step 12 to 15 is missing"),
+        ([(0, 0)], "stream 0: step 0 to 3 is missing"),
+        ([(0, k) for k in range(8)], r"the streams \[0\] are missing; recorded are the first ones up to 2"),
+    ],
+)
+def test_what_is_missing_is_named(tmp_path, skip, message):
+    record(tmp_path / "d", skip=skip)
+    with pytest.raises(StreamError, match=message):
+        StreamDataset("me/stream", tmp_path / "d", streaming=True).check()
+
+
+@pytest.mark.parametrize(
+    ("column", "row", "value", "message"),
+    [
+        ("cronos.step", 13, 0, "stream 0, step 0: it does not follow the frame before it in episode 3"),
+        ("cronos.intervention", 1, 2, "stream 0, step 1: intervention 2 on frame 1"),
+        ("cronos.intervention", 48, 0, "stream 0, step 16: intervention 0 on frame 0"),
+        ("cronos.intervention", 12, 6, "stream 0, step 4: intervention 6"),
+        ("cronos.segment_index", 5, 9, "stream 1, step 1: segment 9 begins inside episode 1"),
+        ("cronos.stream_interventions", 48, 0, "stream 0, step 16: cronos.stream_interventions is 0, not what"),
+        ("index", 7, 8, "stream 1, step 3: its index is not its row, 8"),
+    ],
+)
+def test_wrong_annotations_are_named(tmp_path, column, row, value, message):
+    record(tmp_path / "d")
+    (path,) = (tmp_path / "d").glob("data/*/*.parquet")
+    table = pq.read_table(path)
+    values = table[column].to_pylist()
+    values[row] = value
+    place, field = table.schema.get_field_index(column), table.schema.field(column)
+    pq.write_table(table.set_column(place, field, pa.array(values, field.type)), path)
+    with pytest.raises(StreamError, match=message):
+        StreamDataset("me/stream", tmp_path / "d", streaming=True).check()
+
+
+def test_a_segment_that_is_there_twice_is_named(root, tmp_path):
+    """As if a resumed run had recorded a segment again without dropping the first."""
+    shutil.copytree(root, tmp_path / "d")
+    with SegmentWriter.resume("me/stream", tmp_path / "d") as writer:
+        streams = StreamDataset("me/stream", root)
+        again = streams.segments_of(2)[5]
+        frames = {key: streams.columns(again, [key])[key] for key in writer.features if key != FRONT}
+        scalars = {
+            key: array.reshape(K) for key, array in frames.items() if array.shape[-1] == 1 or array.ndim == 1
+        }
+        pixels = {FRONT: streams.pixels(again, FRONT)}
+        metadata = {"cronos.stream_id": 2, "cronos.segment_index": 5, "cronos.step": 20, "cronos.intervention": 2}
+        metadata |= {"cronos.policy_version": 2, "next.success": False, "cronos.success_frame": -1}
+        writer.add_segment(frames | scalars | pixels, again.task, episode_metadata=metadata)
+    with pytest.raises(StreamError, match="stream 2, step 20: it is there twice"):
+        StreamDataset("me/stream", tmp_path / "d", streaming=True).check()
+
+
+def test_survives_lerobots_own_tools(root, tmp_path):
+    """They drop our columns from the episodes' rows; the frames still tell."""
+    kept = delete_episodes(LeRobotDataset("me/stream", root=root), [0, 1], tmp_path / "d", "me/edited")
+    assert "cronos.step" not in kept.meta.episodes.column_names
+    streams = StreamDataset("me/edited", tmp_path / "d")
+    original = StreamDataset("me/stream", root)
+    for mine, theirs in zip(streams.segments_of(2), original.segments_of(2), strict=True):
+        assert (mine.step, mine.task, mine.intervention) == (theirs.step, theirs.task, theirs.intervention)
+        assert (mine.success_frame, mine.policy_version) == (theirs.success_frame, theirs.policy_version)
+    with pytest.raises(StreamError, match="stream 0: step 0 to 3 is missing"):
+        streams.check()
+
+
+def test_other_datasets_are_refused(tmp_path):
+    with SegmentWriter("me/demos", tmp_path / "d", features(), FPS) as writer:
+        writer.add_segment(segment(5), "task")
+    with pytest.raises(ValueError, match="me/demos has no recorded streams: it lacks the columns"):
+        StreamDataset("me/demos", tmp_path / "d", streaming=True)

@@ -1,0 +1,204 @@
+"""Recordings of whole runs: films, and what happens when a recording fails."""
+
+import json
+import logging
+import resource
+import shutil
+import sys
+
+import numpy as np
+import pytest
+from dummies import DummyEnv, DummyPolicy, DummyPolicyConfig, identity_processors
+from lerobot.utils.random_utils import set_seed
+from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
+from safetensors.torch import load_file
+
+from cronos_lerobot.data.streams import StreamDataset
+from cronos_lerobot.data.video import read_frames
+from cronos_lerobot.kill_test import KillTest
+from cronos_lerobot.protocol import ProtocolConfig
+from cronos_lerobot.rl.ppo_config import PPOConfig
+from cronos_lerobot.scripts import train as script
+from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
+from cronos_lerobot.training.recording import FILM, FilmedEnv
+from cronos_lerobot.training.trainer import Trainer
+
+STREAMS = 4
+
+
+def config(folder, **options):
+    defaults = {
+        "policy": DummyPolicyConfig(),
+        "output_dir": folder,
+        "num_envs": STREAMS,
+        "steps": 4 * 8 * STREAMS,
+        "protocol": ProtocolConfig(task_switch_interval=4, update_interval=8, scene_reset_interval=16),
+        "algorithm": PPOConfig(minibatch_size=16),
+        "record": RecordConfig("me/stream", streams="all"),
+        "eval_freq": 0,
+        "save_freq": 8 * STREAMS,
+        "tensorboard": False,
+    }
+    return CronosTrainConfig(**(defaults | options))
+
+
+def train(cfg, env=None):
+    set_seed(cfg.seed)
+    trainer = Trainer(cfg, env or DummyEnv(STREAMS), DummyEnv, DummyPolicy(), *identity_processors())
+    trainer.train()
+    return trainer
+
+
+class DiskFullEnv(DummyEnv):
+    """From step `at` on, no file may grow beyond `limit` bytes: writing fails as it does on a full disk."""
+
+    at, limit = 10, 6000
+
+    def step(self, actions):
+        if self.t == self.at:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (self.limit, resource.RLIM_INFINITY))
+        return super().step(actions)
+
+
+@pytest.fixture
+def file_size_limit():
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+
+
+def weights(folder):
+    return load_file(folder / "checkpoints/last/pretrained_model/model.safetensors")
+
+
+def test_a_run_outlives_its_recording(tmp_path, file_size_limit, caplog):
+    """The numbers fit in the small files, the pictures and rows of the recording do not."""
+    train(config(tmp_path / "whole", save_freq=0, record=RecordConfig()))
+    with caplog.at_level(logging.WARNING):
+        train(config(tmp_path / "run", save_freq=8 * STREAMS, save_checkpoint=False), DiskFullEnv(STREAMS))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    lines = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
+    assert [line["kind"] for line in lines].count("update") == 4
+    (stopped,) = [line for line in lines if line["kind"] == "recording"]
+    assert stopped["recording"] == "streams"
+    assert "File too large" in stopped["reason"]
+    assert "RECORDING STOPPED, the training goes on without it" in caplog.text
+    assert "is not complete" in caplog.messages[-1]
+    assert not (tmp_path / "run/streams/.incomplete").exists()
+
+
+def test_a_failed_recording_keeps_what_was_flushed_and_is_not_resumed(tmp_path, caplog):
+    """Segments until the first checkpoint are there; a run resumed from a later one says why there are no more."""
+
+    class FailingEnv(DummyEnv):
+        def step(self, actions):
+            if self.t == 10:
+                # The folder is gone, as if its disk were: what the writer does next fails.
+                staging = tmp_path / "run/streams/.incomplete"
+                shutil.rmtree(staging)
+                staging.write_text("")
+            return super().step(actions)
+
+    train(config(tmp_path / "run"), FailingEnv(STREAMS))
+    streams = StreamDataset("me/stream", tmp_path / "run/streams", streaming=True)
+    streams.check()
+    assert [len(streams.segments_of(i)) for i in range(STREAMS)] == [2] * STREAMS
+    train(config(tmp_path / "whole", record=RecordConfig()))
+    for name, tensor in weights(tmp_path / "whole").items():
+        assert (tensor == weights(tmp_path / "run")[name]).all()
+
+    resumed = config(tmp_path / "run", steps=6 * 8 * STREAMS)
+    resumed.checkpoint_path = (tmp_path / "run/checkpoints/last").resolve()
+    with caplog.at_level(logging.WARNING):
+        train(resumed)
+    assert "ended before the checkpoint and is not resumed" in caplog.text
+    assert len(StreamDataset("me/stream", tmp_path / "run/streams", streaming=True).segments) == 2 * STREAMS
+
+
+def cronos_train(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["cronos-train", *map(str, arguments)])
+    script.main()
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--record.root={existing}"], "existing exists; choose another --record.root"),
+        # Nobody may make a folder there, not even root.
+        (["--record.root=/proc/1/streams"], "cannot record to /proc/1/streams"),
+        (["--record.streams=3"], "record.streams must be at most num_envs=2, got 3"),
+        (["--record.filmed_streams=3"], "record.filmed_streams must be at most num_envs=2, got 3"),
+        (["--record.streams=some"], "record.streams must be a number or 'all', got 'some'"),
+        (["--record.flush_interval_s=0"], "record.flush_interval_s must be > 0, got 0"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_a_recording_that_cannot_begin_stops_the_run_at_once(tmp_path, monkeypatch, flags, message):
+    (tmp_path / "existing").mkdir()
+    flags = [flag.format(existing=tmp_path / "existing") for flag in flags]
+    with pytest.raises(SystemExit, match=message):
+        cronos_train(
+            monkeypatch, "--policy.type=pocketvla", "--policy.device=cpu", "--env.type=cronos", "--num_envs=2",
+            "--record.repo_id=me/stream", f"--output_dir={tmp_path / 'run'}", *flags,
+        )  # fmt: skip
+    assert [path.name for path in tmp_path.iterdir()] == ["existing"]
+
+
+def test_resuming_without_the_recording_is_told(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no recording to resume in"):
+        RecordConfig("me/stream").check(tmp_path, 4, resume=True)
+
+
+def test_filmed_streams_are_a_dataset_of_their_own(tmp_path):
+    """Its pictures are those of the states that the policy acted on, at another size."""
+    env_config = CronosEnvConfig(obs_type="environment_state_agent_pos", render_size=(48, 64), num_threads=1)
+    env = CronosVectorEnv(3, **env_config.gym_kwargs)
+    seen = []
+
+    class Watched(FilmedEnv):
+        def _film(self, observation):
+            observation = super()._film(observation)
+            seen.append((observation["agent_pos"][:2].copy(), observation[FILM].copy()))
+            return observation
+
+    from cronos_lerobot.data.recorder import StreamRecorder
+
+    filmed = Watched(env, 2)
+    assert filmed.num_envs == 3
+    recorder = StreamRecorder.open(
+        env, "me/film", tmp_path / "film", segment_length=5, streams=2, cameras={"front": (48, 64)}
+    )
+    rng = np.random.default_rng(0)
+    obs = filmed.observe()
+    for t in range(5):
+        action = rng.uniform(env.single_action_space.low, env.single_action_space.high, (3, 7)).astype(np.float32)
+        observation = {key: obs[key] for key in ("agent_pos", "environment_state")} | {
+            "pixels": {"front": obs[FILM]}
+        }
+        next_obs, reward, *_, info = filmed.step(action)
+        recorder.on_step(
+            observation, env.instructions, action, reward, info["is_success"], np.zeros(3), np.zeros(3), 0,
+            interventions=np.full(3, 0 if t else 6), stream_interventions=np.zeros(3, int), total_interventions=0,
+            steps=np.full(3, t), segments=np.zeros(3, int), segment_ends=np.full(3, t == 4),
+        )  # fmt: skip
+        obs = next_obs
+    recorder.close()
+    env.close()
+    streams = StreamDataset("me/film", tmp_path / "film", streaming=True)
+    streams.check()
+    for stream in range(2):
+        (segment,) = streams.segments_of(stream)
+        pixels = streams.pixels(segment, "observation.images.front")
+        assert pixels.shape == (5, 48, 64, 3)
+        for t, (state, pictures) in enumerate(seen[:5]):
+            np.testing.assert_array_equal(streams.columns(segment)["observation.state"][t], state[stream])
+            assert np.abs(pixels[t].astype(int) - pictures[stream]).mean() < 4
+
+
+def test_killed_runs_lose_nothing_that_was_flushed(tmp_path):
+    """A real run from pixels, killed at random moments; `cronos_lerobot.kill_test` does it twenty times."""
+    tally = KillTest(tmp_path / "killed", seed=1, report=lambda line: None).run(4)
+    assert tally.kills == 5
+    assert tally.segments_checked > 0
+    film = tmp_path / "killed/run/streams_96x64"
+    (path, *_) = sorted(film.rglob("*.mp4"))
+    assert read_frames(path, 0, 8, 5).shape == (8, 64, 96, 3)
