@@ -67,10 +67,16 @@ class ShardedEnv:
 
     def scene_reset(self, ids: np.ndarray, configurations: np.ndarray, split: str = "train") -> None:
         """Put every body of the streams `ids` at configurations (k,) of a split, and the arm home."""
-        ids = np.asarray(ids)
         own = self._own(ids)
         if len(own):
-            self._env.scene_reset(own - self.mine.start, np.asarray(configurations)[np.isin(ids, own)], split)
+            configurations = np.asarray(configurations)[np.isin(ids, own)]
+            self._env.scene_reset(own - self.mine.start, configurations, split)
+
+    def place_bodies(self, ids: np.ndarray, poses: np.ndarray) -> None:
+        """Put every body of the streams `ids` at `poses` (k, bodies, 7), and the arm home."""
+        own = self._own(ids)
+        if len(own):
+            self._env.place_bodies(own - self.mine.start, np.asarray(poses)[np.isin(ids, own)])
 
     def end_effector_reset(self, ids: np.ndarray) -> None:
         """Put the arm of the streams `ids` home."""
@@ -99,7 +105,7 @@ class ShardedEnv:
         """
         if len(self._own(ids)) < len(ids):
             raise ValueError(
-                f"A process renders its own streams, {self.mine.start} to {self.mine.stop - 1} here, "
+                f"A process films its own streams, {self.mine.start} to {self.mine.stop - 1}, "
                 f"got {np.asarray(ids).tolist()}."
             )
         return self._env.render_streams(np.asarray(ids) - self.mine.start)

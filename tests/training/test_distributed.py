@@ -28,8 +28,14 @@ from cronos_lerobot.rl.ppo import PPO
 from cronos_lerobot.rl.ppo_config import PPOConfig
 from cronos_lerobot.rl.processing import PolicyProcessors
 from cronos_lerobot.rl.rollout_buffer import RolloutBuffer
+from cronos_lerobot.stopwatch import Stopwatch
+from cronos_lerobot.task_orders import TASK_ORDERS
 from cronos_lerobot.training.config import RecordConfig
+from cronos_lerobot.training.sharding import ShardedEnv
 from cronos_lerobot.training.trainer import Trainer
+
+# Whatever threads there are wait for work when the test forks.
+pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
 
 DIVERGE_AT = {(5, 1), (21, 2)}
 """Stream 1 is the first process's of two, stream 2 the second's."""
@@ -130,11 +136,11 @@ def train(processes, cfg, policy_class=ScriptedPolicy, dies_at=None):
     return trainer.loop.state_dict(), parameters.tolist()
 
 
-def settings(folder, minibatch_size, *, resume=None, budget=None, algorithm=None, **options):
+def settings(folder, minibatch_size, *, resume=None, budget=None, task_order="random", algorithm=None, **options):
     """A run with heuristic resets; `minibatch_size` is that of one process."""
     protocol = ProtocolConfig(
         task_switch_interval=4, update_interval=8, scene_reset_interval=16, heuristic_reset=True,
-        task_order="random", reset_budget=budget,
+        task_order=task_order, reset_budget=budget,
     )  # fmt: skip
     ppo = {"minibatch_size": minibatch_size, "policy_lr": 1e-2, "kl_base_coef": 0.1} | (algorithm or {})
     cfg = config(folder, protocol=protocol, algorithm=PPOConfig(**ppo), **options)
@@ -297,6 +303,36 @@ def test_processes_that_drift_apart_are_stopped():
 
     messages = together(drift)
     assert all("no longer agree on: the policy." in message for message in messages)
+
+
+def test_a_task_order_that_decides_by_itself_is_stopped(tmp_path, monkeypatch):
+    class Alone:
+        def __init__(self, rng):
+            self.rng = np.random.default_rng(os.getpid())
+
+        def draw(self, loop):
+            return self.rng.integers(loop.num_tasks, size=loop.num_streams)
+
+    def train_alone(processes, cfg):
+        with pytest.raises(RuntimeError, match="no longer agree on: the loop's state\\. Task orders and"):
+            train(processes, cfg)
+
+    monkeypatch.setitem(TASK_ORDERS, "alone", Alone)
+    together(train_alone, settings(tmp_path / "run", 16, task_order="alone"))
+
+
+def test_a_process_films_its_own_streams():
+    def film(processes):
+        env = DummyEnv(2)
+        env.timer = Stopwatch()
+        env.render_streams = lambda ids: [f"local {i}" for i in ids]
+        sharded = ShardedEnv(env, processes)
+        own = sharded.render_streams(np.arange(2) + 2 * processes.rank)
+        with pytest.raises(ValueError, match=r"its own streams, [02] to [13], got \[1, 2\]"):
+            sharded.render_streams(np.array([1, 2]))
+        return own
+
+    assert together(film) == [["local 0", "local 1"]] * 2
 
 
 def test_exchange_keeps_types_and_order():
