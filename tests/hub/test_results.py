@@ -1,0 +1,123 @@
+"""Entries of `.eval_results/cronos.yaml`, from numbers that are known."""
+
+import pytest
+from lerobot_env_cronos.benchmark import draw_benchmark
+from lerobot_env_cronos.scenes import Task
+
+from cronos_lerobot.evaluation.results import independent_results, sequential_results
+from cronos_lerobot.hub.config import PublishConfig, ResultsConfig
+from cronos_lerobot.hub.results import make_entries, merge
+from cronos_lerobot.hub.runs import find_checkpoint, is_repository
+
+BENCHMARK = draw_benchmark("kitchen_2x2", seed=0, num_configurations=2, num_orderings=2, chain_length=2)
+
+
+def record(number, configuration, length):
+    return {"number": number, "configuration": configuration, "length": length, "steps": 80}
+
+
+def make_results(**changes):
+    """Of 8 episodes 6 succeed; the 4 chains complete 2, 1, 1 and 0 tasks."""
+    tasks: list[Task] = [group.tasks[0] for group in BENCHMARK.groups("independent", "train")]
+    episodes = [record(task, i, int(task != 3)) for task in range(4) for i in range(2)]
+    chains = [record(0, 0, 2), record(0, 1, 1), record(1, 0, 1), record(1, 1, 0)]
+    return {
+        "independent": {"train": independent_results(episodes, tasks)},
+        "sequential": {
+            "train": sequential_results(chains, [group.tasks for group in BENCHMARK.groups("sequential", "train")])
+        },
+        "temperature": 0.6, "seed": 3, "advance": "window", "end_effector_reset": False, "date": "2026-11-21",
+        "obs_type": "pixels_agent_pos", "versions": {"cronos-lerobot": "0.1.0", "lerobot_env_cronos": "0.1.0"},
+    } | changes  # fmt: skip
+
+
+def test_values_and_notes():
+    config = ResultsConfig(repo_id="me/p", source_url="https://example.org/log")
+    independent, sequential = make_entries(make_results(), BENCHMARK, config)
+    assert (independent.task_id, independent.value) == ("independent_train", 75.0)
+    assert (sequential.task_id, sequential.value) == ("sequential_train", 1.0)
+    assert sequential.notes is not None
+    assert sequential.notes.startswith("n=4; average chain length, 95 % interval 0.")
+    assert "SEQ 0, 1, ... 75.0, 25.0 %" in sequential.notes
+    assert "temperature 0.6; seed 3; pixels_agent_pos; cronos-lerobot 0.1.0" in sequential.notes
+    assert independent.source_url == "https://example.org/log"
+
+
+def test_a_part_of_the_benchmark_is_refused_or_called_so():
+    results = make_results()
+    results["independent"]["train"]["n"] = 5
+    with pytest.raises(ValueError, match="independent_train: 5 of the 8 episodes of train were evaluated"):
+        make_entries(results, BENCHMARK, ResultsConfig())
+    (entry,) = make_entries(results, BENCHMARK, ResultsConfig(suites="independent", partial=True))
+    assert entry.notes is not None
+    assert entry.notes.startswith("PARTIAL: 5 of the 8 episodes")
+
+
+@pytest.mark.parametrize("change", [{"advance": "on_success"}, {"end_effector_reset": True}])
+def test_other_chains_than_the_benchmarks_are_refused(change):
+    with pytest.raises(ValueError, match=f"sequential_train: evaluated with {{'{next(iter(change))}'"):
+        make_entries(make_results(**change), BENCHMARK, ResultsConfig())
+    # Single tasks do not depend on it.
+    assert len(make_entries(make_results(**change), BENCHMARK, ResultsConfig(suites="independent"))) == 1
+
+
+def test_nothing_to_publish():
+    with pytest.raises(ValueError, match=r"unknown suites \['chains'\]; valid suites: \['independent', 'seq"):
+        make_entries(make_results(), BENCHMARK, ResultsConfig(suites="chains"))
+    results = make_results()
+    del results["sequential"]
+    with pytest.raises(ValueError, match=r"none of the suites \['sequential'\]"):
+        make_entries(results, BENCHMARK, ResultsConfig(suites="sequential"))
+
+
+def test_merging_replaces_only_the_same_benchmark_and_task():
+    def entry(dataset, task, value):
+        return {"dataset": {"id": dataset, "task_id": task}, "value": value}
+
+    there = [entry("me/b", "x", 1), entry("other/b", "x", 2), entry("me/b", "y", 3)]
+    new = [entry("me/b", "z", 4), entry("me/b", "x", 5)]
+    assert [e["value"] for e in merge(there, new)] == [5, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({}, "--repo_id=<owner>/<name> is required"),
+        ({"repo_id": "me/x", "revision": "v1"}, "there is no --branch"),
+        ({"repo_id": "me/x", "dry_run": True}, "go together"),
+    ],
+)
+def test_flags_that_do_not_fit(flags, message):
+    with pytest.raises(ValueError, match=message):
+        PublishConfig(**flags).validate()
+
+
+def test_a_dry_run_overwrites_nothing(tmp_path):
+    (tmp_path / "thesis.txt").touch()
+    with pytest.raises(FileExistsError, match="is not empty"):
+        PublishConfig(repo_id="me/x", dry_run=True, output_dir=tmp_path).validate()
+
+
+def test_where_a_policy_may_be(tmp_path):
+    model = tmp_path / "run/checkpoints/000100/pretrained_model"
+    model.mkdir(parents=True)
+    for name in ("config.json", "model.safetensors"):
+        (model / name).touch()
+    (tmp_path / "run/checkpoints/last").symlink_to("000100")
+    for path in (tmp_path / "run", model.parent, model):
+        assert find_checkpoint(path).model == model
+        assert find_checkpoint(path).run is None, "lerobot-train's: no metrics.jsonl"
+    for name in ("metrics.jsonl", "manifest.json"):
+        (tmp_path / "run" / name).touch()
+    for path in (tmp_path / "run", model.parent, model):
+        found = find_checkpoint(path)
+        assert (found.run, found.step) == (tmp_path / "run", 100)
+    with pytest.raises(FileNotFoundError, match="holds no policy"):
+        find_checkpoint(tmp_path)
+
+
+def test_what_can_be_a_repository(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "outputs/clone").mkdir(parents=True)
+    assert is_repository("me/base")
+    assert not any(map(is_repository, ("outputs/clone", "./base", "/me/base", "a/b/c", None, "base")))
