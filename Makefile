@@ -47,7 +47,7 @@ format: ## Format and fix
 bench: setup ## Steps per second: physics, pixels, training
 	$(RUN) python -m cronos_lerobot.benchmark
 
-wheels: $(UV) ## Build the three wheels into dist/
+wheels: $(UV) ## Build the wheels into dist/
 	$(UV) build --all-packages --wheel
 
 clean: ## Remove the environment and build outputs

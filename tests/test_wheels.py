@@ -1,4 +1,4 @@
-"""The three wheels build, and work in an empty environment outside the checkout."""
+"""The wheels build, and work in an empty environment outside the checkout."""
 
 import shutil
 import subprocess
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-WHEELS = ("cronos_lerobot", "lerobot_env_cronos", "lerobot_policy_pocketvla")
+WHEELS = ("cronos_lerobot", "lerobot_env_cronos", "lerobot_policy_openvla", "lerobot_policy_pocketvla")
 
 USE_THEM = """
 import numpy as np
@@ -18,11 +18,14 @@ from lerobot.utils.import_utils import register_third_party_plugins
 register_third_party_plugins()
 assert "cronos" in EnvConfig.get_known_choices()
 assert get_policy_class("pocketvla").__name__ == "PocketVLAPolicy"
+assert get_policy_class("openvla").__name__ == "OpenVLAPolicy"
 from lerobot_env_cronos import CronosVectorEnv
 env = CronosVectorEnv(2, obs_type="environment_state_agent_pos")
 env.reset(seed=0)
 env.step(np.zeros((2, 7)))
 import cronos_lerobot, cronos_lerobot.scripts.train
+from cronos_lerobot.hub.cards import PACKAGED
+assert (PACKAGED / "policy.md").is_file()
 print(cronos_lerobot.__file__)
 """
 
@@ -50,7 +53,8 @@ def test_every_distribution_has_a_wheel(wheels):
 def test_wheels_work_in_an_empty_environment(wheels, tmp_path):
     uv = find_uv()
     locked = subprocess.run(
-        [uv, "export", "--frozen", "--no-emit-workspace", "--no-dev", "--no-hashes", "-q"],
+        [uv, "export", "--frozen", "--no-emit-workspace", "--no-dev", "--no-hashes", "-q",
+         "--extra=openvla"],
         cwd=ROOT, check=True, capture_output=True, text=True,
     ).stdout  # fmt: skip
     (tmp_path / "locked.txt").write_text(locked)

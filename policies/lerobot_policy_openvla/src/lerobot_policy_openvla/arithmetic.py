@@ -1,7 +1,7 @@
 """Floating-point operations and bytes of an OpenVLA's acting and learning, by formula.
 
-A product of (n x a) with (a x b) counts 2 n a b operations. Attention is counted whole, as if it were not causal, and over all places of the cache.
-Norms, activations and softmaxes are left out: they are less than 1 %.
+A product of (n x a) with (a x b) counts 2 n a b operations. Attention is counted whole, as if it were not causal,
+and over all places of the cache. Norms, activations and softmaxes are left out: they are less than 1 %.
 """
 
 from __future__ import annotations
