@@ -28,7 +28,7 @@ def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1)
         raise ValueError(f"Reset-free training needs --env.type=cronos, got {name!r}.")
     options = env_config.gym_kwargs
     if options["num_threads"] == 0 and local_processes > 1:
-        options["num_threads"] = max(1, len(os.sched_getaffinity(0)) // local_processes)
+        options["num_threads"] = max(1, (os.cpu_count() or 1) // local_processes)
     return CronosVectorEnv(num_envs, scene=env_config.scene, reward=config.protocol.reward, **options)
 
 
