@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
+from lerobot_policy_pocketvla import discretised_normal as discretised_normal_module
+from lerobot_policy_pocketvla.discretised_normal import discretised_normal
 from lerobot_policy_pocketvla.heads import (
     BinDistribution,
     CategoricalHead,
@@ -147,3 +149,43 @@ def test_sigma_starts_where_asked_and_stays_in_its_range():
     low, middle, high = head.sigma().tolist()
     assert (low, high) == (pytest.approx(0.01), pytest.approx(0.9))
     assert middle == pytest.approx(math.sqrt(0.01 * 0.9))
+
+
+@pytest.mark.parametrize("temperature", [1.0, 0.6])
+def test_gradients_of_the_discretised_normal_are_those_of_finite_differences(temperature):
+    torch.manual_seed(0)
+    mean = torch.tensor([[-1.1, 0.1, 0.0], [0.9, -0.3, 1.2]], dtype=torch.float64, requires_grad=True)
+    sigma = torch.tensor([0.05, 0.2, 0.7], dtype=torch.float64, requires_grad=True)
+    tokens = torch.tensor([[0, 140, 3], [250, 99, 255]])
+    centres = bin_centres(256).double()
+
+    def function(mean, sigma):
+        return discretised_normal(mean, sigma, tokens, centres, temperature)
+
+    assert torch.autograd.gradcheck(function, (mean, sigma))
+
+
+@pytest.mark.parametrize("temperature", [1.0, 0.6, 0.0])
+@pytest.mark.parametrize("gripper_dim", [None, 1])
+def test_evaluating_bins_is_the_distribution_over_all_bins(gripper_dim, temperature, monkeypatch):
+    """Also where the rows do not fit into one chunk, and for a bin that the gripper never takes."""
+    monkeypatch.setattr(discretised_normal_module, "CHUNK_NUMBERS", 5 * 256)
+    torch.manual_seed(0)
+    head = gaussian_head(gripper_dim)
+    features = torch.randn(4, 3)
+    tokens = torch.tensor([[10, 0, 128], [255, 255, 0], [90, 255, 200], [127, 7, 255]])
+    if temperature == 0:
+        tokens[0] = head(features).argmax(-1)[0]
+    results = []
+    for evaluate in (
+        lambda: head.evaluate(features, tokens, temperature),
+        lambda: (BinDistribution(head(features)).log_prob(tokens, temperature),
+                 BinDistribution(head(features)).entropy(temperature)),
+    ):  # fmt: skip
+        head.zero_grad(set_to_none=True)
+        log_prob, entropy = evaluate()
+        if temperature:
+            (log_prob.mul(torch.arange(1.0, 5.0)).sum() + 10 * entropy.square().sum()).backward()
+        results.append((log_prob, entropy, *(p.grad for p in head.parameters())))
+    for fast, plain in zip(*results, strict=True):
+        torch.testing.assert_close(fast, plain, rtol=2e-5, atol=2e-5)

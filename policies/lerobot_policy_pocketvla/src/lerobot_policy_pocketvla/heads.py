@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-IMPOSSIBLE = -1e4
-"""Logit of a bin that the gripper never takes: finite, so that 0 * log(0) is 0 and not NaN."""
+from lerobot_policy_pocketvla.discretised_normal import IMPOSSIBLE, discretised_normal, two_points
 
 
 def bin_centres(num_bins: int) -> Tensor:
@@ -108,6 +107,11 @@ class CategoricalHead(nn.Module):
         """Features (B, F) to logits (B, D, bins)."""
         return self.project(features).unflatten(-1, self.shape)
 
+    def evaluate(self, features: Tensor, tokens: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
+        """`BinDistribution.log_prob` of bins (B, D) and `entropy`, each (B,)."""
+        distribution = BinDistribution(self(features))
+        return distribution.log_prob(tokens, temperature), distribution.entropy(temperature)
+
 
 class GaussianHead(nn.Module):
     """A predicted mean and one learned sigma per dimension generate the logits of the bins.
@@ -161,13 +165,36 @@ class GaussianHead(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Features (B, F) to logits (B, D, bins)."""
-        raw = self.project(features)
-        mean = self.mean_limit * torch.tanh(raw / self.mean_limit)
+        mean, gripper_logit = self._mean_and_gripper_logit(features)
         distance = (self.centres - mean.unsqueeze(-1)) / self.sigma().unsqueeze(-1)
         logits = -0.5 * distance.square()
         if self.gripper_dim is None:
             return logits
+        gripper = two_point_logits(gripper_logit, logits.shape[-1])
         dim = self.gripper_dim
-        limit = self.gripper_logit_limit
-        gripper = two_point_logits(limit * torch.tanh(raw[:, dim] / limit), logits.shape[-1])
         return torch.cat((logits[:, :dim], gripper[:, None], logits[:, dim + 1 :]), dim=1)
+
+    def evaluate(self, features: Tensor, tokens: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
+        """`BinDistribution.log_prob` of bins (B, D) and `entropy`, each (B,), at a fraction of the memory."""
+        if temperature == 0:
+            distribution = BinDistribution(self(features))
+            return distribution.log_prob(tokens, temperature), distribution.entropy(temperature)
+        mean, gripper_logit = self._mean_and_gripper_logit(features)
+        log_probs, entropies = discretised_normal(mean, self.sigma(), tokens, self.centres, temperature)
+        if self.gripper_dim is not None:
+            dim = self.gripper_dim
+            gripper = two_points(gripper_logit, tokens[:, dim], len(self.centres), temperature)
+            log_probs, entropies = (
+                torch.cat((normal[:, :dim], point[:, None], normal[:, dim + 1 :]), dim=1)
+                for normal, point in zip((log_probs, entropies), gripper, strict=True)
+            )
+        return log_probs.sum(-1), entropies.mean(-1)
+
+    def _mean_and_gripper_logit(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Means (B, D), of which the gripper's is not used, and the gripper's logit (B,): 0 without a gripper."""
+        raw = self.project(features)
+        mean = self.mean_limit * torch.tanh(raw / self.mean_limit)
+        if self.gripper_dim is None:
+            return mean, raw.new_zeros(len(raw))
+        limit = self.gripper_logit_limit
+        return mean, limit * torch.tanh(raw[:, self.gripper_dim] / limit)

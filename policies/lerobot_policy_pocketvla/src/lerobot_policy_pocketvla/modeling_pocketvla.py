@@ -261,12 +261,8 @@ class PocketVLAPolicy(PreTrainedPolicy):
         """
         with self._full_precision():
             features = self._features(batch)
-            distribution = BinDistribution(self.head(features))
-            return {
-                "log_prob": distribution.log_prob(tokens, temperature),
-                "entropy": distribution.entropy(temperature),
-                "value": self._values(batch, features),
-            }
+            log_prob, entropy = self.head.evaluate(features, tokens, temperature)
+            return {"log_prob": log_prob, "entropy": entropy, "value": self._values(batch, features)}
 
     def predict_values(self, batch: Batch) -> Tensor:
         """Values of the observations, (B,), differentiable."""

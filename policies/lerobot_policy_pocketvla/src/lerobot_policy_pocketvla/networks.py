@@ -1,5 +1,7 @@
 """The networks: text encoder, image encoder, and the trunk that the task modulates."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
@@ -10,6 +12,21 @@ from lerobot_policy_pocketvla.tokenizer import token_ids
 STATE_LIMIT = 10.0
 """Normalised states are clipped to this many standard deviations: a dimension that hardly moved in the
 demonstrations must not drown all others when it does move."""
+
+
+@dataclass(frozen=True)
+class TaskEmbedding:
+    """The embeddings of B instructions, few of them different: what depends on them alone is computed once."""
+
+    unique: Tensor
+    """(U, width), one for each different instruction."""
+    rows: Tensor
+    """(B,) int64, which of them is whose."""
+
+    def spread(self, of_unique: Tensor) -> Tensor:
+        """What was computed for the different instructions, (U, features), for each of the B, (B, features)."""
+        # Not of_unique[rows], whose gradient is several times slower.
+        return F.embedding(self.rows, of_unique)
 
 
 class TextEncoder(nn.Module):
@@ -34,8 +51,8 @@ class TextEncoder(nn.Module):
             nn.LayerNorm(width),
         )
 
-    def forward(self, texts: list[str]) -> Tensor:
-        """Encode B instructions, shape (B, width); each different one is encoded once."""
+    def forward(self, texts: list[str]) -> TaskEmbedding:
+        """Encode B instructions; each different one is encoded once."""
         index: dict[str, int] = {}
         rows = [index.setdefault(text, len(index)) for text in texts]
         tokens = [token_ids(text, self.vocabulary_size) for text in index]
@@ -43,7 +60,7 @@ class TextEncoder(nn.Module):
         padded = [ids + (0,) * (longest - len(ids)) for ids in tokens]
         device = self.embedding.weight.device
         unique = self.mlp(self.embedding(torch.tensor(padded, device=device)))
-        return unique[torch.tensor(rows, device=device)]
+        return TaskEmbedding(unique, torch.tensor(rows, device=device))
 
 
 class Film(nn.Module):
@@ -56,9 +73,9 @@ class Film(nn.Module):
         nn.init.zeros_(self.project.weight)
         nn.init.zeros_(self.project.bias)
 
-    def forward(self, x: Tensor, task: Tensor) -> Tensor:
-        """Scale and shift x, (B, features) or (B, features, H, W), by the task (B, task_width)."""
-        scale, shift = self.project(task).chunk(2, dim=-1)
+    def forward(self, x: Tensor, task: TaskEmbedding) -> Tensor:
+        """Scale and shift x, (B, features) or (B, features, H, W), by the task."""
+        scale, shift = (task.spread(part) for part in self.project(task.unique).chunk(2, dim=-1))
         if x.ndim == 4:
             scale, shift = scale[..., None, None], shift[..., None, None]
         return x * (1.0 + scale.to(x.dtype)) + shift.to(x.dtype)
@@ -82,9 +99,9 @@ class FilmMLP(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in sizes)
         self.films = nn.ModuleList(Film(task_width, width) for _ in sizes)
 
-    def forward(self, x: Tensor, task: Tensor) -> Tensor:
-        """Map x (B, inputs) under the task (B, task_width) to (B, width)."""
-        x = torch.cat((x, task), dim=-1)
+    def forward(self, x: Tensor, task: TaskEmbedding) -> Tensor:
+        """Map x (B, inputs) under the task to (B, width)."""
+        x = torch.cat((x, task.spread(task.unique)), dim=-1)
         for layer, (linear, norm, film) in enumerate(zip(self.linears, self.norms, self.films, strict=True)):
             hidden = F.silu(film(norm(linear(x)), task))
             x = hidden if layer == 0 else x + hidden
@@ -118,8 +135,8 @@ class ImageEncoder(nn.Module):
         self.to_pooled = nn.Conv2d(64, self.POOLED_CHANNELS, 1)
         self.width = 2 * keypoints + self.POOLED_CHANNELS * self.POOLED_SIZE**2
 
-    def forward(self, images: Tensor, task: Tensor) -> Tensor:
-        """Images (B, 3, H, W), uint8 or in [0, 1], under tasks (B, task_width) to (B, width)."""
+    def forward(self, images: Tensor, task: TaskEmbedding) -> Tensor:
+        """Images (B, 3, H, W), uint8 or in [0, 1], under their tasks to (B, width)."""
         dtype = torch.bfloat16 if self.use_bfloat16 else torch.float32
         x = to_signed_unit_range(images, dtype).contiguous(memory_format=torch.channels_last)
         with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=self.use_bfloat16):
