@@ -4,8 +4,8 @@
 
 A small `cronos-train` run from pixels records all its streams, and one of them filmed. Its process gets SIGKILL
 at a random moment, the start-up included. Then both datasets must load in a plain LeRobotDataset and hold each
-segment that was complete by the last flush, once and whole. The run is resumed from its last checkpoint, and so on;
-in the end the recordings must be those of a run that was never killed.
+segment that was complete by the last flush, once and whole. The run is resumed from its last checkpoint, and so
+on. In the end the recordings must be those of a run that was never killed.
 """
 
 from __future__ import annotations
@@ -18,9 +18,11 @@ import os
 import random
 import shutil
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, cast
 
@@ -99,6 +101,7 @@ def train_until_killed(folder: Path, steps: int) -> None:
     from cronos_lerobot.scripts.train import train
 
     _write_to(folder / "run.log")
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     register_third_party_plugins()
     keep_journal(folder / "journal.jsonl")
@@ -183,7 +186,8 @@ class KillTest:
         self._seen: dict[tuple[str, Key], set[str]] = {}
         # Imports cost seconds: a server does them once and forks.
         self._processes = multiprocessing.get_context("forkserver")
-        self._processes.set_forkserver_preload([__name__, "cronos_lerobot.scripts.train"])
+        plugins = [d.name for d in distributions() if d.name.startswith("lerobot_policy_")]
+        self._processes.set_forkserver_preload([__name__, "cronos_lerobot.scripts.train", *plugins])
 
     def run(self, kills: int) -> Tally:
         """Kill, check and resume, then compare with a run that was never killed.
@@ -300,6 +304,13 @@ class KillTest:
             for (recording, key), digests in self._seen.items():
                 if recording == name and digests != {unbroken[key]}:
                     raise KillTestError(f"{name}: segment {key} was not always what an unbroken run records")
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _write_to(log: Path) -> None:

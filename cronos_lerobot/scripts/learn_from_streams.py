@@ -2,10 +2,10 @@
 
     python -m cronos_lerobot.scripts.learn_from_streams --output_dir=outputs/learn_from_streams
 
-For each seed: the base policy learns in recorded streams with few scene resets, `cronos-streams filter` keeps the
-segments in which it brought its task about (not those whose task it found complete), and a new policy of the same
-kind is cloned from these alone, with the base's own recipe. `lerobot-eval` evaluates the base and the clones. All
-commands are shown before they run; the same command again goes on where this one was stopped.
+The base policy learns in 64 recorded streams with few scene resets, and `cronos-streams filter` keeps the segments in
+which it brought its task about (not those whose task it found complete). For each seed, a new policy of the same kind
+is cloned from these alone, with the base's own recipe. `lerobot-eval` evaluates the base and the clones. All commands
+are shown before they run; the same command again goes on where this one was stopped.
 """
 
 from __future__ import annotations
@@ -34,32 +34,31 @@ CHECKPOINT = "checkpoints/last/pretrained_model"
 
 def make_steps(scale: Scale, seeds: Sequence[int], folder: Path) -> list[Step]:
     """The study as steps; their outputs lie in `folder`."""
-    base = folder / "base"
+    base, run, data = (folder / name for name in ("base", "run", "successes"))
     steps = [record_step(scale, folder / "demos"), clone_step(scale, folder / "demos", base)]
-    steps += [eval_step(scale, base / CHECKPOINT, "base", split, folder / "eval") for split in SPLITS]
-    for seed in seeds:
-        run, data, clone = (folder / f"{name}_{seed}" for name in ("run", "successes", "clone"))
-        steps += [_train(scale, base / CHECKPOINT, run, seed), _filter(run / "streams", data, seed)]
-        steps.append(_clone(scale, data, clone, seed))
-        steps += [
-            eval_step(scale, clone / CHECKPOINT, f"clone_{seed}", split, folder / "eval") for split in SPLITS
-        ]
-    return steps
+    steps += [_train(scale, base / CHECKPOINT, run), _filter(run / "streams", data)]
+    steps += [_clone(scale, data, folder / f"clone_{seed}", seed) for seed in seeds]
+    policies = {"base": base} | {f"clone_{seed}": folder / f"clone_{seed}" for seed in seeds}
+    return steps + [
+        eval_step(scale, policy / CHECKPOINT, name, split, folder / "eval")
+        for name, policy in policies.items()
+        for split in SPLITS
+    ]
 
 
-def _train(scale: Scale, base: Path, run: Path, seed: int) -> Step:
+def _train(scale: Scale, base: Path, run: Path) -> Step:
     step = train_step(scale, base, run)
-    changed = {"--seed": seed, "--record.streams": "all", "--record.repo_id": STREAMS, "--eval_freq": 0}
-    return replace(step, name=f"run_{seed}", command=_with(step.command, changed))
+    changed = {"--record.streams": "all", "--record.repo_id": STREAMS, "--eval_freq": 0}
+    return replace(step, command=_with(step.command, changed))
 
 
-def _filter(streams: Path, output: Path, seed: int) -> Step:
+def _filter(streams: Path, output: Path) -> Step:
     command = [
         "cronos-streams", "filter", f"--dataset.repo_id={STREAMS}", f"--dataset.root={streams}",
         "--filter.success=true", "--filter.found_complete=false", "--frames_after_success=8",
         f"--output.repo_id={SUCCESSES}", f"--output.root={output}",
     ]  # fmt: skip
-    return Step(f"filter_{seed}", "The segments in which the policy did its task", command, output)
+    return Step("filter", "The segments in which the policy did its task", command, output)
 
 
 def _clone(scale: Scale, data: Path, output: Path, seed: int) -> Step:
@@ -98,7 +97,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/learn_from_streams"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--steps", type=int, default=153_600, help="interaction steps of each recorded run")
+    parser.add_argument("--steps", type=int, default=81_920, help="interaction steps of the recorded run")
     parser.add_argument("--scale", choices=SCALES, default="full", help="smoke learns nothing")
     args = parser.parse_args()
     scale = SCALES[args.scale] if args.scale == "smoke" else replace(SCALES["full"], train_steps=args.steps)
@@ -109,8 +108,7 @@ def main() -> None:
     except StepFailedError as error:
         sys.exit(f"error: {error}\nrun the same command again to go on from here")
     Console(width=None if sys.stdout.isatty() else 120).print(make_table(scale, args.seeds, args.output_dir))
-    for seed in args.seeds:
-        print((args.output_dir / f"successes_{seed}" / PROVENANCE).read_text())
+    print((args.output_dir / "successes" / PROVENANCE).read_text())
 
 
 if __name__ == "__main__":
