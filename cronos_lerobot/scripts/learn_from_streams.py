@@ -2,10 +2,10 @@
 
     python -m cronos_lerobot.scripts.learn_from_streams --output_dir=outputs/learn_from_streams
 
-The base policy learns in 64 recorded streams with few scene resets, and `cronos-streams filter` keeps the segments in
-which it brought its task about (not those whose task it found complete). For each seed, a new policy of the same kind
-is cloned from these alone, with the base's own recipe. `lerobot-eval` evaluates the base and the clones. All commands
-are shown before they run; the same command again goes on where this one was stopped.
+The base policy learns in 64 recorded streams with few scene resets, and `cronos-streams filter` keeps the segments
+in which it brought its task about (not those whose task it found complete). For each seed, a new policy of the same
+kind is cloned from these alone, with the base's own recipe. `lerobot-eval` evaluates the base and the clones. All
+commands are shown before they run; the same command again goes on where this one was stopped.
 """
 
 from __future__ import annotations
@@ -35,15 +35,16 @@ CHECKPOINT = "checkpoints/last/pretrained_model"
 def make_steps(scale: Scale, seeds: Sequence[int], folder: Path) -> list[Step]:
     """The study as steps; their outputs lie in `folder`."""
     base, run, data = (folder / name for name in ("base", "run", "successes"))
+
+    def evaluate(name: str, policy: Path) -> list[Step]:
+        return [eval_step(scale, policy / CHECKPOINT, name, split, folder / "eval") for split in SPLITS]
+
     steps = [record_step(scale, folder / "demos"), clone_step(scale, folder / "demos", base)]
-    steps += [_train(scale, base / CHECKPOINT, run), _filter(run / "streams", data)]
-    steps += [_clone(scale, data, folder / f"clone_{seed}", seed) for seed in seeds]
-    policies = {"base": base} | {f"clone_{seed}": folder / f"clone_{seed}" for seed in seeds}
-    return steps + [
-        eval_step(scale, policy / CHECKPOINT, name, split, folder / "eval")
-        for name, policy in policies.items()
-        for split in SPLITS
-    ]
+    steps += [*evaluate("base", base), _train(scale, base / CHECKPOINT, run), _filter(run / "streams", data)]
+    for seed in seeds:
+        clone = folder / f"clone_{seed}"
+        steps += [_clone(scale, data, clone, seed), *evaluate(clone.name, clone)]
+    return steps
 
 
 def _train(scale: Scale, base: Path, run: Path) -> Step:
@@ -97,7 +98,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/learn_from_streams"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--steps", type=int, default=81_920, help="interaction steps of the recorded run")
+    parser.add_argument("--steps", type=int, default=153_600, help="interaction steps of the recorded run")
     parser.add_argument("--scale", choices=SCALES, default="full", help="smoke learns nothing")
     args = parser.parse_args()
     scale = SCALES[args.scale] if args.scale == "smoke" else replace(SCALES["full"], train_steps=args.steps)
