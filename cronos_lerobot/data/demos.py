@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, REWARD
 from lerobot_env_cronos import CronosVectorEnv, Task
-from lerobot_env_cronos.configurations import NUM_CONFIGURATIONS, sample_configuration
+from lerobot_env_cronos.configurations import sample_configuration
 from lerobot_env_cronos.simulation import ACTION_HIGH, ACTION_LOW
 
 from cronos_lerobot.data.perturbations import (
@@ -217,7 +217,7 @@ class DemoCollector:
 
     def _new_episode(self, stream: int, task: Task) -> _Episode:
         rng = np.random.default_rng((*self._seed, self._started))
-        number = self._tried[task] % NUM_CONFIGURATIONS
+        number = self._tried[task] % len(self.env.benchmark.configurations["train"])
         self._tried[task] += 1
         self._started += 1
         start, ids = self.config.start, np.array([stream])

@@ -352,6 +352,8 @@ class Handler(BaseHTTPRequestHandler):
         file = commit.files.get(path)
         if file is None:
             raise HubError(404, "EntryNotFound", f"{path} does not exist")
+        if self.hub.faults.drop_downloads:
+            raise DroppedError
         headers = {
             "ETag": f'"{file.etag}"',
             "X-Repo-Commit": commit.oid,

@@ -195,6 +195,17 @@ def test_a_refused_token(hub, commands):
     assert f"the token may not write to dataset me/bench on {hub.url}" in refused.output
 
 
+def test_a_benchmark_that_cannot_be_loaded(hub, bench, commands):
+    commands.forget()
+    show = ("cronos-eval", "--expert=true", "--env.benchmark=me/bench")
+    hub.faults.drop_downloads = True
+    lost = commands.try_(*show, impatient=True)
+    assert re.search(r"error: .*(lost the connection to|cannot reach) the Hub .*benchmark 'me/bench'", lost.output)
+    hub.faults.drop_downloads, hub.faults.refuse_tokens = False, True
+    refused = commands.try_(*show)
+    assert "error: the Hub refused to give out benchmark 'me/bench': Client error '401" in refused.output
+
+
 def test_missing_repositories_and_revisions(hub, bench, evaluation, commands):
     results = ("cronos-publish", "results", f"--results={evaluation}")
     assert f"there is no model me/nobody on {hub.url}" in commands.try_(*results, "--repo_id=me/nobody").output

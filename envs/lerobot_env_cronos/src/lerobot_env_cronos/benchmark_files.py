@@ -116,6 +116,7 @@ def fetch_benchmark(name: str) -> tuple[Path, str]:
     Raises:
         BenchmarkError: no such folder, repository or revision, or the Hub cannot be reached.
     """
+    import httpx
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import (
         HfHubHTTPError,
@@ -143,6 +144,9 @@ def fetch_benchmark(name: str) -> tuple[Path, str]:
         raise BenchmarkError(f"cannot reach the Hub for benchmark {name!r}, and it is not in the cache") from error
     except HfHubHTTPError as error:
         raise BenchmarkError(f"the Hub refused to give out benchmark {name!r}: {error}") from error
+    except httpx.TransportError as error:
+        why = f"lost the connection to the Hub ({type(error).__name__})"
+        raise BenchmarkError(f"{why} while loading benchmark {name!r}: try again") from error
     return folder, f"{repo_id}@{folder.name}"
 
 
