@@ -141,7 +141,8 @@ def read_segments(root: Path, known: Collection[str] = ()) -> dict[Key, str]:
     """
     if not (root / INFO_PATH).is_file() or not json.loads((root / INFO_PATH).read_text())["total_episodes"]:
         return {}
-    dataset = LeRobotDataset(REPO_ID, root=root)
+    # TorchCodec's decoders are kept by path in this process; a resumed run puts other videos there.
+    dataset = LeRobotDataset(REPO_ID, root=root, video_backend="pyav")
     try:
         StreamDataset(REPO_ID, root, streaming=True).check()
     except ValueError as error:

@@ -3,7 +3,7 @@
     python -m cronos_lerobot.scripts.learn_from_streams --output_dir=outputs/learn_from_streams
 
 The base policy learns in 64 recorded streams with few scene resets, and `cronos-streams filter` keeps the segments
-in which it brought its task about (not those whose task it found complete). For each seed, a new policy of the same
+in which it brought its task about (not those whose task it found complete). For each seed a new policy of its
 kind is cloned from these alone, with the base's own recipe. `lerobot-eval` evaluates the base and the clones. All
 commands are shown before they run; the same command again goes on where this one was stopped.
 """
