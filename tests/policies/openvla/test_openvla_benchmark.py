@@ -79,11 +79,12 @@ def test_the_published_size():
 
 def test_the_command(tmp_path, capsys):
     output = tmp_path / "numbers.json"
-    main(["--size=tiny", "--device=cpu", "--streams=2", "--seconds=0", "--dtype=float32", f"--output={output}"])
+    main(["--size=tiny", "--device=cpu", "--streams=2", "--seconds=0", "--dtype=bfloat16", f"--output={output}"])
     printed = capsys.readouterr().out
     assert "H100" in printed
     assert "minibatches of 8" in printed
     result = json.loads(output.read_text())
     assert report(result) + "\n" == printed
     assert result["rollout_s"]["whole"] > 0
-    assert result["memory_bytes"]["weights"] == 4 * result["parameters"]
+    # bfloat16, but for what is trained.
+    assert result["memory_bytes"]["weights"] == 2 * result["parameters"] + 2 * result["trained"]

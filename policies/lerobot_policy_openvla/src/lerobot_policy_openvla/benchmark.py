@@ -1,7 +1,7 @@
 """Memory and speed of OpenVLA's acting and learning with random weights, and what an H100 could do at best.
 
     python -m lerobot_policy_openvla.benchmark --size=7b               # on one GPU with 40 GB or more
-    python -m lerobot_policy_openvla.benchmark --size=7b_half --streams=2 --minibatch_size=2 --seconds=0
+    python -m lerobot_policy_openvla.benchmark --size=7b --layers=4 --streams=2 --minibatch_size=2    # on a CPU
     python -m lerobot_policy_openvla.benchmark --size=7b --formulas    # only counts
 
 It prints the rates of the rollout and of the update, where their time goes, what each of four measures is worth
@@ -41,11 +41,10 @@ CAMERA = "observation.images.front"
 ACTION_TOKENS = 7
 SIZES: dict[str, dict[str, Any]] = {
     "7b": {},
-    "7b_half": {"num_hidden_layers": 16},
     "1b": {"hidden_size": 2048, "intermediate_size": 5504, "num_hidden_layers": 12, "num_attention_heads": 16},
     "tiny": {"hidden_size": 128, "intermediate_size": 256, "num_hidden_layers": 4, "num_attention_heads": 4},
 }
-"""Llama's sizes; `7b_half` has half of its layers. The towers are the published ones but for `tiny`."""
+"""Llama's sizes; the vision towers are the published ones but for `tiny`."""
 
 
 class FixedPrompt:
@@ -59,17 +58,20 @@ class FixedPrompt:
         return self._ids
 
 
-def architecture_of_size(size: str) -> Architecture:
-    """Return the published architecture, or it with another Llama."""
+def architecture_of_size(size: str, layers: int | None = None) -> Architecture:
+    """Return the published architecture, or it with another Llama or with another number of Llama's layers."""
     towers = ("vit_large_patch14_reg4_dinov2.lvd142m", "vit_so400m_patch14_siglip_224")
     tiny = size == "tiny"
+    text_config = {"vocab_size": 32064, "pad_token_id": 32000} | SIZES[size]
+    if layers is not None:
+        text_config["num_hidden_layers"] = layers
     return Architecture(
         timm_model_ids=("test_vit2", "test_vit3") if tiny else towers,
         act_layers=(None, None),
         image_size=64 if tiny else 224,
         image_means=(IMAGENET_MEAN, HALF),
         image_stds=(IMAGENET_STD, HALF),
-        text_config={"vocab_size": 32064, "pad_token_id": 32000} | SIZES[size],
+        text_config=text_config,
         n_action_bins=256,
         pad_to_multiple_of=64,
     )
@@ -83,7 +85,7 @@ def random_network(architecture: Architecture, config: OpenVLAConfig) -> OpenVLA
         value = torch.empty(parameter.shape, dtype=dtype, device=device)
         is_scale = parameter.ndim == 1 and name.endswith("weight")
         value = value.fill_(1.0) if is_scale else value.normal_(std=0.02)
-        set_module_tensor_to_device(network, name, device, value)
+        set_module_tensor_to_device(network, name, device, value, dtype=dtype)
     return network.to(device).eval()
 
 
@@ -98,7 +100,7 @@ def policy_config(args: argparse.Namespace) -> OpenVLAConfig:
         gradient_checkpointing=args.gradient_checkpointing,
         attention=args.attention,
         quantization=args.quantization,
-        architecture=architecture_of_size(args.size).to_dict(),
+        architecture=architecture_of_size(args.size, args.layers).to_dict(),
         action_statistics={"q01": [-1.0] * ACTION_TOKENS, "q99": [1.0] * ACTION_TOKENS, "mask": [True] * 7},
         input_features={CAMERA: PolicyFeature(FeatureType.VISUAL, (3, 224, 224))},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (ACTION_TOKENS,))},
@@ -108,7 +110,7 @@ def policy_config(args: argparse.Namespace) -> OpenVLAConfig:
 def random_policy(args: argparse.Namespace) -> OpenVLAPolicy:
     """Return a policy of random weights."""
     config = policy_config(args)
-    network = random_network(architecture_of_size(args.size), config)
+    network = random_network(architecture_of_size(args.size, args.layers), config)
     finish_network(network, config)
     return OpenVLAPolicy(config, parts=(network, FixedPrompt(args.prompt_tokens))).eval()
 
@@ -278,7 +280,7 @@ def arithmetic(network: OpenVLANetwork, args: argparse.Namespace) -> dict[str, f
 def count(args: argparse.Namespace) -> dict[str, Any]:
     """Only the formulas, of a network that takes no memory."""
     config = policy_config(args)
-    network = empty_network(architecture_of_size(args.size), args.attention).to(resolve_dtype(config))
+    network = empty_network(architecture_of_size(args.size, args.layers), args.attention).to(resolve_dtype(config))
     finish_network(network, config)
     return arithmetic(network, args)
 
@@ -332,6 +334,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     cuda = torch.cuda.is_available()
     parser.add_argument("--size", choices=SIZES, default="7b" if cuda else "tiny")
+    parser.add_argument("--layers", type=int, help="of Llama, in place of the size's: the time is linear in them")
     parser.add_argument("--device", default="cuda" if cuda else "cpu")
     parser.add_argument("--dtype", choices=["auto", "bfloat16", "float32"], default="bfloat16")
     parser.add_argument("--streams", type=int, default=64)

@@ -43,9 +43,11 @@ def _quantized(library: Any, layer: nn.Linear, kind: str) -> nn.Module:
     sizes: tuple[int, int] = (layer.in_features, layer.out_features)
     weight, dtype = layer.weight.detach(), layer.weight.dtype
     if kind == "int8":
-        new = library.nn.Linear8bitLt(*sizes, bias=False, has_fp16_weights=False)
+        with torch.device("meta"):
+            new = library.nn.Linear8bitLt(*sizes, bias=False, has_fp16_weights=False)
         new.weight = library.nn.Int8Params(weight, requires_grad=False, has_fp16_weights=False)
     else:
-        new = library.nn.Linear4bit(*sizes, bias=False, compute_dtype=dtype, quant_type="nf4")
+        with torch.device("meta"):
+            new = library.nn.Linear4bit(*sizes, bias=False, compute_dtype=dtype, quant_type="nf4")
         new.weight = library.nn.Params4bit(weight, requires_grad=False, quant_type="nf4")
     return new
