@@ -60,6 +60,10 @@ class Processes:
         """All processes' arrays, of one shape and type, joined along `axis` in the order of the ranks."""
         return array
 
+    def collect(self, array: np.ndarray) -> np.ndarray:
+        """All processes' arrays, joined along axis 0, in the first process; its own in every other."""
+        return array
+
     def gather(self, value: Any) -> list[Any]:
         """All processes' values, in the order of the ranks."""
         return [value]
@@ -100,11 +104,17 @@ class LaunchedProcesses(Processes):
 
     def concatenate(self, array: np.ndarray, axis: int = 0) -> np.ndarray:
         """All processes' arrays, of one shape and type, joined along `axis` in the order of the ranks."""
-        array = np.ascontiguousarray(array)
-        own = torch.from_numpy(array.reshape(-1).view(np.uint8))
+        own = _to_bytes(array)
         parts = [torch.empty_like(own) for _ in range(self.count)]
         dist.all_gather(parts, own, group=self._control)
-        return np.concatenate([part.numpy().view(array.dtype).reshape(array.shape) for part in parts], axis=axis)
+        return np.concatenate([_from_bytes(part, array) for part in parts], axis=axis)
+
+    def collect(self, array: np.ndarray) -> np.ndarray:
+        """All processes' arrays, joined along axis 0, in the first process; its own in every other."""
+        own = _to_bytes(array)
+        parts = [torch.empty_like(own) for _ in range(self.count)] if self.is_main else None
+        dist.gather(own, parts, dst=0, group=self._control)
+        return array if parts is None else np.concatenate([_from_bytes(part, array) for part in parts])
 
     def gather(self, value: Any) -> list[Any]:
         """All processes' values, in the order of the ranks."""
@@ -181,6 +191,14 @@ def bit_sum(tensors: Iterable[Tensor]) -> int:
     as_int = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
     sums = [t.detach().contiguous().view(as_int[t.element_size()]).sum(dtype=torch.int64) for t in tensors]
     return int(torch.stack(sums).sum())
+
+
+def _to_bytes(array: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+
+
+def _from_bytes(tensor: Tensor, template: np.ndarray) -> np.ndarray:
+    return tensor.numpy().view(template.dtype).reshape(template.shape)
 
 
 def _buckets(tensors: Iterable[Tensor]) -> Iterator[list[Tensor]]:

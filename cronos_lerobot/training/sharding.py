@@ -163,13 +163,13 @@ class ShardedAgent:
 
 
 def whole_step(step: Step, processes: Processes) -> Step:
-    """Return `step` with the observations and actions of all N streams, to be recorded by the first process.
+    """Return `step` with the observations and actions of all N streams in the first process, which records it.
 
     Films are that process's own.
     """
-    action = ActionSample(**{name: processes.concatenate(array) for name, array in vars(step.action).items()})
+    action = ActionSample(**{name: processes.collect(array) for name, array in vars(step.action).items()})
     seen = {name: value for name, value in step.observation.items() if name != FILM}
-    observation = step.observation | _map_arrays(seen, processes.concatenate)
+    observation = step.observation | _map_arrays(seen, processes.collect)
     return replace(step, observation=observation, action=action)
 
 

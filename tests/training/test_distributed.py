@@ -260,10 +260,12 @@ def test_exchange_keeps_types_and_order():
             processes.concatenate(mine).tolist(),
             processes.concatenate(mine > 10, axis=1).tolist(),
             processes.broadcast({"rank": processes.rank}, source=1),
+            processes.collect(mine).tolist(),
         )
 
     rows, flags = [[0, 1], [2, 3], [10, 11], [12, 13]], [[False, False, False, True], [False, False, True, True]]
-    assert together(exchange) == [(rows, flags, {"rank": 1})] * 2
+    everywhere = (rows, flags, {"rank": 1})
+    assert together(exchange) == [(*everywhere, rows), (*everywhere, rows[2:])]
 
 
 def test_bits_tell_weights_apart():
