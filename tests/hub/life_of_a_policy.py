@@ -44,7 +44,7 @@ class Act:
 
 
 STORY = (
-    Act("A benchmark of one's own: new layouts and chains of the kitchen, published",
+    Act("A benchmark of one's own, new layouts and chains of the kitchen",
         "cronos-publish benchmark --repo_id=USER/kitchen_small --scene=kitchen_2x2"
         " --seed=7 --num_configurations=16 --num_orderings=3"),
     Act("Anyone loads it in a line",
@@ -75,7 +75,7 @@ print(chains.num_rows, chains[20])
         "cronos-eval --policy.path=USER/kitchen_eer --env.benchmark=USER/kitchen_small --eval.videos=0"
         " --output_dir=outputs/eval", lines=24),
     Act("", "cronos-publish results --results=outputs/eval --repo_id=USER/kitchen_eer"),
-    Act("Elsewhere, with nothing but the Hub: the streams in order",
+    Act("Elsewhere, with nothing but the Hub, the streams in order",
         """python -c '
 from cronos_lerobot.data.streams import StreamDataset
 streams = StreamDataset("USER/kitchen_stream")
@@ -86,8 +86,8 @@ for segment in streams.segments_of(0)[:4]:
     Act("The results", """python -c '
 from huggingface_hub import hf_hub_download
 print(open(hf_hub_download("USER/kitchen_eer", ".eval_results/cronos.yaml")).read())
-'""", lines=9, elsewhere=True),
-    Act("And the policy on the benchmark's chains, with LeRobot's own command",
+'""", lines=8, elsewhere=True),
+    Act("And the policy on the benchmark's chains, with LeRobot's own command, which samples its actions anew",
         f"lerobot-eval --policy.path=USER/kitchen_eer --policy.device=cpu --env.type=cronos {STATE}"
         " --env.benchmark=USER/kitchen_small --env.suite=sequential --env.split=held_out --eval.n_episodes=16"
         " --eval.batch_size=16 --output_dir=outputs/again", lines=0, elsewhere=True),
