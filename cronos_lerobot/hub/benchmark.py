@@ -31,14 +31,19 @@ def choose_benchmark(config: BenchmarkConfig) -> Benchmark:
     Raises:
         ValueError: it cannot be loaded or drawn.
     """
-    if config.benchmark is not None and config.seed is not None:
-        raise ValueError("--benchmark publishes one that is there, --seed draws a new one: choose")
+    sizes = {name: getattr(config, name) for name in ("num_configurations", "num_orderings", "chain_length")}
+    given = {name: value for name, value in sizes.items() if value is not None}
+    if config.seed is not None:
+        if config.benchmark is not None:
+            raise ValueError("--benchmark publishes one that is there, --seed draws a new one: choose")
+        return draw_benchmark(config.scene or DEFAULT_SCENE, config.seed, **given)
+    if given:
+        raise ValueError(
+            f"{', '.join(f'--{name}' for name in given)}: of a benchmark that is drawn; give a --seed"
+        )
     if config.benchmark is not None:
         return load_benchmark(config.benchmark, config.scene or benchmark_scene(config.benchmark))
-    scene = config.scene or DEFAULT_SCENE
-    if config.seed is None:
-        return load_benchmark(None, scene)
-    return draw_benchmark(scene, config.seed, config.num_configurations, config.num_orderings, config.chain_length)
+    return load_benchmark(None, config.scene or DEFAULT_SCENE)
 
 
 def write_benchmark_repository(config: BenchmarkConfig, folder: Path) -> str:

@@ -69,10 +69,10 @@ class BenchmarkConfig(PublishConfig):
     """Publish this one: a folder, or <owner>/<repository>[@<revision>]; see docs/hub.md for the files."""
     seed: int | None = None
     """Draw new configurations and orderings from this seed."""
-    num_configurations: int = 64
-    """With --seed: configurations of each split."""
-    num_orderings: int = 10
-    """With --seed: orderings, each from every configuration."""
+    num_configurations: int | None = None
+    """With --seed: configurations of each split; null for 64."""
+    num_orderings: int | None = None
+    """With --seed: orderings, each from every configuration; null for 10."""
     chain_length: int | None = None
     """With --seed: tasks of a chain; null for all of the scene."""
     title: str = ""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from huggingface_hub import constants
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 
@@ -71,6 +72,7 @@ def run_facts(run: TrainingRun) -> dict[str, Any]:
         "scene": env["scene"],
         "env": env,
         "observation": describe_observation(env),
+        "configurations": _describe_configurations(env.get("benchmark"), protocol),
         "protocol": protocol,
         "protocol_name": describe_protocol(protocol),
         "algorithm": config["algorithm"]["type"],
@@ -86,6 +88,17 @@ def run_facts(run: TrainingRun) -> dict[str, Any]:
         "command": command_line(run.starts[0]["command"]),
         "num_starts": len(run.starts),
     }
+
+
+def _describe_configurations(benchmark: str | None, protocol: dict[str, Any]) -> str:
+    """Where scene resets put the bodies, in words."""
+    source = "the package"
+    if benchmark is not None:
+        name = benchmark.partition("@")[0]
+        source = (
+            f"[{benchmark}]({constants.ENDPOINT}/datasets/{name})" if is_repository(name) else "a local benchmark"
+        )
+    return f"{protocol['num_configurations']} training configurations of {source}"
 
 
 def _by_kind(counts: dict[str, int]) -> list[tuple[str, int, str]]:

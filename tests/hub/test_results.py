@@ -5,7 +5,8 @@ from lerobot_env_cronos.benchmark import draw_benchmark
 from lerobot_env_cronos.scenes import Task
 
 from cronos_lerobot.evaluation.results import independent_results, sequential_results
-from cronos_lerobot.hub.config import PublishConfig, ResultsConfig
+from cronos_lerobot.hub.benchmark import choose_benchmark
+from cronos_lerobot.hub.config import BenchmarkConfig, PublishConfig, ResultsConfig
 from cronos_lerobot.hub.results import make_entries, merge
 from cronos_lerobot.hub.runs import find_checkpoint, is_repository
 
@@ -90,6 +91,16 @@ def test_merging_replaces_only_the_same_benchmark_and_task():
 def test_flags_that_do_not_fit(flags, message):
     with pytest.raises(ValueError, match=message):
         PublishConfig(**flags).validate()
+
+
+def test_a_benchmark_is_drawn_or_loaded_or_the_packages():
+    drawn = choose_benchmark(BenchmarkConfig(seed=0, num_configurations=2, num_orderings=2, chain_length=2))
+    assert drawn.fingerprint == BENCHMARK.fingerprint
+    assert choose_benchmark(BenchmarkConfig(scene="playroom_2x2")).size("sequential", "train") == 640
+    with pytest.raises(ValueError, match="--num_orderings: of a benchmark that is drawn; give a --seed"):
+        choose_benchmark(BenchmarkConfig(num_orderings=2))
+    with pytest.raises(ValueError, match="choose"):
+        choose_benchmark(BenchmarkConfig(seed=0, benchmark="me/bench"))
 
 
 def test_a_dry_run_overwrites_nothing(tmp_path):

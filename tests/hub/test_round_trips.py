@@ -79,14 +79,13 @@ def test_lerobot_eval_runs_the_benchmark_from_the_hub(bench, policy, commands, t
     commands.forget()
     commands.run(
         "lerobot-eval", f"--policy.path={policy}", "--policy.device=cpu", "--env.type=cronos",
-        "--env.benchmark=me/bench@main", "--env.suite=sequential", "--env.split=held_out",
+        "--env.benchmark=me/bench@main", "--env.suite=sequential", "--env.split=held_out", "--env.task=1",
         "--env.observation_height=32", "--env.observation_width=32", "--eval.n_episodes=2", "--eval.batch_size=2",
         f"--output_dir={tmp_path / 'eval'}",
     )  # fmt: skip
     info = json.loads((tmp_path / "eval/eval_info.json").read_text())
-    assert [(task["task_group"], task["task_id"]) for task in info["per_task"]] == [
-        ("sequential_held_out", 0), ("sequential_held_out", 1)
-    ]  # fmt: skip
+    assert [(task["task_group"], task["task_id"]) for task in info["per_task"]] == [("sequential_held_out", 1)]
+    assert info["overall"]["n_episodes"] == 2
 
 
 def test_a_stream_is_loaded_back_whole(hub, run, commands, tmp_path):
@@ -123,6 +122,7 @@ def test_a_policy_is_loaded_back_with_its_card(hub, run, policy, commands, tmp_p
     front = yaml.safe_load(card.split("---")[1])
     assert front["datasets"] == ["me/stream"]
     assert "base_model" not in front
+    assert f"2 training configurations of [me/bench]({hub.url}/datasets/me/bench)" in card
     # 32 steps are 16 of each of the 2 streams; the scene of each is reset after 8 and after 16.
     assert "Interventions that count: **4**." in card
     assert "| scene reset | 4 | yes |" in card
@@ -240,15 +240,17 @@ def test_a_connection_lost_in_the_middle_of_an_upload(hub, run, commands):
 
 
 def test_a_connection_lost_at_the_commit(hub, bench, commands):
+    publish = ("cronos-publish", *BENCHMARK, "--repo_id=me/late")
     hub.faults.drop_commits = 1
-    lost = commands.try_("cronos-publish", *BENCHMARK, "--repo_id=me/late")
+    lost = commands.try_(*publish, "--pictures=false")
     assert (lost.code, "run the same command again" in lost.output) == (1, True)
-    commands.run("cronos-publish", *BENCHMARK, "--repo_id=me/late")
-    names = set(tree(bench))
-    assert set(hub.tree("datasets", "me/late")) == names
-    # Pushing the same again changes nothing; a smaller one leaves nothing of the larger one behind.
-    oid = hub.repositories["datasets", "me/late"].branches["main"]
-    commands.run("cronos-publish", *BENCHMARK, "--repo_id=me/late")
-    assert hub.tree("datasets", "me/late", oid) == hub.tree("datasets", "me/late")
-    commands.run("cronos-publish", *BENCHMARK, "--repo_id=me/late", "--pictures=false")
-    assert set(hub.tree("datasets", "me/late")) == {name for name in names if not name.startswith("pictures/")}
+    assert hub.tree("datasets", "me/late") == {}
+    commands.run(*publish)
+    # The card names its repository, the rest is the same as elsewhere.
+    assert hub.tree("datasets", "me/late").keys() == tree(bench).keys()
+    first = hub.repositories["datasets", "me/late"].branches["main"]
+    commands.run(*publish, "--pictures=false")
+    names = {name for name in tree(bench) if not name.startswith("pictures/")}
+    assert set(hub.tree("datasets", "me/late")) == names, "nothing is left behind of the larger one"
+    commands.run(*publish)
+    assert hub.tree("datasets", "me/late") == hub.tree("datasets", "me/late", first)
