@@ -196,7 +196,7 @@ def test_filmed_streams_are_a_dataset_of_their_own(tmp_path):
 
 def test_killed_runs_lose_nothing_that_was_flushed(tmp_path):
     """A real run from pixels, killed at random moments; `cronos_lerobot.kill_test` does it twenty times."""
-    tally = KillTest(tmp_path / "killed", seed=1, report=lambda line: None).run(3)
+    tally = KillTest(tmp_path / "killed", seed=1, report=lambda line: None).run(4)
     assert tally.kills == 4
     assert tally.segments_checked > 0
     film = tmp_path / "killed/run/streams_96x64"
