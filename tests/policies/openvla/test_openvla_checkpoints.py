@@ -224,6 +224,16 @@ def test_adapters_of_another_network_are_refused(published, published_adapter, t
         make_policy(published, adapter=str(folder))
 
 
+def test_settings_that_a_saved_policy_cannot_change(published, tmp_path):
+    policy = make_policy(published, lora_rank=4)
+    policy.save_pretrained(tmp_path)
+    config = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=["--unnorm_key=other"])
+    with pytest.raises(ValueError, match=r"'other'.*'bridge_orig'"):
+        OpenVLAPolicy.from_pretrained(tmp_path, config=config)
+    with pytest.raises(ValueError, match="--peft"):
+        policy.wrap_with_peft(peft_cli_overrides={"r": 4})
+
+
 def test_the_image_may_have_any_size(published):
     policy = make_policy(published)
     batch = make_batch(1)

@@ -51,11 +51,11 @@ def test_physical_actions():
 
 def test_choice_of_statistics():
     published = {"bridge_orig": BRIDGE, "other": OTHER}
-    assert choose_statistics(None, published, None)[0] == "bridge_orig"
-    assert choose_statistics(None, {"other": OTHER}, None) == ("other", OTHER)
+    assert choose_statistics(None, published, None)["key"] == "bridge_orig"
+    assert choose_statistics(None, {"other": OTHER}, None) == {"key": "other"} | OTHER
     stats = {"action": {"min": np.array([0.0, 2.0]), "max": np.array([1.0, 3.0])}}
-    expected = {"q01": [0.0, 2.0], "q99": [1.0, 3.0], "mask": [True, False]}
-    assert choose_statistics("dataset", {}, stats) == ("dataset", expected)
+    expected = {"key": "dataset", "q01": [0.0, 2.0], "q99": [1.0, 3.0], "mask": [True, False]}
+    assert choose_statistics("dataset", {}, stats) == expected
     with pytest.raises(ValueError, match=r"'fractal'.*bridge_orig.*dataset"):
         choose_statistics("fractal", published, None)
     with pytest.raises(ValueError, match="lerobot-train"):

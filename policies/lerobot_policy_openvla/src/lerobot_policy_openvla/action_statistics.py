@@ -18,8 +18,8 @@ DEFAULT_KEY = "bridge_orig"
 
 def choose_statistics(
     key: str | None, published: dict[str, dict[str, Any]], dataset_stats: dict[str, dict[str, Any]] | None
-) -> tuple[str, dict[str, Any]]:
-    """Return the name and the q01, q99 and mask (lists with an entry a dimension) of the statistics to use.
+) -> dict[str, Any]:
+    """Return the key, q01, q99 and mask (lists with an entry a dimension) of the statistics to use.
 
     Args:
         key: one of `published`, `dataset`, or None for `bridge_orig` or the only one there is.
@@ -30,14 +30,14 @@ def choose_statistics(
         ValueError: there are none of that name.
     """
     if key == DATASET:
-        return key, _of_dataset(dataset_stats)
+        return _of_dataset(dataset_stats)
     if key is None:
         key = DEFAULT_KEY if DEFAULT_KEY in published or len(published) != 1 else next(iter(published))
     if key not in published:
         raise ValueError(f"unnorm_key={key!r} is not one of {sorted(published)}, nor is it {DATASET!r}")
     entry = published[key]
     mask = entry.get("mask", [True] * len(entry["q01"]))
-    return key, {"q01": list(entry["q01"]), "q99": list(entry["q99"]), "mask": [bool(m) for m in mask]}
+    return {"key": key, "q01": list(entry["q01"]), "q99": list(entry["q99"]), "mask": [bool(m) for m in mask]}
 
 
 def _of_dataset(stats: dict[str, dict[str, Any]] | None) -> dict[str, Any]:
@@ -48,7 +48,7 @@ def _of_dataset(stats: dict[str, dict[str, Any]] | None) -> dict[str, Any]:
     sides = ("q01", "q99") if {"q01", "q99"} <= set(stats["action"]) else ("min", "max")
     q01, q99 = ([float(v) for v in stats["action"][side]] for side in sides)
     # As the published checkpoints have it: the last dimension, the gripper, is 0 to 1 already.
-    return {"q01": q01, "q99": q99, "mask": [True] * (len(q01) - 1) + [False]}
+    return {"key": DATASET, "q01": q01, "q99": q99, "mask": [True] * (len(q01) - 1) + [False]}
 
 
 @dataclass

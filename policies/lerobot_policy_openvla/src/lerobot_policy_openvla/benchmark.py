@@ -78,13 +78,15 @@ def architecture_of_size(size: str, layers: int | None = None) -> Architecture:
 
 
 def random_network(architecture: Architecture, config: OpenVLAConfig) -> OpenVLANetwork:
-    """Return a network of small random weights, made where they are to be."""
+    """Return a network of small random weights, the same few again and again, made where they are to be."""
     network = empty_network(architecture, config.attention)
     device, dtype = config.device or "cpu", resolve_dtype(config)
+    numbers = 0.02 * torch.randn(4_000_037, device=device)
     for name, parameter in list(network.named_parameters()):
-        value = torch.empty(parameter.shape, dtype=dtype, device=device)
-        is_scale = parameter.ndim == 1 and name.endswith("weight")
-        value = value.fill_(1.0) if is_scale else value.normal_(std=0.02)
+        value = torch.ones(parameter.shape, dtype=dtype, device=device)
+        if parameter.ndim > 1 or not name.endswith("weight"):
+            for piece in value.view(-1).split(len(numbers)):
+                piece.copy_(numbers[: len(piece)])
         set_module_tensor_to_device(network, name, device, value, dtype=dtype)
     return network.to(device).eval()
 
@@ -101,7 +103,8 @@ def policy_config(args: argparse.Namespace) -> OpenVLAConfig:
         attention=args.attention,
         quantization=args.quantization,
         architecture=architecture_of_size(args.size, args.layers).to_dict(),
-        action_statistics={"q01": [-1.0] * ACTION_TOKENS, "q99": [1.0] * ACTION_TOKENS, "mask": [True] * 7},
+        unnorm_key="none",
+        action_statistics={"key": "none", "q01": [-1.0] * ACTION_TOKENS, "q99": [1.0] * 7, "mask": [True] * 7},
         input_features={CAMERA: PolicyFeature(FeatureType.VISUAL, (3, 224, 224))},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (ACTION_TOKENS,))},
     )
@@ -178,6 +181,14 @@ class Bench:
             prompt = self.clock(lambda: policy.predict_values(kept)) / streams
         return {"whole": whole, "vision": vision, "prompt": prompt, "decode": whole - vision - prompt}
 
+    @torch.no_grad()
+    def ratio_error(self) -> float:
+        """Mean |log ratio| before the first update: what the network's format leaves of 0 [nats]."""
+        batch = self.observe(self.args.streams)
+        sample = self.policy.sample_actions(batch)
+        again = self.policy.evaluate_actions(batch, sample["tokens"])
+        return float((again["log_prob"] - sample["log_prob"]).abs().mean())
+
     def backward(self, batch: dict[str, Any]) -> None:
         """Forward and backward pass of PPO on a batch, with a loss on all that PPO has one on."""
         self.forward(batch).backward()
@@ -197,6 +208,22 @@ class Bench:
         step = self.clock(optimizer.step) / (minibatch * self.args.grad_accumulation)
         optimizer.zero_grad(set_to_none=True)
         return {"whole": whole + step, "forward": forward, "backward": whole - forward, "optimizer": step}
+
+    def activation_bytes(self, minibatch: int, *, kept: bool) -> float:
+        """Return what a forward pass keeps for the backward pass, for each observation, without the weights."""
+        weights = {p.untyped_storage().data_ptr() for p in self.policy.parameters()}
+        storages: dict[int, Any] = {}
+
+        def pack(tensor: torch.Tensor) -> torch.Tensor:
+            storage = tensor.untyped_storage()
+            if storage.data_ptr() not in weights:
+                # Held, so that no later tensor gets its address.
+                storages[storage.data_ptr()] = storage
+            return tensor
+
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+            self.forward(self.observe(minibatch, kept=kept))
+        return sum(storage.nbytes() for storage in storages.values()) / minibatch
 
     def without_cache(self) -> float:
         """Acting that reads the prompt again for each of the seven tokens."""
@@ -229,6 +256,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     bench.clock.restart()
     update = bench.update(args.minibatch_size, kept=args.frozen_vision)
     memory["update"] = bench.clock.peak_bytes()
+    activations = bench.activation_bytes(args.minibatch_size, kept=args.frozen_vision)
     single = bench.update(1, kept=args.frozen_vision)["whole"] if args.minibatch_size > 1 else None
     # What frozen towers save in the update: with adapters on them, what their part of it costs.
     other = bench.update(args.minibatch_size, kept=not args.frozen_vision)["whole"]
@@ -247,6 +275,8 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         "parameters": sum(p.numel() for p in policy.parameters()),
         "trained": sum(p.numel() for p in policy.parameters() if p.requires_grad),
         "memory_bytes": memory,
+        "activation_bytes": activations,
+        "ratio_error": bench.ratio_error(),
         "rollout_s": rollout,
         "update_s": update,
         "before_after_s": measures,
@@ -294,7 +324,10 @@ def report(result: dict[str, Any]) -> str:
     lines = [
         f"OpenVLA {args['size']}, {result['parameters'] / 1e9:.2f} G parameters, {result['trained'] / 1e6:.1f} M "
         f"trained, on {result['machine'] or 'CPU'} ({args['device']}, {result['threads']} threads)",
-        "memory [GiB]: " + ", ".join(f"{k} {v / gib:.2f}" for k, v in result["memory_bytes"].items()),
+        "memory [GiB]: "
+        + ", ".join(f"{k} {v / gib:.2f}" for k, v in result["memory_bytes"].items())
+        + f"; activations {result['activation_bytes'] / gib:.3f} for each transition of a minibatch",
+        f"log ratio before the first update: {result['ratio_error']:.1e} nats from 0 in the mean",
         f"rollout  {1 / rollout['whole']:10.2f} steps/s: " + _shares(rollout),
         f"update   {1 / update['whole']:10.2f} steps/s: " + _shares(update),
         f"together {1 / step:10.2f} steps/s, {flop / step / 1e12:.2f} TFLOP/s; rollout "

@@ -66,7 +66,7 @@ def read_checkpoint(name: str, revision: str | None = None) -> Checkpoint:
     if config.get("type") == "openvla":
         if not config.get("architecture") or not holds_network(folder):
             raise ValueError(f"{name} holds adapters, not a whole network; use it as --policy.path.")
-        statistics = {config["unnorm_key"]: config["action_statistics"]}
+        statistics = {config["action_statistics"]["key"]: config["action_statistics"]}
         return Checkpoint(folder, Architecture.from_dict(config["architecture"]), statistics, NETWORK_PREFIX)
     preprocessor = _read_json(folder / PREPROCESSOR) if (folder / PREPROCESSOR).is_file() else None
     architecture = Architecture.from_published(config, preprocessor)

@@ -72,7 +72,7 @@ class OpenVLAConfig(PreTrainedConfig):
     architecture: dict[str, Any] | None = None
     """The network's sizes, read from the checkpoint."""
     action_statistics: dict[str, Any] | None = None
-    """q01, q99 and mask of the actions, read from the checkpoint or the data set."""
+    """key, q01, q99 and mask of the actions, read from the checkpoint or the data set."""
 
     optimizer_lr: float = 5e-4
     """Learning rate of behaviour cloning."""
@@ -123,17 +123,22 @@ class OpenVLAConfig(PreTrainedConfig):
             dataset_stats: LeRobot's statistics, for `unnorm_key=dataset`.
 
         Raises:
-            ValueError: there is no checkpoint, or no statistics of that name.
+            ValueError: there is no checkpoint, or no statistics of that name, or others are asked for than the
+                policy was made with.
         """
         if self.architecture and self.action_statistics:
+            if self.unnorm_key != self.action_statistics["key"]:
+                raise ValueError(
+                    f"unnorm_key={self.unnorm_key!r}, but the policy was made with "
+                    f"{self.action_statistics['key']!r}: its tokens would come to mean other actions"
+                )
             return
         if self.checkpoint is None:
             raise ValueError("choose the weights to build on: --policy.checkpoint=openvla/openvla-7b")
         checkpoint = read_checkpoint(self.checkpoint, self.checkpoint_revision)
         self.architecture = checkpoint.architecture.to_dict()
-        self.unnorm_key, self.action_statistics = choose_statistics(
-            self.unnorm_key, checkpoint.action_statistics, dataset_stats
-        )
+        self.action_statistics = choose_statistics(self.unnorm_key, checkpoint.action_statistics, dataset_stats)
+        self.unnorm_key = self.action_statistics["key"]
 
     @property
     def lora_scale_numerator(self) -> int:

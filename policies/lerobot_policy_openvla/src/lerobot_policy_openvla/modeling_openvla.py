@@ -133,7 +133,7 @@ class OpenVLAPolicy(PreTrainedPolicy):
         size, step = len(batch["task"]), self.config.inference_batch_size
         for start in range(0, size, step):
             rows = slice(start, min(start + step, size))
-            yield {k: v[rows] if isinstance(v, Tensor | list) else v for k, v in batch.items()}, rows
+            yield {k: v[rows] if isinstance(v, Tensor | list | tuple) else v for k, v in batch.items()}, rows
 
     # LeRobot's policy interface.
 

@@ -31,6 +31,7 @@ def make_openvla_pre_post_processors(
     """
     config.resolve(dataset_stats)
     assert config.action_statistics is not None
+    statistics = {name: config.action_statistics[name] for name in ("q01", "q99", "mask")}
     steps = make_default_policy_processor_steps(config, dataset_stats, normalizer_device=config.device)
     return make_policy_processor_pipelines(
         input_steps=[
@@ -38,10 +39,10 @@ def make_openvla_pre_post_processors(
             steps.add_batch_dim,
             steps.to_device,
             steps.normalize,
-            ActionStatisticsProcessorStep(**config.action_statistics),
+            ActionStatisticsProcessorStep(**statistics),
         ],
         output_steps=[
-            ActionStatisticsProcessorStep(**config.action_statistics, inverse=True),
+            ActionStatisticsProcessorStep(**statistics, inverse=True),
             steps.unnormalize,
             steps.to_cpu,
         ],
