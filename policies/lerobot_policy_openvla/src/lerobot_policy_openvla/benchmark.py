@@ -126,16 +126,19 @@ class Clock:
         self._seconds = seconds
 
     def __call__(self, function: Callable[[], Any]) -> float:
-        """Return the mean time of a call [s]."""
+        """Return the mean time of a call [s]; on a CPU, of work: what other processes take does not count."""
         if self._seconds:
             function()
             self._wait()
-        start, calls = time.perf_counter(), 0
-        while (elapsed := time.perf_counter() - start) < self._seconds or not calls:
+        start, begun, calls = self._now(), time.perf_counter(), 0
+        while not calls or time.perf_counter() - begun < self._seconds:
             function()
             self._wait()
             calls += 1
-        return elapsed / calls
+        return (self._now() - start) / calls
+
+    def _now(self) -> float:
+        return time.perf_counter() if self._cuda else time.process_time() / torch.get_num_threads()
 
     def peak_bytes(self) -> int:
         """Most memory that was in use since the last `restart`; on a CPU, since the process began."""
