@@ -99,8 +99,14 @@ def test_a_stream_is_loaded_back_whole(hub, run, commands, tmp_path):
     commands.forget()
     code = """
 from cronos_lerobot.data.streams import StreamDataset
+remote = StreamDataset("me/stream", streaming=True)
+remote.check()
 streams = StreamDataset("me/stream")
 streams.check()
+camera, segment = "observation.images.front", streams.segments_of(0)[2]
+assert remote.segments == streams.segments
+assert (remote.pixels(segment, camera) == streams.pixels(segment, camera)).all()
+assert (remote.columns(segment)["action"] == streams.columns(segment)["action"]).all()
 print([(s.step, s.length, s.intervention.name) for s in streams.segments_of(0)])
 print(streams.dataset[15]["observation.images.front"].shape)
 """
