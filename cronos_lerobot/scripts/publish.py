@@ -28,16 +28,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import draccus
-from draccus.utils import ParsingError
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from cronos_lerobot.hub.config import BenchmarkConfig, PolicyConfig, PublishConfig, ResultsConfig, StreamConfig
 from cronos_lerobot.hub.push import PublishError, push_folder
+from cronos_lerobot.scripts.subcommands import run_subcommand
 
 
 def publish_benchmark(config: BenchmarkConfig) -> None:
     """`cronos-publish benchmark`."""
+    config.validate()
     from cronos_lerobot.hub.benchmark import REPLACES, write_benchmark_repository
 
     _publish(config, write_benchmark_repository, replaces=REPLACES)
@@ -45,6 +45,7 @@ def publish_benchmark(config: BenchmarkConfig) -> None:
 
 def publish_stream(config: StreamConfig) -> None:
     """`cronos-publish stream`."""
+    config.validate()
     from cronos_lerobot.hub.streams import REPLACES, read_codebase_version, write_stream_repository
 
     version = read_codebase_version(config)
@@ -53,6 +54,7 @@ def publish_stream(config: StreamConfig) -> None:
 
 def publish_policy(config: PolicyConfig) -> None:
     """`cronos-publish policy`."""
+    config.validate()
     from cronos_lerobot.hub.policy import REPLACES, write_policy_repository
 
     _publish(config, write_policy_repository, replaces=REPLACES)
@@ -60,6 +62,7 @@ def publish_policy(config: PolicyConfig) -> None:
 
 def publish_results(config: ResultsConfig) -> None:
     """`cronos-publish results`."""
+    config.validate()
     from cronos_lerobot.hub.results import write_results
 
     _publish(config, write_results, creates=False)
@@ -94,24 +97,10 @@ COMMANDS: dict[str, tuple[type[PublishConfig], Callable[[Any], None]]] = {
 
 def main() -> None:
     """Entry point of `cronos-publish`."""
-    command, *arguments = sys.argv[1:] or ["--help"]
-    if command in ("--help", "-h"):
-        print(__doc__)
-        return
-    if command not in COMMANDS:
-        sys.exit(f"error: unknown command {command!r}; valid commands: {list(COMMANDS)}")
-    config_class, publish = COMMANDS[command]
-    if command in ("benchmark", "results"):
+    if sys.argv[1:2] in (["benchmark"], ["results"]):
         # They may bring scenes with them.
         register_third_party_plugins()
-    try:
-        config = draccus.parse(config_class, args=arguments)
-        config.validate()
-        publish(config)
-    except ParsingError as error:
-        sys.exit(f"error: {error.__cause__ or error}")
-    except (ValueError, OSError, ImportError, PublishError) as error:
-        sys.exit(f"error: {error}")
+    run_subcommand(__doc__ or "", COMMANDS, (ValueError, OSError, ImportError, PublishError))
 
 
 if __name__ == "__main__":

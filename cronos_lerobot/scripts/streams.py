@@ -28,14 +28,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import draccus
-from draccus.utils import ParsingError
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from rich.console import Console
 
 from cronos_lerobot.data.stream_filter import SegmentFilter, filter_streams
 from cronos_lerobot.data.stream_statistics import make_tables, statistics
 from cronos_lerobot.data.streams import StreamDataset
+from cronos_lerobot.scripts.subcommands import run_subcommand
 
 
 @dataclass
@@ -154,19 +153,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], None]]] = {
 
 def main() -> None:
     """Entry point of `cronos-streams`."""
-    command, *arguments = sys.argv[1:] or ["--help"]
-    if command in ("--help", "-h"):
-        print(__doc__)
-        return
-    if command not in COMMANDS:
-        sys.exit(f"error: unknown command {command!r}; valid commands: {list(COMMANDS)}")
-    config_class, run = COMMANDS[command]
-    try:
-        run(draccus.parse(config_class, args=arguments))
-    except ParsingError as error:
-        sys.exit(f"error: {error.__cause__ or error}")
-    except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
+    run_subcommand(__doc__ or "", COMMANDS)
 
 
 if __name__ == "__main__":
