@@ -46,7 +46,7 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
     if OBS_ENV_STATE in (policy_config.input_features or {}) and not env_config.privileged_state:
         env_config.privileged_state = True
         env_config.__post_init__()
-    if not policy_config.pretrained_path:
+    if not (policy_config.pretrained_path or getattr(policy_config, "checkpoint", None)):
         logging.warning("Training a policy from scratch: its states are not normalised, its success starts at 0.")
     policy = make_policy(policy_config, env_cfg=env_config)
     check_trainable(policy)
