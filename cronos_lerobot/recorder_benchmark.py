@@ -22,6 +22,7 @@ from typing import Any
 import datasets
 import numpy as np
 from lerobot.datasets import LeRobotDataset
+from lerobot.utils.constants import DEFAULT_FEATURES
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from lerobot_env_cronos.expert import ScriptedExpert
@@ -89,7 +90,7 @@ class Recording:
         """The recording in `root` as LeRobot's writer wants it: a list of frames for each segment."""
         dataset = LeRobotDataset(REPO_ID, root=root)
         columns = dataset.hf_dataset.with_format("numpy")[:]
-        names = [key for key in dataset.features if key in columns and key not in _BOOKKEEPING]
+        names = [key for key in dataset.features if key in columns and key not in DEFAULT_FEATURES]
         dtypes = {name: dataset.features[name]["dtype"] for name in names}
         assert dataset.meta.episodes is not None
         for stream, episode in enumerate(dataset.meta.episodes):
@@ -100,9 +101,6 @@ class Recording:
                 pixels = self.steps[t][0]["pixels"]
                 frames.append(frame | {f"observation.images.{name}": p[stream] for name, p in pixels.items()})
             yield episode["tasks"][0], frames
-
-
-_BOOKKEEPING = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
 
 
 def measure(frames: int, root: Path, write: Callable[[], None]) -> Cost:

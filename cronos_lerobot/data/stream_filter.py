@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.utils.constants import DONE
+from lerobot.utils.constants import DEFAULT_FEATURES, DONE
 from tqdm import tqdm
 
 from cronos_lerobot.data.schema import (
@@ -147,7 +147,7 @@ class _Writer:
 
     def __init__(self, source: StreamDataset, repo_id: str, root: Path) -> None:
         self._source = source
-        features = {key: feature for key, feature in source.meta.features.items() if key not in _BOOKKEEPING}
+        features = {key: feature for key, feature in source.meta.features.items() if key not in DEFAULT_FEATURES}
         self._meta = LeRobotDatasetMetadata.create(
             repo_id, source.meta.fps, features, robot_type=source.meta.robot_type, root=root,
             use_videos=bool(source.meta.video_keys),
@@ -195,13 +195,10 @@ class _Writer:
         return self._videos[key]
 
     def _stats(self, rows: pa.Table, clips: Mapping[str, Clip]) -> Stats:
-        frames = {name: to_array(rows[name]) for name in rows.column_names if name not in _BOOKKEEPING}
+        frames = {name: to_array(rows[name]) for name in rows.column_names if name not in DEFAULT_FEATURES}
         for key, clip in clips.items():
             frames[key] = read_frames(clip.path, clip.start, clip.length, self._meta.fps)
         return episode_stats(frames, self._meta.features)
-
-
-_BOOKKEEPING = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
 
 
 def _read(source: StreamDataset, segments: Iterable[Segment]) -> Iterator[tuple[Segment, pa.Table, Stats]]:
@@ -211,7 +208,7 @@ def _read(source: StreamDataset, segments: Iterable[Segment]) -> Iterator[tuple[
     for path in sorted(root.glob("meta/episodes/*/*.parquet")):
         for row in pq.read_table(path).to_pylist():
             stats = stats_of_row(row)
-            stats_of[row["episode_index"]] = {k: v for k, v in stats.items() if k not in _BOOKKEEPING}
+            stats_of[row["episode_index"]] = {k: v for k, v in stats.items() if k not in DEFAULT_FEATURES}
     for path, group in groupby(segments, key=lambda s: meta.get_data_file_path(s.episode)):
         table = pq.read_table(root / path)
         first = table["index"][0].as_py()

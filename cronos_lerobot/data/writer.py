@@ -17,6 +17,7 @@ import numpy as np
 from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.utils import INFO_PATH
+from lerobot.utils.constants import DEFAULT_FEATURES
 
 from cronos_lerobot.data.schema import Features, frame_format
 from cronos_lerobot.data.storage import INCOMPLETE, Shard, next_shard_index, truncate
@@ -222,7 +223,7 @@ class SegmentWriter:
         self._max_pending = max_pending
         self._flush_interval_s = flush_interval_s
         self.features: Features = {
-            key: feature for key, feature in meta.features.items() if key not in _BOOKKEEPING
+            key: feature for key, feature in meta.features.items() if key not in DEFAULT_FEATURES
         }
         self._tasks: dict[str, int] = {} if meta.tasks is None else dict(meta.tasks["task_index"])
         self._metadata_keys: set[str] | None = None
@@ -317,6 +318,3 @@ class SegmentWriter:
     def _open_video(self, key: str, path: Path) -> VideoFile:
         height, width, _ = self._meta.features[key]["shape"]
         return VideoFile(path, self._meta.fps, height, width, self._encoder)
-
-
-_BOOKKEEPING = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
