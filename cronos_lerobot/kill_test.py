@@ -120,11 +120,11 @@ def keep_journal(path: Path) -> None:
     journal = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     add_segment = SegmentWriter.add_segment
 
-    def noted(self: SegmentWriter, frames: Any, task: str, *, episode_metadata: Any = None) -> None:
+    def noted(self: SegmentWriter, frames: Any, task: str, **options: Any) -> None:
         key = [int(frames[STREAM_ID][0]), int(frames[SEGMENT_INDEX][0])]
         line = {"recording": self.root.name, "segment": key, "time": time.monotonic()}
         os.write(journal, json.dumps(line).encode() + b"\n")
-        add_segment(self, frames, task, episode_metadata=episode_metadata)
+        add_segment(self, frames, task, **options)
 
     SegmentWriter.add_segment = noted
 

@@ -1,13 +1,16 @@
 """Records training streams as a LeRobotDataset: an observer that the training loop calls once per step."""
 
+from collections import deque
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from lerobot.utils.constants import ACTION, DONE, REWARD
+from lerobot.utils.constants import ACTION, DONE, OBS_IMAGES, REWARD
 from lerobot_env_cronos import CronosVectorEnv
 
+from cronos_lerobot.data.drawing import LateCamera, UndrawnFrames
 from cronos_lerobot.data.schema import (
     INTERVENTION,
     LOG_PROB,
@@ -52,6 +55,7 @@ class StreamRecorder:
         num_envs: int,
         segment_length: int,
         streams: int | str = "all",
+        cameras: Mapping[str, LateCamera] | None = None,
     ) -> None:
         """Record into `writer` (see `open` for the usual way to make one).
 
@@ -60,6 +64,7 @@ class StreamRecorder:
             num_envs: streams the loop runs, n of the arrays of `on_step`.
             segment_length: the most steps between two task switches (K), the buffers' capacity.
             streams: how many of the streams to record, the first ones, or "all".
+            cameras: whose pictures are drawn when they are written, by feature.
 
         Raises:
             ValueError: `streams` is neither "all" nor between 1 and `num_envs`.
@@ -74,6 +79,8 @@ class StreamRecorder:
         self.num_envs = num_envs
         self.num_streams = streams
         self.segment_length = segment_length
+        self._cameras = dict(cameras or {})
+        self._written: deque[dict[str, np.ndarray]] = deque()
         self._lengths = np.zeros(streams, dtype=np.int64)
         self._tasks = [""] * streams
         self._buffers = [self._new_buffer() for _ in range(streams)]
@@ -87,7 +94,7 @@ class StreamRecorder:
         *,
         segment_length: int,
         streams: int | str = "all",
-        cameras: Mapping[str, tuple[int, int]] | None = None,
+        cameras: Mapping[str, LateCamera] | None = None,
         state: Mapping[str, Any] | None = None,
         **writer_options: Any,
     ) -> Self:
@@ -99,20 +106,28 @@ class StreamRecorder:
             root: its folder; must not exist for a new dataset and must for a resumed one.
             segment_length: the most steps between two task switches (K).
             streams: how many of the streams to record, or "all".
-            cameras: pictures to record in place of the observation's: (height, width) [px] by camera.
+            cameras: pictures to record in place of the observation's, by name; `on_step` then takes, under
+                `pixels` and this name, the states (n, nq) to draw from.
             state: of `state_dict()`. Everything that was written after it is dropped from the dataset.
             writer_options: passed on to `SegmentWriter`.
         """
+        if cameras:
+            # A loop that is far ahead of the drawing waits: no more than two rounds of segments are due.
+            pixels = sum(camera.height * camera.width for camera in cameras.values())
+            rounds = 2 * segment_length * (env.num_envs if isinstance(streams, str) else streams)
+            writer_options = {"max_pending_bytes": rounds * pixels * 3} | writer_options
         if state is None:
             space = env.single_observation_space
             if cameras is not None:
-                space = with_cameras(space, cameras)
+                sizes = {name: (camera.height, camera.width) for name, camera in cameras.items()}
+                space = with_cameras(space, sizes)
             features = stream_features(space, **feature_names(env))
             fps = int(env.metadata["render_fps"])
             writer = SegmentWriter(repo_id, root, features, fps, **writer_options)
         else:
             writer = SegmentWriter.resume(repo_id, root, state["writer"], **writer_options)
-        recorder = cls(writer, num_envs=env.num_envs, segment_length=segment_length, streams=streams)
+        late = {f"{OBS_IMAGES}.{name}": camera for name, camera in (cameras or {}).items()}
+        recorder = cls(writer, num_envs=env.num_envs, segment_length=segment_length, streams=streams, cameras=late)
         if state is not None:
             recorder.load_partial_segments(state)
         return recorder
@@ -243,9 +258,10 @@ class StreamRecorder:
         self._lengths[stream] += 1
 
     def _write_segment(self, stream: int) -> None:
-        # The writer keeps the arrays until they are encoded, so the stream goes on in a fresh buffer.
-        length = self._lengths[stream]
-        frames = {key: buffer[:length] for key, buffer in self._buffers[stream].items()}
+        # The writer keeps the arrays until they are encoded, so the stream goes on in another buffer.
+        length, whole = self._lengths[stream], self._buffers[stream]
+        frames: dict[str, Any] = {key: buffer[:length] for key, buffer in whole.items()}
+        frames |= {key: UndrawnFrames(camera, frames[key]) for key, camera in self._cameras.items()}
         success = frames[SUCCESS]
         metadata = {
             STREAM_ID: stream,
@@ -256,13 +272,20 @@ class StreamRecorder:
             SUCCESS: bool(success.any()),
             SUCCESS_FRAME: int(success.argmax()) if success.any() else -1,
         }
-        self.writer.add_segment(frames, self._tasks[stream], episode_metadata=metadata)
+        self.writer.add_segment(
+            frames, self._tasks[stream], episode_metadata=metadata, written=partial(self._written.append, whole)
+        )
         self._buffers[stream] = self._new_buffer()
         self._lengths[stream] = 0
 
     def _new_buffer(self) -> dict[str, np.ndarray]:
+        # To take fresh memory costs as much as to copy the pixels into it.
+        if self._written:
+            return self._written.popleft()
         buffer = {}
         for key, feature in self.writer.features.items():
             shape, dtype = frame_format(feature)
+            if key in self._cameras:
+                shape, dtype = (self._cameras[key].num_positions,), np.dtype(np.float64)
             buffer[key] = np.empty((self.segment_length, *shape), dtype=dtype)
         return buffer

@@ -49,13 +49,18 @@ def vector_stats(array: np.ndarray) -> dict[str, np.ndarray]:
 
 def image_stats(images: np.ndarray) -> dict[str, np.ndarray]:
     """Statistics per channel of uint8 images (T, H, W, 3), on the frames and pixels that LeRobot samples."""
-    sampled = images[sample_indices(len(images))]
-    # LeRobot's own rule for thinning out large images, on a channel-first view of the stack.
-    sampled = np.stack([auto_downsample_height_width(image.transpose(2, 0, 1)) for image in sampled])
-    height, width = sampled.shape[2:]
-    stack = np.ascontiguousarray(sampled.transpose(0, 2, 3, 1)).reshape(len(sampled) * height, width, 3)
-    counts = np.array(Image.fromarray(stack).histogram(), dtype=np.int64).reshape(3, 256)
+    sampled = sample_indices(len(images))
+    # One at a time: copies of a whole episode cost more than everything else here.
+    counts = np.sum([_histogram(images[i]) for i in sampled], axis=0)
     return _histogram_stats(counts, num_images=len(sampled))
+
+
+def _histogram(image: np.ndarray) -> np.ndarray:
+    """How often each level occurs in each channel of an image (H, W, 3): (3, 256)."""
+    # LeRobot's own rule for thinning out large images, on a channel-first view.
+    thinned = auto_downsample_height_width(image.transpose(2, 0, 1)).transpose(1, 2, 0)
+    histogram = Image.fromarray(np.ascontiguousarray(thinned)).histogram()
+    return np.array(histogram, dtype=np.int64).reshape(3, 256)
 
 
 def _histogram_stats(counts: np.ndarray, num_images: int) -> dict[str, np.ndarray]:

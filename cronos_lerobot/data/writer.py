@@ -8,7 +8,7 @@ import queue
 import shutil
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -19,6 +19,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.utils import INFO_PATH
 from lerobot.utils.constants import DEFAULT_FEATURES
 
+from cronos_lerobot.data.drawing import UndrawnFrames
 from cronos_lerobot.data.schema import Features, frame_format
 from cronos_lerobot.data.storage import INCOMPLETE, Shard, next_shard_index, truncate
 from cronos_lerobot.data.video import MAX_FILE_DURATION_S, VideoFile, fast_encoder
@@ -27,6 +28,8 @@ FLUSH_INTERVAL_S = 20.0
 """Age of the oldest segment not on disk at which all are written [s]. A full queue takes a few seconds more to
 encode, so that what ended 30 s ago is on disk."""
 
+Pixels = np.ndarray | UndrawnFrames
+
 
 class RecordingError(RuntimeError):
     """The dataset can no longer be written; what was flushed before stays and loads."""
@@ -34,9 +37,10 @@ class RecordingError(RuntimeError):
 
 @dataclass
 class _Segment:
-    frames: Mapping[str, np.ndarray]
+    frames: Mapping[str, Pixels]
     task: str
     metadata: Mapping[str, Any]
+    written: Callable[[], None] | None = None
     ended: float = field(default_factory=time.monotonic)
 
     @property
@@ -142,18 +146,21 @@ class SegmentWriter:
 
     def add_segment(
         self,
-        frames: Mapping[str, np.ndarray],
+        frames: Mapping[str, Pixels],
         task: str,
         *,
         episode_metadata: Mapping[str, Any] | None = None,
+        written: Callable[[], None] | None = None,
     ) -> None:
         """Queue one segment as the next episode. Blocks while the encoder is too far behind.
 
         Args:
             frames: one array (T, *shape) of the feature's dtype per feature ((T,) where the shape is (1,));
-                pixels as uint8 (T, H, W, 3). They are NOT copied: leave them alone afterwards.
+                pixels as uint8 (T, H, W, 3) or still to be drawn. They are NOT copied: leave them alone
+                until `written` is called.
             task: the instruction.
             episode_metadata: columns for the episode's row in `meta/episodes`, the same keys every time.
+            written: called in the writer's thread when it needs the arrays no longer.
 
         Raises:
             ValueError: a feature is missing, unknown, or of another dtype or shape.
@@ -169,7 +176,7 @@ class SegmentWriter:
             raise ValueError(
                 f"episode_metadata has the keys {sorted(metadata)}, not {sorted(self._metadata_keys)}"
             )
-        segment = _Segment(frames, task, metadata)
+        segment = _Segment(frames, task, metadata, written)
         with self._room:
             self._room.wait_for(
                 lambda: self._pending == 0 or self._pending + segment.num_bytes <= self._max_pending
@@ -229,6 +236,7 @@ class SegmentWriter:
         self._metadata_keys: set[str] | None = None
         self._max_shard_frames = int(MAX_FILE_DURATION_S * meta.fps)
         self._shard: Shard | None = None
+        self._canvas: dict[str, np.ndarray] = {}
         self._oldest = 0.0
         self._on_disk = meta.info.total_episodes, meta.info.total_frames
         self._next_shard = next_shard_index(meta)
@@ -248,7 +256,7 @@ class SegmentWriter:
         if self._failure is not None:
             raise RecordingError(f"writing to {self.root} failed: {self._failure}") from self._failure
 
-    def _check_frames(self, frames: Mapping[str, np.ndarray]) -> None:
+    def _check_frames(self, frames: Mapping[str, Pixels]) -> None:
         if set(frames) != set(self.features):
             missing, unknown = set(self.features) - set(frames), set(frames) - set(self.features)
             raise ValueError(f"segment lacks {sorted(missing)} and has unknown {sorted(unknown)}")
@@ -307,7 +315,20 @@ class SegmentWriter:
             self._oldest = item.ended
             self._next_shard += 1
         task_index = self._tasks.setdefault(item.task, len(self._tasks))
-        self._shard.append(item.frames, item.task, task_index, item.metadata)
+        self._shard.append(self._draw(item.frames), item.task, task_index, item.metadata)
+        if item.written is not None:
+            item.written()
+
+    def _draw(self, frames: Mapping[str, Pixels]) -> dict[str, np.ndarray]:
+        drawn = {}
+        for key, array in frames.items():
+            if isinstance(array, UndrawnFrames):
+                # Kept from segment to segment: to take this much memory anew costs more than to fill it.
+                if key not in self._canvas or len(self._canvas[key]) < len(array):
+                    self._canvas[key] = np.empty(array.shape, array.dtype)
+                array = array.draw(self._canvas[key])
+            drawn[key] = array
+        return drawn
 
     def _publish(self) -> None:
         if self._shard is not None:

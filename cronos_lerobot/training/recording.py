@@ -11,17 +11,18 @@ import numpy as np
 from lerobot.envs.utils import parse_camera_names
 from lerobot_env_cronos import CronosEnvConfig
 
+from cronos_lerobot.data.drawing import LateCamera
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.writer import RecordingError
 from cronos_lerobot.loop_state import Step
 from cronos_lerobot.training.config import CronosTrainConfig
 
 FILM = "film"
-"""Key of the filmed streams' frames in an observation; policies never see it."""
+"""Key of the filmed streams' states in an observation, from which the writer draws; policies never see it."""
 
 
 class FilmedEnv:
-    """An environment whose observations also hold frames of its first streams, at its `render_size`.
+    """An environment whose observations also hold the states of its first streams, to draw them from later.
 
     Args:
         env: the streams.
@@ -36,7 +37,7 @@ class FilmedEnv:
         return getattr(self._env, name)
 
     def observe(self) -> dict[str, Any]:
-        """The observation of all streams, and the frames."""
+        """The observation of all streams, and the states."""
         return self._film(self._env.observe())
 
     def step(self, actions: np.ndarray) -> tuple:
@@ -45,8 +46,7 @@ class FilmedEnv:
         return (self._film(observation), *outcome)
 
     def _film(self, observation: dict[str, Any]) -> dict[str, Any]:
-        with self._env.timer("record"):
-            return observation | {FILM: self._env.render_streams(self._streams)}
+        return observation | {FILM: self._env.positions(self._streams)}
 
 
 class StreamObserver:
@@ -104,13 +104,14 @@ class StreamObserver:
             assert isinstance(config.env, CronosEnvConfig)
             camera = parse_camera_names(config.env.camera_name)[0]
             height, width = config.env.render_size
+            num_positions = env.positions(np.arange(1)).shape[1]
             suffix = f"_{width}x{height}"
             recorders[FILM] = StreamRecorder.open(
                 env,
                 record.repo_id + suffix,
                 root.with_name(root.name + suffix),
                 streams=record.filmed_streams,
-                cameras={camera: (height, width)},
+                cameras={camera: LateCamera(height, width, num_positions, env.render_positions)},
                 state=state.get(FILM),
                 **common,
             )

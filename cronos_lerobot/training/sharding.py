@@ -97,8 +97,8 @@ class ShardedEnv:
             # How many numbers it takes to find a free place only the owner knows.
             rng.bit_generator.state = self._processes.broadcast(rng.bit_generator.state, source=owner)
 
-    def render_streams(self, ids: np.ndarray) -> np.ndarray:
-        """Frames (k, height, width, 3) uint8 of the streams `ids`, all of this process.
+    def positions(self, ids: np.ndarray) -> np.ndarray:
+        """Generalised positions (k, nq) of the streams `ids`, all of this process.
 
         Raises:
             ValueError: one of them is another process's.
@@ -108,7 +108,11 @@ class ShardedEnv:
                 f"A process films its own streams, {self.mine.start} to {self.mine.stop - 1}, "
                 f"got {np.asarray(ids).tolist()}."
             )
-        return self._env.render_streams(np.asarray(ids) - self.mine.start)
+        return self._env.positions(np.asarray(ids) - self.mine.start)
+
+    def render_positions(self, qpos: np.ndarray) -> np.ndarray:
+        """Frames (k, height, width, 3) uint8 of `positions`."""
+        return self._env.render_positions(qpos)
 
     def get_state(self) -> dict[str, np.ndarray]:
         """The state of all N streams, as one process with N streams has it."""

@@ -61,9 +61,9 @@ def record(root, *, flush_at=(), skip=(), steps=STEPS, repo_id="me/stream") -> N
     recorder = StreamRecorder(writer, num_envs=STREAMS, segment_length=K)
     add_segment = writer.add_segment
 
-    def add_some(frames, task, *, episode_metadata):
+    def add_some(frames, task, *, episode_metadata, **options):
         if (episode_metadata["cronos.stream_id"], episode_metadata["cronos.segment_index"]) not in skip:
-            add_segment(frames, task, episode_metadata=episode_metadata)
+            add_segment(frames, task, episode_metadata=episode_metadata, **options)
 
     writer.add_segment = add_some
     for t in range(steps):

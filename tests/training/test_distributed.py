@@ -243,11 +243,11 @@ def test_a_process_films_its_own_streams():
     def film(processes):
         env = DummyEnv(2)
         env.timer = Stopwatch()
-        env.render_streams = lambda ids: [f"local {i}" for i in ids]
+        env.positions = lambda ids: [f"local {i}" for i in ids]
         sharded = ShardedEnv(env, processes)
-        own = sharded.render_streams(np.arange(2) + 2 * processes.rank)
+        own = sharded.positions(np.arange(2) + 2 * processes.rank)
         with pytest.raises(ValueError, match=r"its own streams, [02] to [13], got \[1, 2\]"):
-            sharded.render_streams(np.array([1, 2]))
+            sharded.positions(np.array([1, 2]))
         return own
 
     assert together(film) == [["local 0", "local 1"]] * 2

@@ -13,6 +13,8 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from safetensors.torch import load_file
 
+from cronos_lerobot.data.drawing import LateCamera
+from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.data.video import read_frames
 from cronos_lerobot.kill_test import KillTest
@@ -153,23 +155,16 @@ def test_filmed_streams_are_a_dataset_of_their_own(tmp_path):
     env_config = CronosEnvConfig(obs_type="environment_state_agent_pos", render_size=(48, 64), num_threads=1)
     env = CronosVectorEnv(3, **env_config.gym_kwargs)
     seen = []
-
-    class Watched(FilmedEnv):
-        def _film(self, observation):
-            observation = super()._film(observation)
-            seen.append((observation["agent_pos"][:2].copy(), observation[FILM].copy()))
-            return observation
-
-    from cronos_lerobot.data.recorder import StreamRecorder
-
-    filmed = Watched(env, 2)
+    filmed = FilmedEnv(env, 2)
     assert filmed.num_envs == 3
+    camera = LateCamera(48, 64, env.simulation.model.nq, env.render_positions)
     recorder = StreamRecorder.open(
-        env, "me/film", tmp_path / "film", segment_length=5, streams=2, cameras={"front": (48, 64)}
+        env, "me/film", tmp_path / "film", segment_length=5, streams=2, cameras={"front": camera}
     )
     rng = np.random.default_rng(0)
     obs = filmed.observe()
     for t in range(5):
+        seen.append((obs["agent_pos"][:2].copy(), env.render_streams(np.arange(2))))
         action = rng.uniform(env.single_action_space.low, env.single_action_space.high, (3, 7)).astype(np.float32)
         observation = {key: obs[key] for key in ("agent_pos", "environment_state")} | {
             "pixels": {"front": obs[FILM]}
@@ -192,6 +187,9 @@ def test_filmed_streams_are_a_dataset_of_their_own(tmp_path):
         for t, (state, pictures) in enumerate(seen[:5]):
             np.testing.assert_array_equal(streams.columns(segment)["observation.state"][t], state[stream])
             assert np.abs(pixels[t].astype(int) - pictures[stream]).mean() < 4
+        moments = np.stack([pictures[stream] for _, pictures in seen]).astype(int)
+        nearest = [int(np.abs(moments - picture).mean(axis=(1, 2, 3)).argmin()) for picture in pixels]
+        assert nearest == [0, 1, 2, 3, 4]
 
 
 def test_killed_runs_lose_nothing_that_was_flushed(tmp_path):

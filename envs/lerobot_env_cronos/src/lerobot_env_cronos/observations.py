@@ -88,9 +88,9 @@ class ObservationBuilder:
             }
         return observation
 
-    def render(self, ids: np.ndarray) -> np.ndarray:
-        """Frames (k, height, width, 3) of simulations `ids` for videos, from the first camera."""
-        return self._renderer(self.render_size, self.cameras[0]).render(self.simulation.qpos[ids])
+    def render(self, qpos: np.ndarray) -> np.ndarray:
+        """Frames (k, height, width, 3) of states `qpos` (k, nq) for videos, from the first camera."""
+        return self._renderer(self.render_size, self.cameras[0]).render(qpos)
 
     def _agent_pos(self, p: np.ndarray, R: np.ndarray) -> np.ndarray:
         sim = self.simulation

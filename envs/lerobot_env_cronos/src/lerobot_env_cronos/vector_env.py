@@ -242,7 +242,15 @@ class CronosVectorEnv(gym.vector.VectorEnv):
 
     def render_streams(self, ids: np.ndarray) -> np.ndarray:
         """Frames (k, height, width, 3) uint8 of some streams."""
-        return self._observations.render(ids)
+        return self.render_positions(self.positions(ids))
+
+    def positions(self, ids: np.ndarray) -> np.ndarray:
+        """All that a picture of streams `ids` shows: MuJoCo's generalised positions now, float64 (k, nq)."""
+        return self.simulation.qpos[ids]
+
+    def render_positions(self, qpos: np.ndarray) -> np.ndarray:
+        """Frames (k, height, width, 3) uint8 at `render_size` of `positions`; any thread may ask for them."""
+        return self._observations.render(qpos)
 
     def call(self, name: str, *args, **kwargs) -> Sequence:
         """What LeRobot asks of the sub-environments of a vector env."""
