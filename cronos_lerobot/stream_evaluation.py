@@ -6,7 +6,7 @@ The streams are those of training (Algorithm 1 of the paper) without learning an
 a segment, tasks in the training cycle. `python -m lerobot_env_cronos.expert_ceiling` is the same for the expert.
 
 A second table says from which scenes the policy succeeds: how the segments' objects and receptacles lay when the
-task was given.
+task was given. `--picture` draws the streams that got stuck.
 """
 
 import argparse
@@ -20,10 +20,12 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.statistics import wilson_interval
+from PIL import Image
 from tqdm import tqdm
 
 from cronos_lerobot.loop_state import SegmentEnd, Step
 from cronos_lerobot.protocol import ProtocolConfig
+from cronos_lerobot.report.stream_sheet import draw_stream_sheet
 from cronos_lerobot.report.stream_video import Spectator, make_spectator
 from cronos_lerobot.resets import make_resets
 from cronos_lerobot.rf_mtrl import rf_mtrl
@@ -44,6 +46,11 @@ class Start(IntEnum):
     FREE = 4
     """The object lies beside the receptacles and the task's is free, as after a scene reset."""
 
+    @property
+    def words(self) -> str:
+        """For people."""
+        return f"begins {self.name.lower().replace('_', ' ')}"
+
 
 @dataclass(frozen=True)
 class StreamOutcomes:
@@ -53,6 +60,19 @@ class StreamOutcomes:
     """(num_segments, num_streams) bool."""
     start: np.ndarray
     """(num_segments, num_streams) `Start`."""
+    positions: np.ndarray
+    """(num_segments, num_streams, nq), MuJoCo's generalised positions at the end of each segment."""
+    instructions: list[list[str]]
+    """[num_segments][num_streams]."""
+
+    def stuck(self, count: int) -> np.ndarray:
+        """The `count` streams whose second half has the fewest tasks done by the policy, of equals the first.
+
+        Tasks that were complete from the start were not done by it.
+        """
+        half = len(self.success) // 2
+        done = self.success[half:] & (self.start[half:] != Start.COMPLETE)
+        return np.argsort(done.sum(axis=0), kind="stable")[:count]
 
 
 def classify_starts(env: CronosVectorEnv) -> np.ndarray:
@@ -90,7 +110,8 @@ def run_streams(
     task_set = TaskSet.of(env.scene, protocol)
     loop = task_set.new_loop(env.num_envs)
     total_steps = num_segments * protocol.task_switch_interval * env.num_envs
-    successes, starts = [], []
+    successes, starts, positions, instructions = [], [], [], []
+    last_step = protocol.task_switch_interval - 1
     with tqdm(total=total_steps, unit="step", unit_scale=True, disable=None) as bar:
         agent.begin_segment()
         for event in rf_mtrl(
@@ -101,10 +122,13 @@ def run_streams(
                 bar.update(env.num_envs)
                 if event.t % protocol.task_switch_interval == 0:
                     starts.append(classify_starts(env))  # a step late, in which nothing can be done
+                    instructions.append(list(event.instructions))
+                if event.t % protocol.task_switch_interval == last_step:
+                    positions.append(env.positions(np.arange(env.num_envs)))
             elif isinstance(event, SegmentEnd):
                 successes.append(event.success)
                 agent.begin_segment()
-    return StreamOutcomes(np.stack(successes), np.stack(starts))
+    return StreamOutcomes(np.stack(successes), np.stack(starts), np.stack(positions), instructions)
 
 
 Row = tuple[str, int, int, float, float, int]
@@ -134,6 +158,21 @@ def print_rows(title: str, rows: list[Row]) -> None:
         print(f"{name:>20}  {k / n:7.3f}  {low:.3f}-{high:.3f}  {n:>6d}  {complete / n:.3f}")
 
 
+def draw_stuck(
+    env: CronosVectorEnv, outcomes: StreamOutcomes, num_streams: int, num_segments: int, path: Path
+) -> None:
+    """Draw the most stuck streams at the end of their last segments."""
+    count = len(outcomes.success)
+    sheet = draw_stream_sheet(
+        env, outcomes.positions, outcomes.instructions, outcomes.success,
+        [[Start(start).words for start in segment] for segment in outcomes.start],
+        streams=outcomes.stuck(num_streams).tolist(), segments=range(max(count - num_segments, 0), count),
+    )  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # 256 colours show no difference in pictures this plain, and take a third of the space.
+    sheet.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
 def _parse_args() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--policy.path", dest="policy_path", required=True, help="checkpoint or Hub id")
@@ -145,6 +184,9 @@ def _parse_args() -> argparse.Namespace:
     parser.add_argument("--heuristic_reset", action="store_true", help="put back bodies that cannot be reached")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, help="CSV to write")
+    parser.add_argument("--picture", type=Path, help="PNG to draw: streams that are stuck, in their last segments")
+    parser.add_argument("--pictured_streams", type=int, default=4, help="rows of the picture")
+    parser.add_argument("--pictured_segments", type=int, default=4, help="columns of the picture")
     return parser.parse_args()
 
 
@@ -161,6 +203,8 @@ def main() -> None:
         heuristic_reset=args.heuristic_reset,
     )
     outcomes = run_streams(env, agent, protocol, args.num_segments, args.seed)
+    if args.picture is not None:
+        draw_stuck(env, outcomes, args.pictured_streams, args.pictured_segments, args.picture)
     env.close()
     tables = {"segment": rows_by_segment(outcomes), "start": rows_by_start(outcomes)}
     for title, rows in tables.items():

@@ -2,10 +2,19 @@
 
 import numpy as np
 from lerobot_env_cronos import CronosVectorEnv
+from PIL import Image
 
 from cronos_lerobot.protocol import ProtocolConfig
 from cronos_lerobot.report.stream_video import ExpertSpectator, Spectator
-from cronos_lerobot.stream_evaluation import Start, classify_starts, rows_by_segment, rows_by_start, run_streams
+from cronos_lerobot.stream_evaluation import (
+    Start,
+    StreamOutcomes,
+    classify_starts,
+    draw_stuck,
+    rows_by_segment,
+    rows_by_start,
+    run_streams,
+)
 
 PROTOCOL = ProtocolConfig(scene_reset_interval=None, end_effector_reset=True)
 
@@ -78,3 +87,27 @@ def test_bodies_out_of_reach_are_lost():
     env.simulation.move_body(np.array([2]), "cloth", np.array([[0.8, 0.5, -0.74, 1, 0, 0, 0]]))
     # All are told to put the bottle on the plate: the cloth does not matter.
     assert classify_starts(env).tolist() == [Start.FREE, Start.LOST, Start.FREE, Start.FREE]
+
+
+def test_streams_in_which_the_policy_did_nothing_are_stuck_and_drawn(tmp_path):
+    success = np.array([[1, 1, 0], [1, 0, 0], [1, 0, 1], [1, 0, 0]], bool)
+    start = np.full((4, 3), Start.FREE)
+    start[2:, 0] = Start.COMPLETE
+    env = make_env()
+    positions = np.repeat(env.positions(np.arange(3))[None], 4, axis=0)
+    outcomes = StreamOutcomes(success, start, positions, [["put it there"] * 3] * 4)
+    assert outcomes.stuck(2).tolist() == [0, 1]
+    draw_stuck(env, outcomes, 2, 3, tmp_path / "new" / "stuck.png")
+    with Image.open(tmp_path / "new" / "stuck.png") as picture:
+        assert picture.size == (3 * 326 + 6, 2 * 246 + 6)
+
+
+def test_positions_are_those_at_the_end_of_each_segment():
+    env = make_env()
+    protocol = ProtocolConfig(scene_reset_interval=None, end_effector_reset=False)
+    outcomes = run_streams(env, ExpertEverySecondSegment(env), protocol, 2)
+    np.testing.assert_array_equal(outcomes.positions[1], env.positions(np.arange(4)))
+    # The second segment only holds the arm where the first one moved it.
+    assert np.abs(outcomes.positions[1] - outcomes.positions[0]).max() < 0.2
+    first, second = outcomes.instructions
+    assert all(a != b for a, b in zip(first, second))
