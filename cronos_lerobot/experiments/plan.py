@@ -29,7 +29,7 @@ from cronos_lerobot.experiments.specs import (
     run_specs,
 )
 
-DEMO_FLAGS = ("--seed=1", "--noise.share=0.75", "--misses.share=0.25", "--steps_after_release=8")
+DIVERSE_DEMO_FLAGS = ("--noise.share=0.75", "--misses.share=0.25", "--steps_after_release=8")
 """Noise and misses show how to recover, the frames after the release that a finished task is left alone."""
 LAST_POLICY = Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR)
 
@@ -56,7 +56,8 @@ def base_jobs(scene: str, options: Options) -> list[Job]:
     pixels = OBS_NAMES[options.obs_type] == "pixels"
     dataset = (f"--dataset.repo_id=local/{folder.name}", f"--dataset.root={folder / 'demos'}")
     record = ["cronos-record-demos", "--env.type=cronos", f"--env.scene={scene}", *dataset]
-    record += [f"--env.obs_type={options.obs_type}", f"--dataset.num_episodes={recipe.demos}", *DEMO_FLAGS]
+    record += [f"--env.obs_type={options.obs_type}", f"--dataset.num_episodes={recipe.demos}", "--seed=1"]
+    record += [] if recipe.clean else DIVERSE_DEMO_FLAGS
     clone = ["lerobot-train", "--policy.type=pocketvla", "--policy.device=cpu", "--policy.push_to_hub=false"]
     clone += [*dataset, f"--batch_size={recipe.clone_batch}", f"--steps={recipe.clone_steps}"]
     clone += [f"--save_freq={recipe.save_freq}", "--log_freq=40", "--wandb.enable=false", "--seed=1"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from cronos_lerobot.experiments.definitions import LONG, SHORT
 
@@ -59,6 +59,9 @@ class BaseRecipe:
     """The step whose policy is the base: a quarter, half, three quarters or all of `clone_steps`."""
     clone_batch: int = 256
     """Frames of a gradient step."""
+    clean: bool = False
+    """Whether the demonstrations have no noise, no missed grasps and no frames after the release: the arm always
+    comes from home, which is the bias of the paper's base policy (Section 5)."""
 
     def __post_init__(self) -> None:
         valid = [*range(self.save_freq, self.clone_steps, self.save_freq), self.clone_steps]
@@ -81,6 +84,10 @@ BASE_RECIPES: dict[tuple[str, str], BaseRecipe] = {
 }
 """By scene and kind of observation. Those of kitchen_2x2 are measured (docs/results.md), the others have as many
 demonstrations and gradient steps for each task."""
+CLEAN_RECIPES: dict[tuple[str, str], BaseRecipe] = {
+    ("kitchen_2x2", STATE): BaseRecipe(400, 640, checkpoint=480, clean=True),
+}
+"""The same from clean demonstrations, where that is measured."""
 SMOKE_RECIPE = BaseRecipe(8, 5, checkpoint=5, clone_batch=32)
 
 ALGORITHM_FLAGS = {
@@ -90,17 +97,19 @@ ALGORITHM_FLAGS = {
 """Flags of `cronos-train` that learn from each kind of observation."""
 
 
-def base_recipe(scale: Scale, scene: str, obs_type: str) -> BaseRecipe:
-    """The recipe of a scene's base policy.
+def base_recipe(scale: Scale, scene: str, obs_type: str, *, clean: bool = False) -> BaseRecipe:
+    """The recipe of a scene's base policy, on request from clean demonstrations.
 
     Raises:
         ValueError: there is none; one can be given with --policy.path.
     """
     if scale.smoke:
-        return SMOKE_RECIPE
-    if (scene, obs_type) not in BASE_RECIPES:
-        known = ", ".join(f"{s}/{o}" for s, o in BASE_RECIPES)
+        return replace(SMOKE_RECIPE, clean=clean)
+    recipes = CLEAN_RECIPES if clean else BASE_RECIPES
+    if (scene, obs_type) not in recipes:
+        known = ", ".join(f"{s}/{OBS_NAMES[o]}" for s, o in recipes)
+        kind = "clean base policy" if clean else "base policy"
         raise ValueError(
-            f"no recipe for a base policy of {scene}/{obs_type}; there are {known}: use --policy.path"
+            f"no recipe for a {kind} of {scene}/{OBS_NAMES[obs_type]}; there are {known}: use --policy.path"
         )
-    return BASE_RECIPES[scene, obs_type]
+    return recipes[scene, obs_type]

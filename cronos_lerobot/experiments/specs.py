@@ -112,7 +112,7 @@ def base_folder(scene: str, options: Options) -> Path:
     The recipe is part of its name, and so of the runs' commands: another recipe makes other runs.
     """
     recipe = options.recipes[scene]
-    made = f"{recipe.demos}demos_{recipe.clone_steps}steps"
+    made = f"{recipe.demos}{'clean' if recipe.clean else ''}demos_{recipe.clone_steps}steps"
     return options.root / "base" / f"{scene}_{OBS_NAMES[options.obs_type]}_{made}"
 
 

@@ -50,6 +50,8 @@ examples:
       cronos-reproduce figure3 --dry_run
   draw what there is so far
       cronos-reproduce table1 --scale=small --report_only
+  the paper's bias at its strongest: a base policy that has only seen the arm come from home
+      cronos-reproduce table1 --base.clean=true --root=outputs/reproduce_clean
   from pixels, with a base policy and a setting of one's own
       cronos-reproduce table1 --obs_type=pixels_agent_pos --policy.path=me/policy -- --algorithm.target_kl=0.02
 
@@ -97,6 +99,11 @@ def make_parser() -> argparse.ArgumentParser:
         ("checkpoint", "the step of the cloning whose policy is taken: a quarter, half, 3/4 or all of them"),
     ):
         parser.add_argument(f"--base.{name}", dest=f"base_{name}", type=int, metavar="N", help=text)
+    parser.add_argument(
+        "--base.clean", dest="base_clean", nargs="?", const=True, default=False, type=parse_bool,
+        metavar="true|false",
+        help="clone it from demonstrations that go straight from home to success, as the paper's do",
+    )  # fmt: skip
     parser.add_argument("--temperature", type=float, default=0.6, help="of every evaluation (default: 0.6)")
     parser.add_argument(
         "--root", type=Path, default=ROOT, help=f"holds base policies and runs, shared by all (default: {ROOT})"
@@ -169,7 +176,8 @@ def make_options(args: argparse.Namespace, extra: list[str], scenes: Iterable[st
     if "clone_steps" in changes:
         changes.setdefault("checkpoint", changes["clone_steps"])
     needed = () if args.policy_path else scenes
-    recipes = {scene: replace(base_recipe(scale, scene, obs_type), **changes) for scene in needed}
+    made = {scene: base_recipe(scale, scene, obs_type, clean=args.base_clean) for scene in needed}
+    recipes = {scene: replace(recipe, **changes) for scene, recipe in made.items()}
     seeds = parse_seeds(args.seeds, scale.seeds)
     from cronos_lerobot.experiments.specs import Options
 
