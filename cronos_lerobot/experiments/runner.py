@@ -64,7 +64,8 @@ class Runner:
         if parallel < 1:
             raise ValueError(f"at least one job must run at a time, got {parallel}")
         self.parallel, self.display = parallel, display
-        self.environment = os.environ | (environment or {})
+        # Unbuffered, so that a log says in time, and in order, what its command does.
+        self.environment = os.environ | {"PYTHONUNBUFFERED": "1"} | (environment or {})
         self.states: dict[str, str] = {}
         self._children: list[_Child] = []
         self._elsewhere: set[str] = set()
