@@ -23,13 +23,18 @@ from lerobot_env_cronos.statistics import wilson_interval
 from PIL import Image
 from tqdm import tqdm
 
+from cronos_lerobot.data.png import encode_palette_png
 from cronos_lerobot.loop_state import SegmentEnd, Step
 from cronos_lerobot.protocol import ProtocolConfig
+from cronos_lerobot.report.overlay import Status
 from cronos_lerobot.report.stream_sheet import draw_stream_sheet
 from cronos_lerobot.report.stream_video import Spectator, make_spectator
 from cronos_lerobot.resets import make_resets
 from cronos_lerobot.rf_mtrl import rf_mtrl
 from cronos_lerobot.task_orders import TaskSet, make_task_order
+
+PICTURED_STREAMS, PICTURED_SEGMENTS = 4, 4
+"""Rows and columns of `--picture`."""
 
 
 class Start(IntEnum):
@@ -45,11 +50,6 @@ class Start(IntEnum):
     """The object lies beside the receptacles, but another one is on the task's."""
     FREE = 4
     """The object lies beside the receptacles and the task's is free, as after a scene reset."""
-
-    @property
-    def words(self) -> str:
-        """For people."""
-        return f"begins {self.name.lower().replace('_', ' ')}"
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,19 @@ class StreamOutcomes:
         half = len(self.success) // 2
         done = self.success[half:] & (self.start[half:] != Start.COMPLETE)
         return np.argsort(done.sum(axis=0), kind="stable")[:count]
+
+    def describe(self, segment: int, stream: int) -> Status:
+        """What a picture of the end of a segment says."""
+        return Status(
+            self.instructions[segment][stream],
+            segment,
+            len(self.success),
+            succeeded=bool(self.success[segment, stream]),
+            interventions=0,
+            outcomes=self.success[: segment + 1, stream].tolist(),
+            caption=f"stream {stream}",
+            message=f"begins {Start(self.start[segment, stream]).name.lower().replace('_', ' ')}",
+        )
 
 
 def classify_starts(env: CronosVectorEnv) -> np.ndarray:
@@ -158,19 +171,14 @@ def print_rows(title: str, rows: list[Row]) -> None:
         print(f"{name:>20}  {k / n:7.3f}  {low:.3f}-{high:.3f}  {n:>6d}  {complete / n:.3f}")
 
 
-def draw_stuck(
-    env: CronosVectorEnv, outcomes: StreamOutcomes, num_streams: int, num_segments: int, path: Path
-) -> None:
-    """Draw the most stuck streams at the end of their last segments."""
-    count = len(outcomes.success)
-    sheet = draw_stream_sheet(
-        env, outcomes.positions, outcomes.instructions, outcomes.success,
-        [[Start(start).words for start in segment] for segment in outcomes.start],
-        streams=outcomes.stuck(num_streams).tolist(), segments=range(max(count - num_segments, 0), count),
-    )  # fmt: skip
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # 256 colours show no difference in pictures this plain, and take a third of the space.
-    sheet.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+def draw_stuck(env: CronosVectorEnv, outcomes: StreamOutcomes) -> Image.Image:
+    """The most stuck streams, one a row, at the end of their last segments."""
+    num_segments = len(outcomes.success)
+    last = range(max(num_segments - PICTURED_SEGMENTS, 0), num_segments)
+    stuck = outcomes.stuck(PICTURED_STREAMS)
+    return draw_stream_sheet(
+        env, [[(outcomes.positions[s, i], outcomes.describe(s, i)) for s in last] for i in stuck]
+    )
 
 
 def _parse_args() -> argparse.Namespace:
@@ -185,8 +193,6 @@ def _parse_args() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, help="CSV to write")
     parser.add_argument("--picture", type=Path, help="PNG to draw: streams that are stuck, in their last segments")
-    parser.add_argument("--pictured_streams", type=int, default=4, help="rows of the picture")
-    parser.add_argument("--pictured_segments", type=int, default=4, help="columns of the picture")
     return parser.parse_args()
 
 
@@ -204,7 +210,8 @@ def main() -> None:
     )
     outcomes = run_streams(env, agent, protocol, args.num_segments, args.seed)
     if args.picture is not None:
-        draw_stuck(env, outcomes, args.pictured_streams, args.pictured_segments, args.picture)
+        args.picture.parent.mkdir(parents=True, exist_ok=True)
+        args.picture.write_bytes(encode_palette_png(draw_stuck(env, outcomes)))
     env.close()
     tables = {"segment": rows_by_segment(outcomes), "start": rows_by_start(outcomes)}
     for title, rows in tables.items():

@@ -8,6 +8,7 @@ import numpy as np
 from lerobot_env_cronos import Benchmark, CronosVectorEnv
 from PIL import Image, ImageDraw
 
+from cronos_lerobot.data.png import encode_palette_png
 from cronos_lerobot.report.task_pictures import CAMERAS, PICTURE, caption_font, draw_sheet
 
 ROW_PICTURE = (320, 240)
@@ -56,7 +57,9 @@ def task_sheet(benchmark: Benchmark) -> bytes:
     starts = benchmark.configurations["train"]
     poses = starts[np.arange(len(tasks)) % len(starts)]
     frames = render_poses(benchmark, poses, (2 * PICTURE[0], 2 * PICTURE[1]), CAMERAS)
-    return _png(draw_sheet([(task.instruction, shown) for task, shown in zip(tasks, frames, strict=True)]))
+    return encode_palette_png(
+        draw_sheet([(task.instruction, shown) for task, shown in zip(tasks, frames, strict=True)])
+    )
 
 
 def configuration_pictures(benchmark: Benchmark) -> dict[str, list[bytes]]:
@@ -83,14 +86,7 @@ def configuration_sheet(pictures: dict[str, list[bytes]]) -> bytes:
             picture = Image.open(io.BytesIO(row)).resize(SHEET_PICTURE, Image.Resampling.LANCZOS)
             place = (gap + j % SHEET_COLUMNS * (width + gap), y + caption + j // SHEET_COLUMNS * (height + gap))
             sheet.paste(picture, place)
-    return _png(sheet)
-
-
-def _png(picture: Image.Image) -> bytes:
-    # 256 colours show no difference in pictures this plain, and take a third of the space.
-    buffer = io.BytesIO()
-    picture.quantize(256, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
-    return buffer.getvalue()
+    return encode_palette_png(sheet)
 
 
 def _jpeg(frame: np.ndarray) -> bytes:

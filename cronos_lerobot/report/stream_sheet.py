@@ -1,4 +1,4 @@
-"""A sheet of pictures of streams: one row for each stream, one picture for the end of each segment."""
+"""A sheet of pictures of streams, with what happens in them written on each."""
 
 from __future__ import annotations
 
@@ -15,39 +15,18 @@ PICTURE = (320, 240)
 GAP = 6
 
 
-def draw_stream_sheet(
-    env: CronosVectorEnv,
-    positions: np.ndarray,
-    instructions: Sequence[Sequence[str]],
-    success: np.ndarray,
-    starts: Sequence[Sequence[str]],
-    *,
-    streams: Sequence[int],
-    segments: Sequence[int],
-) -> Image.Image:
-    """Draw the chosen streams at the end of the chosen segments.
+def draw_stream_sheet(env: CronosVectorEnv, rows: Sequence[Sequence[tuple[np.ndarray, Status]]]) -> Image.Image:
+    """Draw a sheet of pictures.
 
     Args:
         env: draws.
-        positions: (num_segments, num_streams, nq) at the end of every segment.
-        instructions: [segment][stream].
-        success: (num_segments, num_streams) bool, the task was complete after any step.
-        starts: [segment][stream], how the scene lay when the task was given, in words.
-        streams: rows of the sheet.
-        segments: columns of the sheet.
+        rows: of the sheet, all of one length: a state (nq,), see `CronosVectorEnv.positions`, and its overlay.
     """
     width, height = PICTURE
-    size = (len(segments) * (width + GAP) + GAP, len(streams) * (height + GAP) + GAP)
-    sheet = Image.new("RGB", size, "white")
-    for row, stream in enumerate(streams):
-        for column, segment in enumerate(segments):
-            done = bool(success[segment, stream])
-            status = Status(
-                instructions[segment][stream], segment, len(positions), succeeded=done, interventions=0,
-                outcomes=success[: segment + 1, stream].tolist(), caption=f"stream {stream}",
-                message=starts[segment][stream],
-            )  # fmt: skip
-            frame = draw_status(env.render_positions(positions[segment, stream][None])[0], status)
-            picture = Image.fromarray(frame).resize(PICTURE, Image.Resampling.LANCZOS)
-            sheet.paste(picture, (GAP + column * (width + GAP), GAP + row * (height + GAP)))
+    sheet = Image.new("RGB", (len(rows[0]) * (width + GAP) + GAP, len(rows) * (height + GAP) + GAP), "white")
+    for i, row in enumerate(rows):
+        frames = env.render_positions(np.stack([positions for positions, _ in row]))
+        for j, (frame, (_, status)) in enumerate(zip(frames, row, strict=True)):
+            picture = Image.fromarray(draw_status(frame, status)).resize(PICTURE, Image.Resampling.LANCZOS)
+            sheet.paste(picture, (GAP + j * (width + GAP), GAP + i * (height + GAP)))
     return sheet
