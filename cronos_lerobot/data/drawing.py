@@ -1,7 +1,7 @@
 """Pictures that are drawn when they are written: a stream keeps the state of each step, the writer's thread draws.
 
 A frame of 640 x 480 takes software rendering milliseconds, which the training loop should not wait for, and its
-pixels take ten thousand times the memory of the state.
+pixels take some thousand times the memory of the state.
 """
 
 from collections.abc import Callable

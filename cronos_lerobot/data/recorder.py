@@ -64,7 +64,7 @@ class StreamRecorder:
             num_envs: streams the loop runs, n of the arrays of `on_step`.
             segment_length: the most steps between two task switches (K), the buffers' capacity.
             streams: how many of the streams to record, the first ones, or "all".
-            cameras: whose pictures are drawn when they are written, by feature.
+            cameras: whose pictures are drawn when they are written, by name.
 
         Raises:
             ValueError: `streams` is neither "all" nor between 1 and `num_envs`.
@@ -79,7 +79,7 @@ class StreamRecorder:
         self.num_envs = num_envs
         self.num_streams = streams
         self.segment_length = segment_length
-        self._cameras = dict(cameras or {})
+        self._cameras = {f"{OBS_IMAGES}.{name}": camera for name, camera in (cameras or {}).items()}
         self._written: deque[dict[str, np.ndarray]] = deque()
         self._lengths = np.zeros(streams, dtype=np.int64)
         self._tasks = [""] * streams
@@ -126,8 +126,9 @@ class StreamRecorder:
             writer = SegmentWriter(repo_id, root, features, fps, **writer_options)
         else:
             writer = SegmentWriter.resume(repo_id, root, state["writer"], **writer_options)
-        late = {f"{OBS_IMAGES}.{name}": camera for name, camera in (cameras or {}).items()}
-        recorder = cls(writer, num_envs=env.num_envs, segment_length=segment_length, streams=streams, cameras=late)
+        recorder = cls(
+            writer, num_envs=env.num_envs, segment_length=segment_length, streams=streams, cameras=cameras
+        )
         if state is not None:
             recorder.load_partial_segments(state)
         return recorder

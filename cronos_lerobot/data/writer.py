@@ -28,7 +28,7 @@ FLUSH_INTERVAL_S = 20.0
 """Age of the oldest segment not on disk at which all are written [s]. A full queue takes a few seconds more to
 encode, so that what ended 30 s ago is on disk."""
 
-Pixels = np.ndarray | UndrawnFrames
+Column = np.ndarray | UndrawnFrames
 
 
 class RecordingError(RuntimeError):
@@ -37,7 +37,7 @@ class RecordingError(RuntimeError):
 
 @dataclass
 class _Segment:
-    frames: Mapping[str, Pixels]
+    frames: Mapping[str, Column]
     task: str
     metadata: Mapping[str, Any]
     written: Callable[[], None] | None = None
@@ -146,7 +146,7 @@ class SegmentWriter:
 
     def add_segment(
         self,
-        frames: Mapping[str, Pixels],
+        frames: Mapping[str, Column],
         task: str,
         *,
         episode_metadata: Mapping[str, Any] | None = None,
@@ -256,7 +256,7 @@ class SegmentWriter:
         if self._failure is not None:
             raise RecordingError(f"writing to {self.root} failed: {self._failure}") from self._failure
 
-    def _check_frames(self, frames: Mapping[str, Pixels]) -> None:
+    def _check_frames(self, frames: Mapping[str, Column]) -> None:
         if set(frames) != set(self.features):
             missing, unknown = set(self.features) - set(frames), set(frames) - set(self.features)
             raise ValueError(f"segment lacks {sorted(missing)} and has unknown {sorted(unknown)}")
@@ -319,7 +319,7 @@ class SegmentWriter:
         if item.written is not None:
             item.written()
 
-    def _draw(self, frames: Mapping[str, Pixels]) -> dict[str, np.ndarray]:
+    def _draw(self, frames: Mapping[str, Column]) -> dict[str, np.ndarray]:
         drawn = {}
         for key, array in frames.items():
             if isinstance(array, UndrawnFrames):
