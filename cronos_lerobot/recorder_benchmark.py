@@ -27,6 +27,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from lerobot_env_cronos.expert import ScriptedExpert
 
+from cronos_lerobot.data.drawing import LateCamera
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.schema import Intervention
 from cronos_lerobot.data.video import fast_encoder
@@ -61,23 +62,29 @@ class Recording:
     """
 
     def __init__(self, num_streams: int, height: int, width: int, steps: int) -> None:
-        self.env = CronosVectorEnv(num_streams, observation_height=height, observation_width=width)
+        self.env = CronosVectorEnv(
+            num_streams, observation_height=height, observation_width=width, render_size=(height, width)
+        )
+        self.camera = LateCamera(height, width, self.env.simulation.model.nq, self.env.render_positions)
         tasks = self.env.scene.tasks
         self.env.set_task(np.arange(num_streams), [tasks[i % len(tasks)] for i in range(num_streams)])
         expert = ScriptedExpert(self.env)
         expert.reset(np.arange(num_streams))
-        observation, self.steps = self.env.observe(), []
+        observation, self.steps, self.positions = self.env.observe(), [], []
         for _ in range(steps):
+            self.positions.append(self.env.positions(np.arange(num_streams)))
             action = expert.act().astype(np.float32)
             following, reward, *_, info = self.env.step(action)
             self.steps.append((observation, action, reward, info["is_success"]))
             observation = following
 
-    def write(self, recorder: StreamRecorder) -> None:
-        """Hand all steps to a recorder, as the training loop does."""
+    def write(self, recorder: StreamRecorder, *, drawn: bool = True) -> None:
+        """Hand all steps to a recorder, as the training loop does; if not `drawn`, states in place of pictures."""
         n = self.env.num_envs
         zeros, numbers = np.zeros(n, np.float32), np.zeros(n, np.int64)
         for t, (observation, action, reward, success) in enumerate(self.steps):
+            if not drawn:
+                observation = observation | {"pixels": dict.fromkeys(observation["pixels"], self.positions[t])}
             recorder.on_step(
                 observation, self.env.instructions, action, reward, success, zeros, zeros, 0,
                 interventions=np.full(n, Intervention.NONE if t else Intervention.INITIAL),
@@ -121,6 +128,11 @@ def compare_writers(
     recorder = StreamRecorder.open(recording.env, REPO_ID, ours, segment_length=steps)
     features, fps = recorder.writer.features, int(recording.env.metadata["render_fps"])
     yield "StreamRecorder", measure(frames, ours, partial(recording.write, recorder))
+    late = StreamRecorder.open(
+        recording.env, REPO_ID, folder / "drawn", segment_length=steps, cameras={"front": recording.camera}
+    )
+    write = partial(recording.write, late, drawn=False)
+    yield "StreamRecorder, drawing too", measure(frames, folder / "drawn", write)
     segments = list(recording.segments(ours))
     names = ("LeRobot, its defaults", "LeRobot, streaming, our codec")
     for is_fast, name in enumerate(names):
