@@ -43,24 +43,34 @@ class DummyEnv:
         self.lost: set[tuple[int, int]] = set()
         self.tasks = [TASKS[0]] * num_envs
         self.x = np.zeros(num_envs)
+        self.moved = 0
         self.t = 0
         self.diverge_at = diverge_at or set()
         self.calls: list = []
 
     def step(self, actions):
-        assert actions.shape == (self.num_envs, 7)
         self.calls.append("step")
-        self.x = np.clip(self.x + 0.2 * actions[:, 0], -3, 3)
-        success = np.abs(self.x - [task.goal for task in self.tasks]) < 0.3
+        reward, diverged = self.step_streams(actions, np.arange(self.num_envs))
+        never = np.zeros(self.num_envs, bool)
+        info = {"is_success": self.is_success, "is_grasped": never, "diverged": diverged}
+        return self._observation(), reward, never, never, info
+
+    def step_streams(self, actions, ids):
+        assert actions.shape == (self.num_envs, 7)
+        self.x[ids] = np.clip(self.x[ids] + 0.2 * actions[ids, 0], -3, 3)
+        self.moved += len(ids)
         diverged = np.array([(self.t, i) in self.diverge_at for i in range(self.num_envs)])
         self.t += 1
-        never = np.zeros(self.num_envs, bool)
-        info = {"is_success": success, "is_grasped": never, "diverged": diverged}
-        return self._observation(), success.astype(np.float32), never, never, info
+        return self.is_success.astype(np.float32), diverged
 
-    def observe(self):
+    @property
+    def is_success(self):
+        return np.abs(self.x - [task.goal for task in self.tasks]) < 0.3
+
+    def observe(self, ids=None):
         self.calls.append("observe")
-        return self._observation()
+        observation = self._observation()
+        return observation if ids is None else {"agent_pos": observation["agent_pos"][ids]}
 
     def _observation(self):
         agent_pos = np.zeros((self.num_envs, 13), np.float32)

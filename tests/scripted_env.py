@@ -13,7 +13,7 @@ class ScriptedEnv(SequentialVectorEnv):
         self.script, self.diverge_at, self.homed, self.clock, self.stepped = script, diverge_at, [], 0, []
         super().__init__(len(script), ordering=TASKS, obs_type="environment_state_agent_pos", **kwargs)
 
-    def _step_physics(self, actions, ids):
+    def step_streams(self, actions, ids):
         self.clock += 1
         self.stepped.append(ids.tolist())
         due = [self.script[i][TASKS.index(self.tasks[i])] for i in range(self.num_envs)]

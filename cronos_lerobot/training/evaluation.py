@@ -123,16 +123,25 @@ def _rollout(
     num_steps: int,
     num_episodes: int,
 ) -> np.ndarray:
-    """Return (num_envs,) bool, whether the task was complete at any step; stops once all counted ones were."""
+    """Return (num_envs,) bool, whether the task was complete at any step.
+
+    An episode ends with its success: only the others are simulated and observed any further. The policy sees the
+    whole batch, the last observation of those that ended, so that every episode keeps its random numbers.
+    """
     instructions = [task.instruction for task in env.tasks]
     succeeded = np.zeros(env.num_envs, np.bool_)
-    observation = env.observe()
+    columns = {key: rows.copy() for key, rows in observation_columns(env.observe()).items()}
+    running = np.arange(num_episodes)
     for _ in range(num_steps):
-        batch = processors.batch(observation_columns(observation), instructions)
-        sample = policy.sample_actions(batch, temperature=temperature, generator=generator)
-        observation, _, _, _, info = env.step(processors.physical_actions(sample["action"]))
+        sample = policy.sample_actions(
+            processors.batch(columns, instructions), temperature=temperature, generator=generator
+        )
+        _, diverged = env.step_streams(processors.physical_actions(sample["action"]), running)
         # A simulation that broke down proves nothing, whatever it shows.
-        succeeded |= info["is_success"] & ~info["diverged"]
-        if succeeded[:num_episodes].all():
+        succeeded[running] = (env.is_success & ~diverged)[running]
+        running = running[~succeeded[running]]
+        if not len(running):
             break
+        for key, rows in observation_columns(env.observe(running)).items():
+            columns[key][running] = rows
     return succeeded

@@ -47,6 +47,31 @@ def test_a_success_counts_at_any_step_and_80_steps_are_all():
     assert policy.calls == 80
 
 
+@pytest.mark.parametrize("num_envs", [2, 4])
+def test_an_episode_is_simulated_until_its_success(num_envs):
+    env = DummyEnv(num_envs)
+    # From -0.375 and 0.125, 0.2 a step, to within 0.3 of 1.0.
+    evaluate_independent(env, [TASKS[0]], ScriptedPolicy(), PROCESSORS, configurations=[1, 5])
+    assert env.moved == 6 + 3
+
+
+def test_it_succeeds_as_if_all_episodes_were_simulated_to_the_end():
+    env, policy, succeeded = DummyEnv(8), DummyPolicy(seed=1), np.zeros(8, bool)
+    env.scene_reset(np.arange(8), np.arange(8))
+    generator = torch.Generator().manual_seed(5)
+    observation = env.observe()
+    for _ in range(12):
+        batch = PROCESSORS.batch({"observation.state": observation["agent_pos"]}, [TASKS[0].instruction] * 8)
+        actions = policy.sample_actions(batch, temperature=0.6, generator=generator)["action"]
+        observation, _, _, _, info = env.step(PROCESSORS.physical_actions(actions))
+        succeeded |= info["is_success"]
+    result = evaluate_independent(
+        DummyEnv(8), [TASKS[0]], policy, PROCESSORS, configurations=range(8), temperature=0.6, seed=5, num_steps=12
+    )
+    assert result.successes[TASKS[0].instruction] == succeeded.tolist()
+    assert 0 < succeeded.sum() < 8
+
+
 def test_split_and_configurations_reach_the_environment():
     seen = []
 

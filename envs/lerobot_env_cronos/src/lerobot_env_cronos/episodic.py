@@ -85,7 +85,7 @@ class IndependentVectorEnv(EpisodicVectorEnv):
     def step(self, actions: np.ndarray):
         """Step the unfinished episodes; see `CronosVectorEnv.step`."""
         running = self._all[~self.done]
-        reward, diverged = self._step_physics(actions, running)
+        reward, diverged = self.step_streams(actions, running)
         reward[self.done] = 0.0
         success = self.is_success & ~self.done
         self._elapsed[running] += 1

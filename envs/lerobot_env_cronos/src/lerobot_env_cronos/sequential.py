@@ -122,7 +122,7 @@ class SequentialVectorEnv(EpisodicVectorEnv):
         """`step` without an observation: apply actions (n, 7) to the running chains and do the bookkeeping."""
         running, position = ~self.done, self.position.copy()
         ids = self._all[running]
-        _, diverged = self._step_physics(actions, ids)
+        _, diverged = self.step_streams(actions, ids)
         self._elapsed[ids] += 1
         # A simulation that broke down proves nothing, whatever it shows, and cannot go on.
         task_success = running & self.is_success & ~self._is_complete & ~diverged

@@ -119,11 +119,15 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         Raises:
             ValueError: wrong shape, or an action that is not finite.
         """
-        reward, diverged = self._step_physics(actions, self._all)
+        reward, diverged = self.step_streams(actions, self._all)
         never = np.zeros(self.num_envs, dtype=bool)
         return self.observe(), reward, never, never.copy(), self._info() | {"diverged": diverged}
 
-    def _step_physics(self, actions: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def step_streams(self, actions: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`step` for streams `ids` (k,) alone, without an observation; the others stay as they are.
+
+        Returns the reward (n,) and `diverged` (n,); `is_success` and `is_grasped` are attributes.
+        """
         actions = np.asarray(actions, dtype=np.float64)
         if actions.shape != (self.num_envs, 7):
             raise ValueError(f"actions must have shape ({self.num_envs}, 7), got {actions.shape}")
