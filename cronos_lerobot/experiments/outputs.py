@@ -13,6 +13,7 @@ from cronos_lerobot.experiments.definitions import Experiment, Row
 from cronos_lerobot.experiments.results import ExperimentResult, RowResult, collect, paper_results
 from cronos_lerobot.experiments.specs import Options, base_policy
 from cronos_lerobot.metrics import Summary
+from cronos_lerobot.report.statistics import Rate
 from cronos_lerobot.report.tables import write_csv
 from cronos_lerobot.training.logging import METRICS
 
@@ -29,6 +30,7 @@ def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options,
         name: tables.main_rows(result),
         f"{name}_curves": tables.curve_rows(result),
         f"{name}_segments": tables.segment_rows(result),
+        f"{name}_tasks": tables.task_rows(result),
         f"{name}_sequential": tables.sequential_rows(result),
     }
     for file, table in data.items():
@@ -88,6 +90,7 @@ def markdown(result: ExperimentResult, figures: Sequence[str]) -> str:
     lines += _section("What the text says", _claim_columns(tables.claim_rows(result)))
     lines += _section("Sequences of tasks", _sequential_columns(tables.sequential_rows(result)))
     lines += _section("Success while training, by segment since the last scene reset", _segment_columns(result))
+    lines += _section("Success while training, by quarter of the run", _quarter_columns(result))
     for file in figures:
         lines += ["", f"![{file}]({file})"]
     lines += _unfinished(result)
@@ -204,6 +207,21 @@ def _segment_columns(result: ExperimentResult) -> Columns:
     columns: Columns = {"": [row.row.label for row in rows]}
     for segment in sorted({segment for _, segment in rates}):
         columns[str(segment + 1)] = [_number(rates.get((row.row.name, segment)), 2) for row in rows]
+    return columns
+
+
+def _quarter_columns(result: ExperimentResult) -> Columns:
+    rates: dict[tuple[str, bool], dict[int, Rate]] = {}
+    for row in tables.task_rows(result):
+        quarters = rates.setdefault((row["row"], row["is_reset_task"]), {})
+        quarters[row["quarter"]] = quarters.get(row["quarter"], Rate(0, 0)) + Rate(row["successes"], row["n"])
+    if not rates:
+        return {}
+    labels = {row.row.name: row.row.label for row in result.rows}
+    columns: Columns = {"": [labels[name] + ", reset tasks" * is_reset for name, is_reset in rates]}
+    for quarter in sorted({quarter for quarters in rates.values() for quarter in quarters}):
+        found = [quarters.get(quarter) for quarters in rates.values()]
+        columns[str(quarter)] = [_number(rate.value if rate else None, 2) for rate in found]
     return columns
 
 

@@ -82,8 +82,8 @@ BASE_RECIPES: dict[tuple[str, str], BaseRecipe] = {
     ("playroom_2x2", PIXELS): BaseRecipe(800, 1200, checkpoint=900),
     ("kitchen_3x3", PIXELS): BaseRecipe(1800, 2700, checkpoint=2025),
 }
-"""By scene and kind of observation. Measured (docs/experiments.md), but for those from pixels of the last two scenes,
-which have as many demonstrations and gradient steps for each task as kitchen_2x2."""
+"""By scene and kind of observation. Measured (docs/experiments.md), but for those from pixels of the other
+scenes, which have as many demonstrations and gradient steps for each task as kitchen_2x2."""
 CLEAN_RECIPES: dict[tuple[str, str], BaseRecipe] = {
     ("kitchen_2x2", STATE): BaseRecipe(400, 640, checkpoint=480, clean=True),
 }

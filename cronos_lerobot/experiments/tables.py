@@ -10,7 +10,7 @@ import numpy as np
 from cronos_lerobot.experiments.definitions import INTERACTION_STEPS, INTERVENTIONS
 from cronos_lerobot.experiments.results import ExperimentResult, RowResult, paper_results, sequential
 from cronos_lerobot.metrics import Summary, interpolate, summarise
-from cronos_lerobot.report.series import segment_rates
+from cronos_lerobot.report.series import segment_rates, task_rates
 
 Row = dict[str, Any]
 TICK = {True: "✓", False: "–"}
@@ -85,6 +85,16 @@ def segment_rows(result: ExperimentResult) -> list[Row]:
         {"row": row.row.name, "segment": segment, "success": rate.value, "successes": rate.successes, "n": rate.n}
         for row in result.rows
         for segment, rate in segment_rates(row.group).items()
+    ]
+
+
+def task_rows(result: ExperimentResult) -> list[Row]:
+    """Success while training by quarter of the runs and instruction; those of learned resets are told apart."""
+    return [
+        {"row": row.row.name, "quarter": quarter + 1, "is_reset_task": instruction not in result.tasks}
+        | {"task": instruction, "success": rate.value, "successes": rate.successes, "n": rate.n}
+        for row in result.rows
+        for (quarter, instruction), rate in task_rates(row.group).items()
     ]
 
 

@@ -74,6 +74,17 @@ def segment_rates(group: Group, last_part: float = LAST_PART) -> dict[int, Rate]
     return dict(sorted(rates.items()))
 
 
+def task_rates(group: Group, parts: int = 4) -> dict[tuple[int, str], Rate]:
+    """Success while training by part of the run (0 is the first) and instruction, learned resets' among them."""
+    rates: dict[tuple[int, str], Rate] = {}
+    for run in group.runs:
+        for i, update in enumerate(run.updates):
+            for instruction, (successes, n) in update["rollout"]["success_by_task"].items():
+                key = (i * parts // len(run.updates), instruction)
+                rates[key] = rates.get(key, Rate(0, 0)) + Rate(successes, n)
+    return dict(sorted(rates.items()))
+
+
 def _last_updates(run: TrainingRun, last_part: float) -> list[Record]:
     """The last part of a run, at least one whole cycle between two scene resets where there is one."""
     if not run.updates:

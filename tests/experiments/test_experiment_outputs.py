@@ -240,6 +240,29 @@ def test_files_of_table1(options, tmp_path):
         assert len({tuple(pixel) for pixel in picture[::7, ::7, :3].reshape(-1, 3).tolist()}) > 5
 
 
+def test_tasks_and_reset_tasks_by_quarter(options, tmp_path):
+    task, reset = INSTRUCTIONS[0], "put it on the table"
+    for seed in (1, 2):
+        spec = make_run(options, "table1", "t1280_eer_cl_lsr", seed, (2, 4, 4))
+        metrics = spec.train_folder / "metrics.jsonl"
+        records = [json.loads(line) for line in metrics.read_text().splitlines()]
+        for number, record in enumerate(r for r in records if r["kind"] == "update"):
+            # Updates 0 and 1 are the first quarter of eight.
+            record["rollout"]["success_by_task"] = {task: [number, 8], reset: [8 - number, 8 * seed]}
+        metrics.write_text("".join(json.dumps(record) + "\n" for record in records))
+    result = results(options, "table1")
+    rows = {(row["quarter"], row["is_reset_task"]): row for row in tables.task_rows(result)}
+    assert {row["row"] for row in rows.values()} == {"t1280_eer_cl_lsr"}
+    assert [(rows[q, False]["successes"], rows[q, False]["n"]) for q in (1, 2, 3, 4)] == [
+        (2, 32), (10, 32), (18, 32), (26, 32),
+    ]  # fmt: skip
+    assert (rows[1, True]["task"], rows[1, True]["successes"], rows[1, True]["n"]) == (reset, 30, 48)
+    text = write_outputs(EXPERIMENTS["table1"], EXPERIMENTS["table1"].rows, options, tmp_path / "out")
+    assert "| T = 1280, EER, CL, LSR | 0.06 | 0.31 | 0.56 | 0.81 |" in text
+    assert "| T = 1280, EER, CL, LSR, reset tasks | 0.62 |" in text
+    assert len(read_csv(tmp_path / "out/table1_tasks.csv")) == 8
+
+
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_experiment_is_drawn_and_without_runs_only_says_so(name, options, tmp_path):
     experiment = EXPERIMENTS[name]
