@@ -36,6 +36,8 @@ class Job:
     """A console script of this environment, or `python`, and its flags."""
     output: Path
     """The folder that the command makes; removed before the command starts anew."""
+    made_from_it: tuple[Path, ...] = ()
+    """What other jobs have made of the output, which is removed with it."""
     needs: tuple[str, ...] = ()
     """Names of the jobs whose outputs it uses."""
     resume: Callable[[], list[str] | None] = lambda: None
@@ -56,8 +58,9 @@ class Job:
 
     def remove_output(self) -> None:
         """Make room for a new start."""
-        if self.output.is_dir():
-            shutil.rmtree(self.output)
+        for folder in (self.output, *self.made_from_it):
+            if folder.is_dir():
+                shutil.rmtree(folder)
         self.log.unlink(missing_ok=True)
 
 

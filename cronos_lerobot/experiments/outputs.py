@@ -246,7 +246,7 @@ def _unfinished(result: ExperimentResult) -> list[str]:
             *lines,
         ]
     if result.changed:
-        lines += ["", "## Made by another command", "", *(f"- {text}" for text in result.changed)]
+        lines += ["", "## Left out: made by another command", "", *(f"- {text}" for text in result.changed)]
     return lines
 
 

@@ -31,6 +31,8 @@ from cronos_lerobot.experiments.specs import (
 
 DIVERSE_DEMO_FLAGS = ("--noise.share=0.75", "--misses.share=0.25", "--steps_after_release=8")
 """Noise and misses show how to recover, the frames after the release that a finished task is left alone."""
+PLUGIN_FLAG = "discover_packages_path"
+"""Of LeRobot's commands: imports a module that registers policies or environments."""
 LAST_POLICY = Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR)
 
 
@@ -118,25 +120,36 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
         "--tensorboard=false",
         f"--output_dir={spec.train_folder}",
     ]
-    # What is given last wins: the row's own flags, then those of the command line.
-    for flags in (spec.row.flags, options.extra):
-        given = {flag.split("=")[0] for flag in flags}
-        command = [flag for flag in command if flag.split("=")[0] not in given] + list(flags)
+    command = _with_flags(command, spec.row.flags, options.extra)
 
     def resume() -> list[str] | None:
         config = spec.train_folder / LAST_POLICY / TRAIN_CONFIG_NAME
-        plugins = [flag for flag in command if "discover_packages_path" in flag]
+        plugins = [flag for flag in command if PLUGIN_FLAG in flag]
         return ["cronos-train", "--resume=true", f"--config_path={config}", *plugins] if config.is_file() else None
 
     return Job(
         spec.name,
         tuple(command),
         spec.train_folder,
+        made_from_it=(spec.evaluations_folder,),
         needs=(base,) if base else (),
         resume=resume,
         progress=lambda: train_progress(spec.train_folder, spec.steps),
         work=spec.steps,
     )
+
+
+def _with_flags(command: list[str], *more: Iterable[str]) -> list[str]:
+    """What is given last wins: the row's own flags, then those of the command line."""
+    for flags in map(list, more):
+        given = {flag.split("=")[0] for flag in flags}
+        command = [flag for flag in command if flag.split("=")[0] not in given] + flags
+    return command
+
+
+def _env_flags(flags: Iterable[str]) -> list[str]:
+    """The flags of a training that its evaluation must have too: the scene's, and what registers it."""
+    return [flag for flag in flags if flag.startswith("--env.") or PLUGIN_FLAG in flag]
 
 
 def evaluation_jobs(spec: RunSpec, evaluation: CheckpointEvaluation) -> list[Job]:
@@ -148,6 +161,7 @@ def evaluation_jobs(spec: RunSpec, evaluation: CheckpointEvaluation) -> list[Job
             videos = int(evaluation.suite == "sequential" and not spec.options.scale.smoke)
             policy = str(spec.policy(checkpoint))
             command = eval_command(policy, spec.scene, evaluation.suite, split, folder, spec.options, videos)
+            command = _with_flags(command, _env_flags(spec.row.flags), _env_flags(spec.options.extra))
             jobs.append(_eval_job(f"{spec.name}/{folder.name}", command, folder, spec.name))
     return jobs
 
@@ -160,6 +174,7 @@ def base_evaluation_jobs(scene: str, options: Options, evaluation: CheckpointEva
     for split in evaluation.splits:
         folder = base_evaluation_folder(scene, evaluation.suite, split, options)
         command = eval_command(base_policy(scene, options), scene, evaluation.suite, split, folder, options)
+        command = _with_flags(command, _env_flags(options.extra))
         jobs.append(_eval_job(f"base/{folder.parent.name}/{folder.name}", command, folder, needed))
     return jobs
 

@@ -58,9 +58,10 @@ class SeedResult:
         return [_point(n, counts[n], result, task) for n, result in sorted(found.items()) if n in counts]
 
     def final(self, split: str) -> Point | None:
-        """The evaluation at the end of the run; None before it."""
+        """The evaluation at the end of the run, which a reset budget may have brought early; None before it."""
         curve = self.curve(split)
-        return curve[-1] if curve and curve[-1].interaction_steps >= self.spec.steps else None
+        end = self.run.last["interaction_steps"] if self.finished else self.spec.steps
+        return curve[-1] if curve and curve[-1].interaction_steps >= end else None
 
 
 @dataclass
@@ -118,7 +119,7 @@ class ExperimentResult:
     options: Options
     rows: list[RowResult]
     changed: list[str]
-    """Runs that were made by another command than the experiment's, which are left out or told apart."""
+    """Runs that were made by another command than the experiment's, which are left out."""
 
     @property
     def tasks(self) -> list[str]:
@@ -141,6 +142,7 @@ def collect(experiment: Experiment, rows: Iterable[Row], options: Options) -> Ex
                 continue
             if flags := _changed(spec):
                 changed.append(f"{spec.name}: {' '.join(flags)}")
+                continue
             seeds.append(_read_seed(spec, experiment.evaluations))
         results.append(RowResult(row, seeds, len(options.seeds)))
     return ExperimentResult(experiment, options, results, changed)

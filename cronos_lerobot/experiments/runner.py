@@ -125,6 +125,9 @@ class Runner:
         resumed = job.resume() if record and job.output.exists() else None
         if resumed is None:
             job.remove_output()
+            gone = [name for name, state in self.states.items() if state == DONE and not is_done(self.jobs[name])]
+            for name in gone:
+                del self.states[name]
             record = {"command": list(job.command), "seconds": 0.0, "starts": 0}
         record |= {"status": "running", "starts": record["starts"] + 1}
         write_record(job, record)

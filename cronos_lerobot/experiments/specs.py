@@ -77,6 +77,11 @@ class RunSpec:
         return self.folder / "train"
 
     @property
+    def evaluations_folder(self) -> Path:
+        """Holds the evaluations of its checkpoints."""
+        return self.folder / "eval"
+
+    @property
     def checkpoints(self) -> list[int]:
         """Interaction steps of the checkpoints that a finished run has."""
         per_update = self.options.scale.num_envs * UPDATE_INTERVAL
@@ -95,7 +100,7 @@ class RunSpec:
 
     def evaluation_folder(self, suite: str, split: str, checkpoint: int) -> Path:
         """`--output_dir` of an evaluation."""
-        return self.folder / "eval" / f"{suite}_{split}_{checkpoint:07d}"
+        return self.evaluations_folder / f"{suite}_{split}_{checkpoint:07d}"
 
 
 def run_specs(experiment: Experiment, options: Options, rows: Iterable[Row] | None = None) -> list[RunSpec]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Experiment, Row, find_rows
 from cronos_lerobot.experiments.display import make_display
-from cronos_lerobot.experiments.jobs import Job, is_done
+from cronos_lerobot.experiments.jobs import Job, changed_flags, is_done
 from cronos_lerobot.experiments.runner import DONE, Runner
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
 from cronos_lerobot.scripts.pipeline import command_line
@@ -32,6 +32,8 @@ RESERVED = (
     "--seed",
     "--output_dir",
     "--num_envs",
+    "--save_freq",
+    "--protocol.update_interval",
     "--policy.path",
     "--env.scene",
     "--resume",
@@ -194,6 +196,21 @@ def make_options(args: argparse.Namespace, extra: list[str], scenes: Iterable[st
     )
 
 
+def check_budget(chosen: list[tuple[Experiment, tuple[Row, ...]]], options: Options) -> None:
+    """Refuse a reset budget where checkpoints are evaluated that it may keep a run from.
+
+    Raises:
+        ValueError: there is one.
+    """
+    for experiment, rows in chosen:
+        flags = [*options.extra, *(flag for row in rows for flag in row.flags)]
+        if experiment.evaluations and any(flag.startswith("--protocol.reset_budget") for flag in flags):
+            raise ValueError(
+                f"--protocol.reset_budget ends runs early, and {experiment.name} evaluates their checkpoints at"
+                " fixed steps; experiments without such evaluations take it, table1 for example"
+            )
+
+
 def print_list() -> None:
     """Print the experiments and their rows."""
     for experiment in EXPERIMENTS.values():
@@ -208,6 +225,9 @@ def print_plan(jobs: list[Job]) -> None:
     for job in jobs:
         if is_done(job):
             print(f"# {job.name}: done ({job.output})")
+            continue
+        if flags := changed_flags(job):
+            print(f"# {job.name}: NOT REUSED, made by another command ({job.output}): {' '.join(flags)}")
             continue
         resumed = job.resume() if job.output.exists() else None
         print(f"# {job.name}{': goes on' if resumed else ''}")
@@ -248,6 +268,7 @@ def main() -> None:
     try:
         chosen = [(EXPERIMENTS[name], find_rows(EXPERIMENTS[name], args.rows)) for name in names]
         options = make_options(args, sys.argv[split + 1 :], {experiment.scene for experiment, _ in chosen})
+        check_budget(chosen, options)
     except ValueError as error:
         sys.exit(f"error: {error}")
     from cronos_lerobot.experiments.plan import make_jobs

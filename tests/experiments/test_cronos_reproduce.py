@@ -95,6 +95,8 @@ def test_list_names_every_row(monkeypatch, capsys):
         (["table1", "--threads=0"], "--threads must be at least 1, got 0"),
         (["table1", "--base.checkpoint=400"], "base.checkpoint must be one of [80, 160, 240, 320], got 400"),
         (["table1", "--", "--steps=3"], "--steps=3 is set by the experiment"),
+        (["table1", "--", "--save_freq=3"], "--save_freq=3 is set by the experiment"),
+        (["figure5", "--", "--protocol.reset_budget=100"], "figure5 evaluates their checkpoints at fixed steps"),
         (["table2"], "invalid choice: 'table2'"),
         (["all", "--rows", "t80"], "for one experiment"),
     ],

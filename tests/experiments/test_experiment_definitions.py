@@ -167,6 +167,21 @@ def test_own_policy_needs_no_base():
     assert "--policy.path=me/policy" in jobs["kitchen_2x2_state_paper/t320_eer_1300k/seed5"].command
 
 
+def test_evaluations_have_the_environment_of_their_training():
+    extra = ("--env.benchmark=me/kitchen", "--env.discover_packages_path=mine", "--algorithm.target_kl=0.02")
+    jobs = jobs_of("figure4", scale="small", extra=extra)
+    evaluations = [job for job in jobs.values() if job.command[0] == "cronos-eval"]
+    assert any(job.name.startswith("base/") for job in evaluations)
+    assert len(evaluations) > 12
+    for job in evaluations:
+        assert set(extra[:2]) < set(job.command)
+        assert extra[2] not in job.command
+    train = jobs["kitchen_2x2_state_small/t80_307k/seed1"]
+    assert set(extra) < set(train.command)
+    assert train.made_from_it == (train.output.parent / "eval",)
+    assert {job.output.parent for job in evaluations if train.name in job.needs} == set(train.made_from_it)
+
+
 def test_pixels():
     jobs = jobs_of("figure7", rows=["t320_eer"], scale="small", obs_type=PIXELS)
     demos, clone, *trains = jobs.values()

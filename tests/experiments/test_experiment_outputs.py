@@ -148,19 +148,31 @@ def test_unfinished_run_is_drawn_but_not_counted(options, tmp_path):
 
 
 def test_run_without_its_last_evaluation_has_no_success_at_the_end(options):
-    make_run(options, "table1", "t80", 1, (2, 4, 6), updates=4)
+    metrics = make_run(options, "table1", "t80", 1, (2, 4, 6)).train_folder / "metrics.jsonl"
+    *lines, last = metrics.read_text().splitlines(keepends=True)
+    assert json.loads(last)["kind"] == "evaluation"
+    metrics.write_text("".join(lines))
     row = by_row(tables.main_rows(results(options, "table1")))["t80"]
     assert (row["seeds"], row["success_train_mean"]) == (1, None)
     # Its curve is still there.
     assert row["D_normalised_mean"] is not None
 
 
-def test_run_of_another_command_is_named(options):
+def test_run_of_another_command_is_named_and_left_out(options):
     make_run(options, "table1", "t80", 1, (2, 4, 6))
     other = replace(options, extra=("--algorithm.target_kl=0.02",))
-    (text,) = results(other, "table1").changed
+    result = results(other, "table1")
+    (text,) = result.changed
     assert "t80_10k/seed1" in text
     assert "+--algorithm.target_kl=0.02" in text
+    row = by_row(tables.main_rows(result))["t80"]
+    assert (row["seeds"], row["success_train_mean"]) == (0, None)
+
+
+def test_run_that_its_reset_budget_ended_early_counts(options):
+    make_run(options, "table1", "t80", 1, (2, 4, 6), updates=4)
+    row = by_row(tables.main_rows(results(options, "table1")))["t80"]
+    assert (row["seeds"], row["success_train_mean"], row["interventions_mean"]) == (1, 0.75, RESETS[80] / 2)
 
 
 def evaluation(success, n=8):

@@ -3,6 +3,7 @@
 import fcntl
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -140,6 +141,17 @@ def test_lost_output_is_made_again(tmp_path):
     (tmp_path / "a").rmdir()
     assert run([job])[0] == {"a": "done"}
     assert (tmp_path / "a/n").read_text() == "x"
+
+
+def test_what_was_made_of_a_lost_output_is_made_again(tmp_path):
+    made = count_job(tmp_path, "a", made_from_it=(tmp_path / "b",))
+    jobs = [made, count_job(tmp_path, "b", needs=("a",)), count_job(tmp_path, "c")]
+    run(jobs)
+    shutil.rmtree(tmp_path / "a")
+    states, tape = run(jobs, parallel=1)
+    assert states == dict.fromkeys("abc", "done")
+    assert tape.events == [("a", "started"), ("a", "done"), ("b", "started"), ("b", "done")]
+    assert [(tmp_path / name / "n").read_text() for name in "abc"] == ["x"] * 3
 
 
 def test_job_of_another_process_is_waited_for(tmp_path):
