@@ -128,13 +128,16 @@ def segment_rows(groups: Iterable[Group]) -> list[Row]:
 
 
 def intervention_rows(groups: Iterable[Group]) -> list[Row]:
-    """Interventions of every run by kind, in all."""
+    """Interventions of every run, in all, of single streams, and by kind."""
     rows = []
     for group in groups:
         for run in group.runs:
             last = run.last
             counters = {name: last[name] for name in ("interaction_steps", "interventions")}
-            rows.append(_identity(group, run) | counters | last["interventions_by_kind"])
+            # Records of older runs do not have them.
+            streams = last.get("interventions_by_stream") or []
+            extremes = {"fewest of a stream": min(streams), "most of a stream": max(streams)} if streams else {}
+            rows.append(_identity(group, run) | counters | extremes | last["interventions_by_kind"])
     return rows
 
 
@@ -182,11 +185,15 @@ def merge_statistics(rows: list[Row]) -> list[Row]:
     return merged
 
 
+def column_names(rows: list[Row]) -> list[str]:
+    """The columns of rows that may have different ones, in the order in which they appear."""
+    return list(dict.fromkeys(name for row in rows for name in row))
+
+
 def write_csv(path: Path, rows: list[Row]) -> None:
     """Write rows that may have different columns; a missing value is an empty cell."""
-    columns = list(dict.fromkeys(name for row in rows for name in row))
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns, restval="")
+        writer = csv.DictWriter(file, column_names(rows), restval="")
         writer.writeheader()
         writer.writerows(rows)
 

@@ -45,7 +45,10 @@ def train(config: CronosTrainConfig) -> None:
     def make_own_env(num_envs: int) -> CronosVectorEnv:
         return make_env(config, num_envs, processes.local_count)
 
-    env = make_own_env(mine.stop - mine.start)
+    try:
+        env = make_own_env(mine.stop - mine.start)
+    except ValueError as error:
+        sys.exit(f"error: {error}")
     trainer = Trainer(config, env, make_own_env, policy, preprocessor, postprocessor, processes)
     try:
         trainer.train()

@@ -20,7 +20,7 @@ def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1)
     `local_processes` of this node share its cores, unless the config says how many threads each takes.
 
     Raises:
-        ValueError: the environment is not a CRONOS scene.
+        ValueError: the environment is not a CRONOS scene, or has fewer configurations than are asked for.
     """
     env_config = config.env
     if not isinstance(env_config, CronosEnvConfig):
@@ -29,7 +29,19 @@ def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1)
     options = env_config.gym_kwargs
     if options["num_threads"] == 0 and local_processes > 1:
         options["num_threads"] = max(1, (os.cpu_count() or 1) // local_processes)
-    return CronosVectorEnv(num_envs, scene=env_config.scene, reward=config.protocol.reward, **options)
+    env = CronosVectorEnv(num_envs, scene=env_config.scene, reward=config.protocol.reward, **options)
+    wanted = {"protocol.num_configurations": ("train", config.protocol.num_configurations)}
+    if config.eval_freq:
+        wanted["eval.n_episodes"] = (config.eval.split, config.eval.n_episodes)
+    for flag, (split, count) in wanted.items():
+        available = len(env.benchmark.configurations[split])
+        if count > available:
+            env.close()
+            raise ValueError(
+                f"--{flag}={count}, but {env_config.benchmark or env_config.scene} has {available} {split}"
+                f" configurations: give --{flag}={available} or fewer."
+            )
+    return env
 
 
 def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any]:

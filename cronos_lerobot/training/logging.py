@@ -146,6 +146,7 @@ class RunLogger:
             "interventions": self.loop.b,
             "updates": self.loop.updates,
             "interventions_by_kind": interventions,
+            "interventions_by_stream": self.loop.stream_interventions.tolist(),
             "time": time.time(),
         } | values
         self.metrics.write(record)

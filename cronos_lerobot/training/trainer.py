@@ -76,6 +76,7 @@ class Trainer:
             self.env = ShardedEnv(env, self.processes)
             self.agent = ShardedAgent(self.agent, self.env.mine)
         self.loop = self.task_set.new_loop(config.num_envs)
+        self._last_evaluation = 0
         self.run_state = RunState(
             ppo, self.loop, self.generators, self.env, preprocessor, postprocessor, self.processes
         )
@@ -90,6 +91,7 @@ class Trainer:
         observers: dict[str, Any] = {}
         if self.config.checkpoint_path is not None:
             observers = load_checkpoint(self.run_state, self.config.checkpoint_path)
+            self._last_evaluation = observers.get("last_evaluation", self.loop.n)
         self._open_observers(observers)
         try:
             if self.loop.t == 0:
@@ -111,7 +113,7 @@ class Trainer:
             )
 
     def _run(self) -> None:
-        last_eval = last_save = self.loop.n
+        last_save = self.loop.n
         updated = False
         self.stopwatch.lap()
         for event in self._events():
@@ -125,13 +127,12 @@ class Trainer:
             env_state = self.env.get_state()
             self._check_processes()
             self._log_update()
-            if _due(self.loop.n, last_eval, self.config.eval_freq):
+            if _due(self.loop.n, self._last_evaluation, self.config.eval_freq):
                 self._evaluate()
-                last_eval = self.loop.n
             if self.config.save_checkpoint and _due(self.loop.n, last_save, self.config.save_freq):
                 self._save(env_state)
                 last_save = self.loop.n
-        if last_eval < self.loop.n:
+        if self._last_evaluation < self.loop.n:
             self._evaluate()
         if self.config.save_checkpoint and (last_save < self.loop.n or not self._has_checkpoint()):
             self._save(self.env.get_state())
@@ -184,6 +185,7 @@ class Trainer:
             self.logger.progress({"success": rollout["success"], "steps_per_s": steps_per_s})
 
     def _evaluate(self) -> None:
+        self._last_evaluation = self.loop.n
         if not self.config.eval_freq:
             return
         options = self.config.eval
@@ -205,7 +207,11 @@ class Trainer:
         self.stopwatch.lap()
 
     def _save(self, env_state: dict[str, np.ndarray]) -> None:
-        observers = {"logger": self.logger.state_dict(), "recorder": self.recorder.state_dict()}
+        observers = {
+            "logger": self.logger.state_dict(),
+            "recorder": self.recorder.state_dict(),
+            "last_evaluation": self._last_evaluation,
+        }
         self.logger.log_checkpoint(save_checkpoint(self.run_state, self.config, observers, env_state))
         self.stopwatch.lap()
 

@@ -41,6 +41,14 @@ def run(bench, commands, tmp_path_factory):
     return folder
 
 
+def test_a_training_that_asks_for_more_configurations_than_there_are_is_told(bench, commands, tmp_path):
+    flags = [*TRAINING, f"--env.benchmark={bench}", f"--output_dir={tmp_path / 'run'}", "--eval_freq=16"]
+    outcome = commands.try_("cronos-train", *flags)
+    assert outcome.code == 1
+    assert "--eval.n_episodes=64, but" in outcome.output
+    assert "has 2 train configurations: give --eval.n_episodes=2 or fewer" in outcome.output
+
+
 @pytest.fixture(scope="module")
 def policy(run, commands):
     """The policy on the Hub."""

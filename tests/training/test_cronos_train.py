@@ -84,8 +84,9 @@ def test_strategy_and_order_of_the_docs(tmp_path):
     script = str(Path(sys.executable).with_name(command[0]))
     subprocess.run([script, *command[1:]], check=True, env=os.environ | {"PYTHONPATH": str(tmp_path)})
     last = json.loads((output / "metrics.jsonl").read_text().splitlines()[-1])
-    # Two streams of 24 steps: six segments, all failed, so that the last three switches reset both.
-    assert last["interventions_by_kind"]["scene_reset"] == 6
+    # Two streams of 24 steps: six segments, all failed, so that the fourth switch resets both.
+    assert last["interventions_by_kind"]["scene_reset"] == 2
+    assert last["interventions_by_stream"] == [last["interventions"] // 2] * 2
     assert last["interventions_by_kind"]["task_switch"] == 12
 
 

@@ -105,6 +105,30 @@ def test_resumed_run_equals_the_unbroken_one(tmp_path):
     assert len(json.loads((broken / "manifest.json").read_text())["starts"]) == 2
 
 
+def test_a_kill_during_the_last_evaluation_does_not_lose_it(tmp_path, monkeypatch):
+    short = {"steps": 3 * STEPS_PER_UPDATE, "eval_freq": 2 * STEPS_PER_UPDATE}
+    unbroken, broken = config(tmp_path / "unbroken", **short), config(tmp_path / "broken", **short)
+    train(unbroken)
+    steps = [line["interaction_steps"] for line in metrics(tmp_path / "unbroken") if line["kind"] == "evaluation"]
+    assert steps == [0, 2 * STEPS_PER_UPDATE, 3 * STEPS_PER_UPDATE]
+    trainer = make_trainer(broken)
+    evaluate = trainer._evaluate
+
+    def evaluate_or_die():
+        if trainer.loop.n == 3 * STEPS_PER_UPDATE:
+            raise KilledError
+        evaluate()
+
+    monkeypatch.setattr(trainer, "_evaluate", evaluate_or_die)
+    with pytest.raises(KilledError):
+        trainer.train()
+    resumed = config(tmp_path / "broken", **short)
+    resumed.checkpoint_path = (tmp_path / "broken/checkpoints/last").resolve()
+    assert resumed.checkpoint_path.name.endswith(str(3 * STEPS_PER_UPDATE))
+    train(resumed)
+    assert metrics(tmp_path / "broken") == metrics(tmp_path / "unbroken")
+
+
 def test_same_seed_same_run_other_seed_other_run(tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         train(config(tmp_path / name, seed=seed, steps=2 * STEPS_PER_UPDATE))
