@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
-from lerobot_env_cronos import STEPS_PER_TASK, CronosVectorEnv
+from lerobot_env_cronos import STEPS_PER_TASK, CronosVectorEnv, load_benchmark
 from lerobot_env_cronos.simulation import NUM_ARM_JOINTS
 from lerobot_env_cronos.statistics import wilson_interval
 from tqdm import trange
@@ -107,14 +107,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--policy.path", dest="policy_path", required=True, help="checkpoint or Hub id")
     parser.add_argument("--policy.device", dest="device", default="cpu")
-    parser.add_argument("--scene", default="kitchen_2x2")
+    parser.add_argument("--scene", help="default: that of the policy's training, or kitchen_2x2")
     parser.add_argument("--split", default="train", choices=["train", "held_out"])
     parser.add_argument("--seed", type=int, default=0, help="of the policy's sampling")
     parser.add_argument("--output", type=Path, help="CSV to write")
     args = parser.parse_args()
     register_third_party_plugins()
-    env_config, agent = make_spectator(args.policy_path, args.device)
-    env = CronosVectorEnv(256, args.scene, **env_config.gym_kwargs)
+    env_config, agent = make_spectator(args.policy_path, args.device, args.scene)
+    benchmark = load_benchmark(env_config.benchmark, env_config.scene)
+    num_envs = len(benchmark.scene.tasks) * len(benchmark.configurations[args.split])
+    env = CronosVectorEnv(num_envs, env_config.scene, **env_config.gym_kwargs)
     table = rows(run_second_tasks(env, agent, args.split, args.seed))
     env.close()
     print("bodies  arm   success  95 % interval    n  complete from the start (left out)")

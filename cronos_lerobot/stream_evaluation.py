@@ -185,7 +185,7 @@ def _parse_args() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--policy.path", dest="policy_path", required=True, help="checkpoint or Hub id")
     parser.add_argument("--policy.device", dest="device", default="cpu")
-    parser.add_argument("--scene", default="kitchen_2x2")
+    parser.add_argument("--scene", help="default: that of the policy's training, or kitchen_2x2")
     parser.add_argument("--num_streams", type=int, default=64)
     parser.add_argument("--num_segments", type=int, default=16, help="length of a stream, 80 steps each")
     parser.add_argument("--no_end_effector_reset", action="store_true", help="leave the arm where it is")
@@ -201,8 +201,8 @@ def main() -> None:
     args = _parse_args()
     register_third_party_plugins()
     set_seed(args.seed)
-    env_config, agent = make_spectator(args.policy_path, args.device)
-    env = CronosVectorEnv(args.num_streams, args.scene, **env_config.gym_kwargs)
+    env_config, agent = make_spectator(args.policy_path, args.device, args.scene)
+    env = CronosVectorEnv(args.num_streams, env_config.scene, **env_config.gym_kwargs)
     protocol = ProtocolConfig(
         scene_reset_interval=None,
         end_effector_reset=not args.no_end_effector_reset,

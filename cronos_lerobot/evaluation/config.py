@@ -13,14 +13,12 @@ from typing import Any
 
 import draccus
 from lerobot.configs import PreTrainedConfig, parser
-from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
 from lerobot_env_cronos import Benchmark, CronosEnvConfig, configurations, load_benchmark, orderings
 from lerobot_env_cronos.benchmark import SUITES
 from lerobot_env_cronos.configurations import SPLITS
-from lerobot_env_cronos.model import CAMERAS
-from lerobot_env_cronos.scenes import SCENES
+
+from cronos_lerobot.evaluation.policy_env import observations_of, trained_scene
 
 QUICK_CONFIGURATIONS, QUICK_ORDERINGS = 16, 3
 EXPERT = "scripted expert"
@@ -146,9 +144,9 @@ class CronosEvalConfig:
         if self.policy is None:
             derived["obs_type"] = "environment_state_agent_pos"
         else:
-            derived = _observations(self.policy)
+            derived = observations_of(self.policy)
             if env.benchmark is None:
-                derived |= _trained_scene(self.policy.pretrained_path)
+                derived |= trained_scene(self.policy.pretrained_path)
         for name, value in derived.items():
             if name not in given:
                 setattr(env, name, value)
@@ -220,30 +218,6 @@ class CronosEvalConfig:
 
 def _words(text: str) -> list[str]:
     return [word.strip() for word in text.split(",") if word.strip()]
-
-
-def _observations(policy: PreTrainedConfig) -> dict[str, Any]:
-    """Fields of `CronosEnvConfig` that show a policy what it takes."""
-    images = policy.image_features
-    takes_state = OBS_ENV_STATE in (policy.input_features or {})
-    if not images:
-        return {"obs_type": "environment_state_agent_pos"} if takes_state else {}
-    derived: dict[str, Any] = {"obs_type": "pixels_agent_pos", "privileged_state": takes_state}
-    cameras = [name for name in CAMERAS if f"{OBS_IMAGES}.{name}" in images]
-    if cameras:
-        derived["camera_name"] = ",".join(cameras)
-    # LeRobot passes images of another size on without a word.
-    _, height, width = next(iter(images.values())).shape
-    return derived | {"observation_height": height, "observation_width": width}
-
-
-def _trained_scene(path: Path | None) -> dict[str, str]:
-    """The scene that a checkpoint of `cronos-train` was trained in."""
-    file = Path(path or "") / TRAIN_CONFIG_NAME
-    if not file.is_file():
-        return {}
-    scene = (json.loads(file.read_text()).get("env") or {}).get("scene")
-    return {"scene": scene} if scene in SCENES else {}
 
 
 def fingerprint(policy: PreTrainedConfig) -> str:

@@ -106,6 +106,7 @@ def write_report(report: Report, output: Path) -> Path:
         "cell": _cell,
         "percent": lambda x: f"{100 * x:.1f}",
         "merged": tables.merge_statistics,
+        "columns": tables.column_names,
     }
     page = environment.get_template("page.html.j2").render(
         title=report.title,

@@ -125,8 +125,14 @@ def sum_rates(rates: Iterable[Rate]) -> Rate:
     return total
 
 
-def find_runs(folders: Iterable[Path]) -> tuple[list[TrainingRun], list[EvaluationRun], list[SuiteRun]]:
+def find_runs(
+    folders: Iterable[Path], scene: str = "kitchen_2x2"
+) -> tuple[list[TrainingRun], list[EvaluationRun], list[SuiteRun]]:
     """Read the runs of cronos-train, lerobot-eval and cronos-eval in `folders` and below them, each once.
+
+    Args:
+        folders: where to look.
+        scene: of the evaluations of lerobot-eval, whose files do not name it.
 
     Raises:
         FileNotFoundError: a folder is missing or holds no run.
@@ -140,7 +146,7 @@ def find_runs(folders: Iterable[Path]) -> tuple[list[TrainingRun], list[Evaluati
             training.setdefault(path.resolve(), read_training_run(path.parent))
             found = True
         for path in _files(folder, EVAL_INFO):
-            evaluation.setdefault(path.resolve(), read_evaluation_runs(path.parent))
+            evaluation.setdefault(path.resolve(), read_evaluation_runs(path.parent, scene))
             found = True
         results = [path for path in _files(folder, RESULTS) if is_results(path)]
         suites += results
@@ -214,13 +220,22 @@ def read_evaluation_runs(folder: Path, scene: str = "kitchen_2x2") -> list[Evalu
 
 
 def group_runs(runs: list[TrainingRun]) -> list[Group]:
-    """Group runs by their config but for the seed, labelled by what tells the groups apart."""
+    """Group runs by their config but for seed and length, labelled by what tells the groups apart.
+
+    Of several runs of one seed a group has the longest.
+    """
     groups: dict[str, Group] = {}
     flat = {}
     for run in runs:
         experiment = {key: value for key, value in run.config.items() if key not in NOT_THE_EXPERIMENT}
         key = json.dumps(experiment, sort_keys=True) if experiment else str(run.folder)
-        groups.setdefault(key, Group(run.name)).runs.append(run)
+        group = groups.setdefault(key, Group(run.name))
+        # A longer run of the same seed begins with the shorter one: counted twice it would narrow the spread.
+        same = next((other for other in group.runs if run.seed is not None and other.seed == run.seed), None)
+        if same is None:
+            group.runs.append(run)
+        elif run.last["interaction_steps"] > same.last["interaction_steps"]:
+            group.runs[group.runs.index(same)] = run
         flat[key] = _flatten(experiment)
     names = sorted({name for config in flat.values() for name in config})
     differing = [name for name in names if len({config.get(name) for config in flat.values()}) > 1]

@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig, RGBEncoderConfig
 from lerobot.policies import make_policy, make_pre_post_processors
-from lerobot.utils.constants import OBS_ENV_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
@@ -28,6 +27,7 @@ from tqdm import tqdm
 
 from cronos_lerobot.data.schema import Intervention, observation_columns
 from cronos_lerobot.data.video import VideoFile
+from cronos_lerobot.evaluation.policy_env import observations_of, trained_scene
 from cronos_lerobot.loop_state import SegmentEnd, Step
 from cronos_lerobot.protocol import ProtocolConfig
 from cronos_lerobot.report.overlay import Status, draw_status
@@ -151,15 +151,20 @@ def film_stream(
             agent.begin_segment()
 
 
-def make_spectator(policy_path: str, device: str = "cpu") -> tuple[CronosEnvConfig, Any]:
-    """Load a policy; returns an env config with what it observes, and a function from an env to its agent."""
+def make_spectator(
+    policy_path: str, device: str = "cpu", scene: str | None = None
+) -> tuple[CronosEnvConfig, PolicySpectator]:
+    """Load a policy; returns the environment that it expects, and the agent that acts by it.
+
+    Args:
+        policy_path: checkpoint or Hub id.
+        device: of the policy.
+        scene: None for the one of its training.
+    """
     policy_config = PreTrainedConfig.from_pretrained(policy_path)
     policy_config.pretrained_path, policy_config.device = Path(policy_path), device
-    sees_pixels = bool(policy_config.image_features)
-    env_config = CronosEnvConfig(
-        obs_type="pixels_agent_pos" if sees_pixels else "environment_state_agent_pos",
-        privileged_state=sees_pixels and OBS_ENV_STATE in (policy_config.input_features or {}),
-    )
+    where = {"scene": scene} if scene else trained_scene(policy_config.pretrained_path)
+    env_config = CronosEnvConfig(**observations_of(policy_config), **where)
     policy = make_policy(policy_config, env_cfg=env_config)
     processors = make_pre_post_processors(
         policy_config, policy_path, preprocessor_overrides={"device_processor": {"device": device}}
@@ -202,7 +207,7 @@ def make_parser() -> argparse.ArgumentParser:
     who.add_argument("--policy.path", dest="policy_path", metavar="PATH", help="checkpoint or Hub id of a policy")
     who.add_argument("--policy", choices=[EXPERT], help="the scripted expert")
     parser.add_argument("--policy.device", dest="device", default="cpu")
-    parser.add_argument("--scene", default="kitchen_2x2")
+    parser.add_argument("--scene", help="default: that of the policy's training, or kitchen_2x2")
     parser.add_argument("--segments", type=int, default=8, help="length of the stream, 80 steps each (default: 8)")
     parser.add_argument(
         "--scene_reset_interval", type=int, help="control steps between scene resets; never if absent"
@@ -227,10 +232,11 @@ def main() -> None:
         end_effector_reset=not args.no_end_effector_reset,
         task_order=args.task_order,
     )
-    config, agent = CronosEnvConfig(obs_type="environment_state_agent_pos"), None
+    scene = {"scene": args.scene} if args.scene else {}
+    config, agent = CronosEnvConfig(obs_type="environment_state_agent_pos", **scene), None
     if args.policy_path:
-        config, agent = make_spectator(args.policy_path, args.device)
-    env = CronosVectorEnv(1, args.scene, **config.gym_kwargs)
+        config, agent = make_spectator(args.policy_path, args.device, args.scene)
+    env = CronosVectorEnv(1, config.scene, **config.gym_kwargs)
     try:
         stream = film_stream(env, agent or ExpertSpectator(env), protocol, args.segments, args.seed)
         total = args.segments * protocol.task_switch_interval

@@ -12,7 +12,9 @@ from cronos_lerobot.evaluation.store import RESULTS
 
 SUITES = ("independent", "sequential")
 DECISIVE = ("policy", "scene", "obs_type", "temperature", "seed", "advance", "end_effector_reset")
-"""Fields of results.json in which two evaluations of one policy must agree to be shown as one."""
+"""Fields of results.json in which two evaluations of one policy must agree to be shown as one,"""
+IDENTITY = ("benchmark", "n_episodes", "orderings")
+"""and of its `identity`."""
 
 
 @dataclass
@@ -44,18 +46,24 @@ def read_suite_runs(files: Iterable[Path]) -> list[SuiteRun]:
     merged: dict[str, SuiteRun] = {}
     for folder in dict.fromkeys(path.resolve().parent for path in files):
         results = json.loads((folder / RESULTS).read_text())
-        key = json.dumps([results.get(name) for name in DECISIVE])
+        settings = _settings(results)
+        key = json.dumps(settings)
         run = merged.setdefault(key, SuiteRun(policy_name(results["policy"]), {}, []))
         for suite in SUITES:
             run.results.setdefault(suite, {}).update(results.get(suite, {}))
         run.videos.extend((folder / video["path"], video) for video in results.get("videos") or [])
-        run.settings.update({name: results.get(name) for name in DECISIVE})
+        run.settings.update(settings)
     runs = list(merged.values())
     names = [run.name for run in runs]
     for run in runs:
         if names.count(run.name) > 1:
             run.name += f" ({_what_differs(run, runs)})"
     return runs
+
+
+def _settings(results: dict[str, Any]) -> dict[str, Any]:
+    identity = results.get("identity", {})
+    return {name: results.get(name) for name in DECISIVE} | {name: identity.get(name) for name in IDENTITY}
 
 
 def policy_name(policy: str) -> str:
@@ -73,5 +81,5 @@ def _what_differs(run: SuiteRun, runs: list[SuiteRun]) -> str:
     same = [
         other for other in runs if other.settings["policy"] == run.settings["policy"] or other.name == run.name
     ]
-    names = [name for name in DECISIVE if len({str(other.settings[name]) for other in same}) > 1]
+    names = [name for name in run.settings if len({str(other.settings[name]) for other in same}) > 1]
     return ", ".join(f"{name}={run.settings[name]}" for name in names)

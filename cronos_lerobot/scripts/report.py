@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from lerobot_env_cronos.scenes import SCENES
+
 from cronos_lerobot.report.page import Report, write_report
 from cronos_lerobot.report.runs import EvaluationRun, find_runs
 from cronos_lerobot.report.tables import comparison_text
@@ -45,6 +47,10 @@ def make_parser() -> argparse.ArgumentParser:
     add_folders("--after", "lerobot-eval of the policy that came out")
     parser.add_argument("--videos", nargs="+", type=Path, metavar="MP4", default=[], help="more videos to show")
     parser.add_argument("--output", type=Path, default=Path("report"), help="folder to write (default: report)")
+    parser.add_argument(
+        "--scene", default="kitchen_2x2", choices=SCENES,
+        help="of lerobot-eval's folders, which number the tasks and do not name the scene (default: kitchen_2x2)",
+    )  # fmt: skip
     parser.add_argument("--title", default="CRONOS report", help="headline of the page")
     return parser
 
@@ -56,14 +62,15 @@ def make_report(
     after: list[Path] | None = None,
     videos: list[Path] | None = None,
     title: str = "CRONOS report",
+    scene: str = "kitchen_2x2",
 ) -> Report:
     """Read run folders and pair evaluations before with those after.
 
     Raises:
         FileNotFoundError: a folder holds no run, or a video is missing.
     """
-    training, evaluations, suites = find_runs(runs)
-    old, new = _evaluations(before or []), _evaluations(after or [])
+    training, evaluations, suites = find_runs(runs, scene)
+    old, new = _evaluations(before or [], scene), _evaluations(after or [], scene)
     paired = {run.folder.resolve() for run in old + new}
     rest = [run for run in evaluations if run.folder.resolve() not in paired]
     for video in videos or []:
@@ -72,8 +79,8 @@ def make_report(
     return Report(training, rest, old, new, videos or [], title, suites)
 
 
-def _evaluations(folders: list[Path]) -> list[EvaluationRun]:
-    return find_runs(folders)[1]
+def _evaluations(folders: list[Path], scene: str) -> list[EvaluationRun]:
+    return find_runs(folders, scene)[1]
 
 
 def main() -> None:
@@ -83,7 +90,9 @@ def main() -> None:
     if not args.runs + args.before + args.after:
         parser.error("name at least one run folder; cronos-report --help has examples")
     try:
-        report = make_report(args.runs, before=args.before, after=args.after, videos=args.videos, title=args.title)
+        report = make_report(
+            args.runs, before=args.before, after=args.after, videos=args.videos, title=args.title, scene=args.scene
+        )
     except (FileNotFoundError, ValueError) as error:
         sys.exit(f"error: {error}")
     page = write_report(report, args.output)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+from lerobot_env_cronos.scenes import SCENES
 from synthetic_runs import INSTRUCTIONS, write_evaluation, write_training_run
 
 from cronos_lerobot.report.page import write_report
@@ -269,6 +270,47 @@ def test_results_of_cronos_eval(tmp_path):
     (tmp_path / "other/results.json").write_text("[]")
     with pytest.raises(FileNotFoundError, match="cronos-eval"):
         find_runs([tmp_path / "other"])
+
+
+def test_a_quick_evaluation_does_not_replace_the_whole_one(tmp_path):
+    for name, successes, n in (("whole", [0.75, 0.5], 64), ("whole_quick", [0.25, 0.0], 16)):
+        identity = {"identity": {"policy": "1a2b", "n_episodes": n, "orderings": 10}}
+        write_results(tmp_path / name, "me/policy", {"sequential": {"train": chains(successes)}}, **identity)
+    runs = find_runs([tmp_path])[2]
+    assert [(run.name, run.results["sequential"]["train"]["positions"][0]["success"]) for run in runs] == [
+        ("me/policy (n_episodes=64)", 0.75), ("me/policy (n_episodes=16)", 0.25),
+    ]  # fmt: skip
+
+
+def test_columns_of_scenes_with_more_tasks_stay_in_their_place(tmp_path):
+    write_results(tmp_path / "a", "me/two", {"sequential": {"train": chains([0.75, 0.5])}})
+    write_results(
+        tmp_path / "b", "me/three", {"sequential": {"train": chains([0.7, 0.6, 0.4])}}, scene="kitchen_3x3"
+    )
+    page = write_report(make_report([tmp_path]), tmp_path / "report").read_text()
+    table = page[page.index("<th>SEQ 0</th>") :]
+    table = table[: table.index("</table>")]
+    names = re.findall(r"<th>(.*?)</th>", page[: page.index(table) + len(table)].split("<table>")[-1])
+    rows = [re.findall(r"<td>(.*?)</td>", line) for line in table.splitlines() if "<td>" in line]
+    two, three = (dict(zip(names, row, strict=True)) for row in rows)
+    assert (two["chain length"].split()[0], two["SEQ 2"]) == ("1.25", "")
+    assert (three["chain length"].split()[0], three["SEQ 2"].split()[0]) == ("1.7", "0.4")
+
+
+def test_of_two_runs_of_one_seed_the_longer_counts(tmp_path):
+    write_training_run(tmp_path / "short", seed=1, successes=(2, 3, 4), updates=4)
+    write_training_run(tmp_path / "long", seed=1, successes=(2, 4, 6))
+    write_training_run(tmp_path / "other", seed=2, successes=(2, 4, 4))
+    (group,) = group_runs(find_runs([tmp_path])[0])
+    assert sorted(run.name for run in group.runs) == ["long", "other"]
+    (row,) = seed_rows([group])
+    assert row["seeds"] == 2
+
+
+def test_tasks_of_lerobot_eval_are_those_of_the_scene(tmp_path):
+    write_evaluation(tmp_path / "e")
+    (evaluation,) = make_report([tmp_path / "e"], scene="playroom_2x2").evaluations
+    assert list(evaluation.successes) == [task.instruction for task in SCENES["playroom_2x2"].tasks]
 
 
 def test_policies_in_short():
