@@ -71,6 +71,21 @@ def test_tape_of_every_row_of_table_1(row):
     assert loop.b == put_back + scene
 
 
+def test_a_heuristic_reset_comes_before_the_scene_reset_of_the_same_switch():
+    class Clumsy(DummyEnv):
+        def step(self, actions):
+            if self.t == 3:  # the last step before the first scene reset
+                self.lost.add((1, 1))
+            return super().step(actions)
+
+    config = protocol(scene_reset_interval=4, heuristic_reset=True)
+    env, _, loop, _ = run(config, steps=16, env=Clumsy(2))
+    at_switches = [call for call in env.calls if call in (EER, PUT_BACK, SCENE)]
+    assert at_switches == [SCENE, EER, EER, PUT_BACK, SCENE, EER, EER, SCENE]
+    assert loop.interventions[:, Intervention.HEURISTIC_RESET].tolist() == [0, 1]
+    assert loop.b == 1 + 4
+
+
 def test_learned_resets_follow_the_object_of_the_task():
     config = protocol(learned_reset=True, scene_reset_interval=None)
     _, _, loop, events = run(config, steps=6 * 4)
@@ -147,7 +162,7 @@ def test_own_strategy_and_own_order_by_name():
             self.rng = rng
 
         def due(self, env, loop):
-            return np.flatnonzero((loop.recent_success[:, -2:] == 0).all(axis=1))
+            return np.flatnonzero((loop.recent_success[:, -2:] == 0).all(axis=1) & (loop.position >= 2))
 
         def apply(self, env, ids):
             env.scene_reset(ids, self.rng.integers(64, size=len(ids)))
@@ -163,8 +178,8 @@ def test_own_strategy_and_own_order_by_name():
     try:
         config = protocol(scene_reset_interval=None, extra_resets=["stuck"], task_order="last")
         env, _, loop, events = run(config, steps=16)
-        assert [call for call in env.calls if call[0] == "scene_reset"] == [SCENE, SCENE, SCENE, SCENE]
-        assert loop.b == 6  # after segments 2, 3 and 4 the last two had failed
+        assert [call for call in env.calls if call[0] == "scene_reset"] == [SCENE, SCENE, SCENE]
+        assert loop.b == 4  # after segments 2 and 4 the last two since the reset had failed
         assert all((event.task == 3).all() for event in events if isinstance(event, SegmentEnd))
         with pytest.raises(ValueError, match="stuck"):
             register_reset("stuck")(ResetStuck)

@@ -1,4 +1,4 @@
-"""What happened in recorded streams, counted: successes and interventions."""
+"""What happened in recorded streams, counted: successes, and what segments began after."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from cronos_lerobot.data.schema import Intervention
 from cronos_lerobot.data.streams import Segment, StreamDataset
 
 NUM_PERIODS = 10
-"""Parts of the recording that interventions are counted in."""
+"""Parts of the recording that segments are counted in."""
 
 
 def statistics(streams: StreamDataset) -> dict[str, Any]:
-    """Count successes and interventions of recorded streams.
+    """Count successes of recorded streams, and what their segments began after.
 
     Returns:
         `streams`, `segments`, `frames`; `success` and `success_by_{position,task,policy_version,stream}`:
         [successes, of these complete from the start, segments], by the number of task switches since the scene
-        reset, and so on; `interventions`: the number of each kind; `interventions_over_time`: the same for each
-        tenth of the steps, by its first step.
+        reset, and so on; `began_after`: segments by the intervention before them, the strongest where there were
+        several; `began_after_over_time`: the same for each tenth of the steps, by its first step.
     """
     segments = streams.segments
     keys: dict[str, Callable[[Segment], Any]] = {
@@ -42,8 +42,8 @@ def statistics(streams: StreamDataset) -> dict[str, Any]:
         "frames": sum(s.length for s in segments),
         "success": _successes(segments),
         **{f"success_by_{name}": _by(segments, key) for name, key in keys.items()},
-        "interventions": _kinds(segments),
-        "interventions_over_time": over_time,
+        "began_after": _kinds(segments),
+        "began_after_over_time": over_time,
     }
 
 
@@ -63,8 +63,8 @@ def make_tables(result: dict[str, Any]) -> list[Table]:
         tables.append(table)
         title = ""
     kinds = [kind.name.lower() for kind in Intervention if kind is not Intervention.NONE]
-    table = Table("interventions from step", *kinds)
-    for key, counts in [*result["interventions_over_time"].items(), ("all", result["interventions"])]:
+    table = Table("segments that began after, from step", *kinds)
+    for key, counts in [*result["began_after_over_time"].items(), ("all", result["began_after"])]:
         table.add_row(str(key), *(str(counts.get(kind, 0)) for kind in kinds))
     return [*tables, table]
 

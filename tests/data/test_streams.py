@@ -93,10 +93,10 @@ def test_statistics(streams):
     assert result["success_by_task"] == {TASKS[1]: [0, 0, 12], TASKS[0]: [12, 4, 12]}
     assert result["success_by_policy_version"] == {v: [3, 1, 6] for v in range(STEPS // UPDATE)}
     assert result["success_by_stream"] == {0: [4, 0, 8], 1: [4, 0, 8], 2: [4, 4, 8]}
-    assert result["interventions"] == {"end_effector_reset": 18, "scene_reset": 3, "initial": 3}
+    assert result["began_after"] == {"end_effector_reset": 18, "scene_reset": 3, "initial": 3}
     # Tenths of 32 steps, rounded up, are 4 steps: one segment of each stream.
-    assert result["interventions_over_time"][0] == {"initial": 3}
-    assert result["interventions_over_time"][16] == {"scene_reset": 3}
+    assert result["began_after_over_time"][0] == {"initial": 3}
+    assert result["began_after_over_time"][16] == {"scene_reset": 3}
     assert len(make_tables(result)) == 4
 
 

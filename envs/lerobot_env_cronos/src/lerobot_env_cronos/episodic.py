@@ -87,9 +87,9 @@ class IndependentVectorEnv(EpisodicVectorEnv):
         running = self._all[~self.done]
         reward, diverged = self.step_streams(actions, running)
         reward[self.done] = 0.0
-        success = self.is_success & ~self.done
+        # A diverged simulation cannot be judged any further, whatever it shows: its episode ends as a failure.
+        success = self.is_success & ~self.done & ~diverged
         self._elapsed[running] += 1
-        # A diverged simulation cannot be judged any further: its episode ends as a failure.
         truncated = ~self.done & ~success & ((self._elapsed >= self._max_episode_steps) | diverged)
         self.done |= success | truncated
         info = {"is_success": success, "is_grasped": self.is_grasped.copy(), "diverged": diverged}
