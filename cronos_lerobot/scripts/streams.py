@@ -1,6 +1,6 @@
 """`cronos-streams`: looks into recorded training streams, checks them, and makes training data of them.
 
-cronos-streams statistics   successes by segment since the scene reset, by task, policy version; what they began after
+cronos-streams statistics   successes by segment since the scene reset, task, policy version; what they began after
 cronos-streams check        that nothing is missing, nothing there twice, every annotation where it belongs
 cronos-streams filter       some of the segments as an ordinary LeRobotDataset, for lerobot-train
 
