@@ -12,9 +12,9 @@ from cronos_lerobot.evaluation.store import RESULTS
 
 SUITES = ("independent", "sequential")
 DECISIVE = ("policy", "scene", "obs_type", "temperature", "seed", "advance", "end_effector_reset")
-"""Fields of results.json in which two evaluations of one policy must agree to be shown as one,"""
+"""Fields of results.json in which two evaluations of one policy must agree to be shown as one."""
 IDENTITY = ("benchmark", "n_episodes", "orderings")
-"""and of its `identity`."""
+"""Fields of its `identity` in which they must agree too."""
 
 
 @dataclass

@@ -96,3 +96,18 @@ def test_config_errors_name_the_bad_value(field, value, caplog):
         CronosEnvConfig(**{field: value})
     # draccus hides the exception's text from command lines, so it is logged as well.
     assert str(value) in caplog.text
+
+
+def test_a_diverged_step_is_no_success_whatever_it_shows(monkeypatch):
+    env = IndependentVectorEnv(2, task=TASK, obs_type=STATE)
+    env.reset(seed=0)
+
+    def break_the_first(actions, ids):
+        env.is_success[:] = True
+        return np.zeros(2), np.array([True, False])
+
+    monkeypatch.setattr(env, "step_streams", break_the_first)
+    _, _, terminated, truncated, info = env.step(np.zeros((2, 7)))
+    assert terminated.tolist() == info["is_success"].tolist() == [False, True]
+    assert truncated.tolist() == [True, False]
+    env.close()

@@ -3,7 +3,9 @@
 import av
 import numpy as np
 import pytest
-from lerobot_env_cronos import CronosVectorEnv
+from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from lerobot_env_cronos.scenes import SCENES
 from PIL import Image
 
@@ -11,7 +13,7 @@ from cronos_lerobot.data.schema import Intervention
 from cronos_lerobot.protocol import ProtocolConfig
 from cronos_lerobot.report import stream_video
 from cronos_lerobot.report.overlay import FAILURE, SUCCESS, Status, draw_status
-from cronos_lerobot.report.stream_video import ExpertSpectator, film_stream, write_gif, write_mp4
+from cronos_lerobot.report.stream_video import ExpertSpectator, film_stream, make_spectator, write_gif, write_mp4
 from cronos_lerobot.report.task_pictures import draw_sheet, render_tasks
 
 
@@ -31,6 +33,20 @@ def film():
         frames = list(film_stream(env, ExpertSpectator(env), protocol, num_segments=3))
     env.close()
     return frames, told
+
+
+def test_a_policy_acts_in_the_scene_of_its_training_and_sees_what_it_knows(tmp_path):
+    register_third_party_plugins()
+    options = {"camera_name": "bridge", "observation_height": 32, "observation_width": 48}
+    config = make_policy_config("pocketvla", device="cpu", push_to_hub=False, observation="image")
+    make_policy(config, env_cfg=CronosEnvConfig(**options)).save_pretrained(tmp_path)
+    for processor in make_pre_post_processors(config):
+        processor.save_pretrained(tmp_path)
+    (tmp_path / "train_config.json").write_text('{"env": {"scene": "playroom_2x2"}}')
+    env_config, _ = make_spectator(str(tmp_path))
+    assert {name: getattr(env_config, name) for name in options} == options
+    assert (env_config.scene, env_config.obs_type) == ("playroom_2x2", "pixels_agent_pos")
+    assert make_spectator(str(tmp_path), scene="kitchen_3x3")[0].scene == "kitchen_3x3"
 
 
 def test_one_frame_for_each_control_step(film):
