@@ -56,10 +56,11 @@ def rf_mtrl(
                 metrics = agent.update()  # 16, 17, 18
                 loop.updates += 1
                 yield Update(metrics)
-            if resets.divergence.put_back(env, loop, info["diverged"]):
+            if k < K and resets.divergence.put_back(env, loop, info["diverged"]):
                 o_tp1 = env.observe()
             o_t = o_tp1
         segment = loop.end_segment()
+        resets.divergence.put_back(env, loop, info["diverged"])
         resets.end_effector.apply_if_due(env, loop)  # 21, 22
         resets.heuristic.apply_if_due(env, loop)  # 23, 24
         for strategy in resets.extra:

@@ -89,6 +89,16 @@ def test_diverged_stream_is_reset_at_once_and_alone():
     assert loop.b == 3
 
 
+def test_a_stream_that_diverges_in_its_last_step_begins_the_next_segment_in_a_fresh_scene():
+    env, _, loop, events = run(protocol(end_effector_reset=False), 8, env=DummyEnv(2, {(1, 1)}))
+    second_store = [i for i, call in enumerate(env.calls) if call == "store"][1]
+    tape = env.calls[second_store + 1 : second_store + 5]
+    assert tape == [("scene_reset", [1]), "set_task", "observe", "act"]
+    assert [end.position.tolist() for end in events if isinstance(end, SegmentEnd)] == [[0, 0], [1, 0]]
+    assert loop.interventions[:, Intervention.DIVERGENCE].tolist() == [0, 1]
+    assert [int(event.preceded_by[1]) for event in events if isinstance(event, Step)][2] == Intervention.DIVERGENCE
+
+
 def test_events_and_what_preceded_each_frame():
     _, _, _, events = run(protocol(), steps=16)
     kinds = [type(event) for event in events]

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 INTERACTION_STEPS, INTERVENTIONS = "interaction_steps", "interventions"
 
-CURRICULUM_UNTIL, CURRICULUM_INTERVAL = 650_000, 320
-"""The paper's curriculum: T = 320 up to 0.65 M interaction steps (Table 1, Section 6.3)."""
+CURRICULUM_INTERVAL = 320
+"""T of the paper's curriculum up to half of S: 0.65 M of 1.3 M interaction steps (Table 1, Section 6.3)."""
 
 SHORT, LONG = 1_300_000, 2_900_000
 """S of the paper's two kinds of run [interaction steps]: Sections 6.1-6.4 and 6.6, and "to ensure convergence"

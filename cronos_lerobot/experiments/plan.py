@@ -11,7 +11,6 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETR
 
 from cronos_lerobot.experiments.definitions import (
     CURRICULUM_INTERVAL,
-    CURRICULUM_UNTIL,
     CheckpointEvaluation,
     Experiment,
     Row,
@@ -89,7 +88,7 @@ def train_flags(spec: RunSpec) -> list[str]:
         f"--protocol.task_order={row.task_order}",
     ]
     if row.curriculum:
-        until = CURRICULUM_UNTIL * scale.steps[spec.paper_steps] // spec.paper_steps
+        until = scale.steps[spec.paper_steps] // 2
         flags.append(f"--protocol.curriculum={json.dumps([[until, CURRICULUM_INTERVAL]])}")
     for name in ("learned_reset", "heuristic_reset"):
         if getattr(row, name):

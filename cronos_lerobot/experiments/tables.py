@@ -11,6 +11,7 @@ from cronos_lerobot.experiments.definitions import INTERACTION_STEPS, INTERVENTI
 from cronos_lerobot.experiments.results import ExperimentResult, RowResult, paper_results, sequential
 from cronos_lerobot.metrics import Summary, interpolate, summarise
 from cronos_lerobot.report.series import segment_rates, task_rates
+from cronos_lerobot.report.statistics import Rate
 
 Row = dict[str, Any]
 TICK = {True: "✓", False: "–"}
@@ -79,10 +80,15 @@ def _numbers(name: str, summary: Summary | None) -> Row:
     }
 
 
+def _rate_cells(rate: Rate) -> Row:
+    low, high = rate.interval
+    return {"success": rate.value, "successes": rate.successes, "n": rate.n, "ci95_low": low, "ci95_high": high}
+
+
 def segment_rows(result: ExperimentResult) -> list[Row]:
     """Success while training by segment since the last scene reset, in the last quarter of the runs."""
     return [
-        {"row": row.row.name, "segment": segment, "success": rate.value, "successes": rate.successes, "n": rate.n}
+        {"row": row.row.name, "segment": segment} | _rate_cells(rate)
         for row in result.rows
         for segment, rate in segment_rates(row.group).items()
     ]
@@ -92,7 +98,8 @@ def task_rows(result: ExperimentResult) -> list[Row]:
     """Success while training by quarter of the runs and instruction; those of learned resets are told apart."""
     return [
         {"row": row.row.name, "quarter": quarter + 1, "is_reset_task": instruction not in result.tasks}
-        | {"task": instruction, "success": rate.value, "successes": rate.successes, "n": rate.n}
+        | {"task": instruction}
+        | _rate_cells(rate)
         for row in result.rows
         for (quarter, instruction), rate in task_rates(row.group).items()
     ]

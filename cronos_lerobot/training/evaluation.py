@@ -137,9 +137,9 @@ def _rollout(
             processors.batch(columns, instructions), temperature=temperature, generator=generator
         )
         _, diverged = env.step_streams(processors.physical_actions(sample["action"]), running)
-        # A simulation that broke down proves nothing, whatever it shows.
+        # A simulation that broke down ends its episode, and proves nothing, whatever it shows.
         succeeded[running] = (env.is_success & ~diverged)[running]
-        running = running[~succeeded[running]]
+        running = running[~(succeeded | diverged)[running]]
         if not len(running):
             break
         for key, rows in observation_columns(env.observe(running)).items():

@@ -230,6 +230,27 @@ def test_a_diverged_simulation_is_reported_and_the_others_go_on():
     assert not info["diverged"].any()
 
 
+def test_a_simulation_that_diverges_while_its_bodies_settle_is_put_back(monkeypatch):
+    env, healthy = make(3), make(3)
+    for each in (env, healthy):
+        each.reset(seed=0)
+    bodies = env.simulation.body_poses()[1].copy()
+    advance = env.simulation._advance
+
+    def break_one(ids, nstep):
+        broken = advance(ids, nstep)
+        if 1 in ids:
+            env.simulation.qvel[1] = np.nan
+        return broken
+
+    monkeypatch.setattr(env.simulation, "_advance", break_one)
+    for each in (env, healthy):
+        each.end_effector_reset(np.arange(3))
+    np.testing.assert_array_equal(env.simulation.body_poses()[1], bodies)
+    np.testing.assert_array_equal(env.simulation.qvel[1], 0.0)
+    np.testing.assert_array_equal(env.simulation.qpos[[0, 2]], healthy.simulation.qpos[[0, 2]])
+
+
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [

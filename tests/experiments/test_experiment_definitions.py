@@ -143,9 +143,13 @@ def test_protocols_are_valid_and_mean_what_the_row_says(name, scale):
         assert early == (320 if row.curriculum else row.interval)
 
 
-def test_curriculum_takes_the_same_share_of_a_smaller_run():
-    for scale, until in (("paper", 650_000), ("small", 153_600)):
-        spec = next(s for s in run_specs(EXPERIMENTS["table1"], options(scale)) if s.row.curriculum)
+def test_curriculum_ends_at_half_of_every_run():
+    for name, scale, until in (
+        ("table1", "paper", 650_000),
+        ("table1", "small", 153_600),
+        ("figure3", "paper", 1_450_000),
+    ):
+        spec = next(s for s in run_specs(EXPERIMENTS[name], options(scale)) if s.row.curriculum)
         assert f"--protocol.curriculum=[[{until}, 320]]" in train_flags(spec)
 
 

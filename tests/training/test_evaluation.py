@@ -104,3 +104,11 @@ def test_a_broken_simulation_is_no_success():
     env = DummyEnv(1, diverge_at={(t, 0) for t in range(80)})
     result = evaluate_independent(env, [TASKS[0]], ScriptedPolicy(), PROCESSORS, configurations=[0])
     assert result.overall == SuccessRate(0, 1)
+
+
+def test_a_broken_simulation_ends_its_episode():
+    outcomes = [
+        evaluate_independent(env, [TASKS[0]], ScriptedPolicy(), PROCESSORS, configurations=[0, 1]).successes
+        for env in (DummyEnv(2), DummyEnv(2, diverge_at={(0, 1)}))
+    ]
+    assert outcomes == [{TASKS[0].instruction: [True, True]}, {TASKS[0].instruction: [True, False]}]

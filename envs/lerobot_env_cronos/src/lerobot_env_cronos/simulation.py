@@ -159,10 +159,18 @@ class Simulation:
         self._ctrl[ids, :NUM_ARM_JOINTS] = arm_target
 
     def settle(self, ids: np.ndarray) -> None:
-        """Let the bodies of the simulations come to rest, the arm holding still."""
+        """Let the bodies of the simulations come to rest, the arm holding still.
+
+        One that diverges is put back to where it began, at rest.
+        """
+        before = self.qpos[ids].copy()
         for _ in range(SETTLE_MAX_CHUNKS):
-            self._advance(ids, SETTLE_CHUNK)
-            ids = ids[np.abs(self.qvel[ids, NUM_ROBOT_JOINTS:]).max(1) > SETTLE_SPEED]
+            broken = self._advance(ids, SETTLE_CHUNK)
+            diverged = broken[ids] | self._is_diverged(ids)
+            if diverged.any():
+                self._restore(ids[diverged], before[diverged])
+            moving = np.abs(self.qvel[ids, NUM_ROBOT_JOINTS:]).max(1) > SETTLE_SPEED
+            ids, before = ids[moving], before[moving]
             if not len(ids):
                 return
 
@@ -226,8 +234,6 @@ class Simulation:
             on &= np.linalg.norm(self.force(grasp_sensor(side, obj)), axis=1) < GRASP_MIN_FORCE_N
         for receptacle in self.scene.receptacles:
             on &= np.linalg.norm(self.force(support_sensor(obj, receptacle)), axis=1) <= SUCCESS_MIN_FORCE_N
-        xy = self.body_pose(obj)[:, :2]
-        on &= ((xy >= EE_LOW[:2]) & (xy <= EE_HIGH[:2])).all(1)
         return on & (speed < SETTLE_SPEED)
 
     def body_rotations(self) -> np.ndarray:
