@@ -24,5 +24,5 @@ def encode_palette_png(picture: Image.Image) -> bytes:
     256 colours show no difference in pictures as plain as these, and take a third of the space.
     """
     buffer = io.BytesIO()
-    picture.quantize(256, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
+    picture.quantize(256, kmeans=3, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
     return buffer.getvalue()

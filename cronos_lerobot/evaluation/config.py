@@ -196,6 +196,8 @@ class CronosEvalConfig:
             "scene", "obs_type", "privileged_state", "observation_height", "observation_width", "camera_name"
         )  # fmt: skip
         own = {} if env.benchmark is None else {"benchmark": self.benchmark().fingerprint}
+        if env.renderer != "classic":
+            own["renderer"] = env.renderer
         return own | {
             "policy": EXPERT if self.policy is None else fingerprint(self.policy),
             "env": {name: getattr(env, name) for name in decisive},

@@ -11,7 +11,7 @@ import numpy as np
 from lerobot.envs.utils import parse_camera_names
 from lerobot_env_cronos import CronosEnvConfig, get_scene
 from lerobot_env_cronos.model import build_model
-from lerobot_env_cronos.rendering import BatchRenderer
+from lerobot_env_cronos.rendering import BatchRenderer, make_renderer
 from tqdm import tqdm
 
 from cronos_lerobot.evaluation.chains import Chain, Trajectory
@@ -102,7 +102,8 @@ def _chosen(store: ResultStore, parts: Sequence[Part], count: int) -> Iterator[t
 
 def _open_renderer(env_config: CronosEnvConfig) -> BatchRenderer:
     camera = parse_camera_names(env_config.camera_name)[0]
-    return BatchRenderer(build_model(get_scene(env_config.scene)), *env_config.render_size, camera)
+    model = build_model(get_scene(env_config.scene))
+    return make_renderer(env_config.renderer, model, *env_config.render_size, camera)
 
 
 def film_chain(path: Path, chain: Chain, length: int, trajectory: Trajectory, render: Render, where: str) -> None:

@@ -173,7 +173,7 @@ class Evaluation:
             "seed": config.seed,
             "advance": config.advance,
             "end_effector_reset": config.end_effector_reset,
-            "renderer": "classic",
+            "renderer": self.env_config.renderer,
             "opengl_platform": os.environ.get("MUJOCO_GL"),
             "versions": {"python": platform.python_version()} | package_versions(),
             "commit": git_commit(),

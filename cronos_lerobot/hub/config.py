@@ -104,6 +104,8 @@ class PolicyConfig(PublishConfig):
     one."""
     results: Path | None = None
     """results.json of cronos-eval, or its folder, for the card."""
+    scene: str | None = None
+    """Scene of a policy that lerobot-train made, for the card; cronos-train's checkpoints know theirs."""
 
     repo_type: ClassVar[str] = "model"
 

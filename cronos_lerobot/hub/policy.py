@@ -98,6 +98,8 @@ def _card(
     recorded = (trained.get("record") or trained.get("dataset") or {}).get("repo_id")
     base_model = config.base_policy or (str(base) if is_repository(base) else None)
     env = trained.get("env") or {}
+    if config.scene and env.get("scene") and config.scene != env["scene"]:
+        raise ValueError(f"--scene={config.scene}, but the policy was trained in {env['scene']}")
     return render_card(
         "policy",
         repo_id=config.repo_id,
@@ -109,7 +111,7 @@ def _card(
         is_demonstrations=run is None,
         base_model=base_model,
         base_is_local=base is not None and base_model is None,
-        scene=env.get("scene") or "kitchen_2x2",
+        scene=env.get("scene") or config.scene or (results or {}).get("scene"),
         obs_type=env.get("obs_type") or _guess_observation(policy),
         curves=curves,
         results=results,

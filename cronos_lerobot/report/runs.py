@@ -243,6 +243,10 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
     for key, group in groups.items() if differing and len(others) <= 3 else ():
         protocol = describe_protocol(group.runs[0].config["protocol"]) if others != differing else ""
         group.label = ", ".join(filter(None, (protocol, _name_values(flat[key], others))))
+    for group in groups.values() if len(groups) == 1 else ():
+        # The name of one run would stand for all of them.
+        if len(group.runs) > 1 and group.runs[0].config.get("protocol"):
+            group.label = describe_protocol(group.runs[0].config["protocol"])
     return list(groups.values())
 
 
@@ -256,8 +260,16 @@ def describe_protocol(protocol: dict[str, Any]) -> str:
     Args:
         protocol: of a training config.
     """
-    words = [f"T = {protocol.get('scene_reset_interval')}"]
+    interval = protocol.get("scene_reset_interval")
+    words = ["no scene resets" if interval is None else f"T = {interval}"]
     ticks = {"EER": "end_effector_reset", "CL": "curriculum", "LSR": "learned_reset", "HSR": "heuristic_reset"}
+    if (
+        interval is not None
+        and interval == protocol.get("task_switch_interval")
+        and not protocol.get("curriculum")
+    ):
+        # A scene reset at every task switch sends the arm home anyway.
+        del ticks["EER"]
     words += [word for word, name in ticks.items() if protocol.get(name)]
     words += protocol.get("extra_resets") or []
     if protocol.get("task_order", "heuristic") != "heuristic":

@@ -6,12 +6,14 @@ python -m cronos_lerobot.report.task_pictures --scene=kitchen_2x2
 from __future__ import annotations
 
 import argparse
+from importlib import import_module
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 from lerobot_env_cronos import CronosVectorEnv
-from lerobot_env_cronos.scenes import SCENES
+from lerobot_env_cronos.rendering import RENDERERS
+from lerobot_env_cronos.scenes import get_scene
 from PIL import Image, ImageDraw, ImageFont
 
 from cronos_lerobot.data.png import encode_palette_png
@@ -22,16 +24,19 @@ PICTURE = (320, 240)
 CAPTION, GAP, COLUMNS = 34, 14, 2
 
 
-def render_tasks(scene: str, split: str = "train") -> list[tuple[str, list[np.ndarray]]]:
+def render_tasks(
+    scene: str, split: str = "train", renderer: str = "classic"
+) -> list[tuple[str, list[np.ndarray]]]:
     """Return (instruction, one frame (480, 640, 3) uint8 per camera) of every task's start.
 
     Task i is shown from configuration i of the split, so that the sheet also shows how scenes differ.
     """
-    tasks = SCENES[scene].tasks
+    tasks = get_scene(scene).tasks
     width, height = 2 * PICTURE[0], 2 * PICTURE[1]
     env = CronosVectorEnv(
-        len(tasks), scene, observation_height=height, observation_width=width, camera_name=",".join(CAMERAS)
-    )
+        len(tasks), scene, observation_height=height, observation_width=width, camera_name=",".join(CAMERAS),
+        renderer=renderer,
+    )  # fmt: skip
     try:
         everyone = np.arange(len(tasks))
         env.scene_reset(everyone, everyone, split)
@@ -68,13 +73,17 @@ def caption_font(size: int) -> ImageFont.FreeTypeFont:
 def main() -> None:
     """Write the sheet of a scene."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--scene", default="kitchen_2x2", choices=sorted(SCENES))
+    parser.add_argument("--scene", default="kitchen_2x2", help="default: kitchen_2x2")
+    parser.add_argument("--import", metavar="MODULE", dest="module", help="register the scenes of a module first")
     parser.add_argument("--split", default="train", choices=("train", "held_out"))
+    parser.add_argument("--renderer", default="classic", choices=RENDERERS)
     parser.add_argument("--output", type=Path, help="default: docs/images/tasks_SCENE.png")
     args = parser.parse_args()
+    if args.module:
+        import_module(args.module)
     output = args.output or Path("docs/images") / f"tasks_{args.scene}.png"
     output.parent.mkdir(parents=True, exist_ok=True)
-    sheet = draw_sheet(render_tasks(args.scene, args.split))
+    sheet = draw_sheet(render_tasks(args.scene, args.split, args.renderer))
     output.write_bytes(encode_palette_png(sheet))
     print(output)
 

@@ -90,7 +90,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--jobs", type=int, help="runs at a time (default: cores / threads)")
     parser.add_argument(
         "--threads", type=int, default=1,
-        help="threads of each run (default: 1); results do not depend on --jobs, but they do on this",
+        help="threads of each run (default: 1); results do not depend on --jobs; on this they may",
     )  # fmt: skip
     parser.add_argument(
         "--policy.path", dest="policy_path", metavar="PATH", help="base policy (default: make one)"

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS
-from cronos_lerobot.experiments.scales import BASE_RECIPES, OBS_NAMES, SCALES
+from cronos_lerobot.experiments.scales import BASE_RECIPES, CLEAN_RECIPES, OBS_NAMES, SCALES
 from cronos_lerobot.scripts.reproduce import make_parser
 
 DOCS = (Path(__file__).parents[2] / "docs/experiments.md").read_text()
@@ -40,12 +40,17 @@ def test_scales():
 
 
 def test_recipes():
-    names = {(scene, short): recipe for (scene, obs), recipe in BASE_RECIPES.items() for short in [OBS_NAMES[obs]]}
+    recipes = {
+        (scene, OBS_NAMES[obs], recipe.clean): recipe
+        for table in (BASE_RECIPES, CLEAN_RECIPES)
+        for (scene, obs), recipe in table.items()
+    }
     section = DOCS[DOCS.index("| | demonstrations") :].split("\n\n")[0].splitlines()[2:]
-    assert len(section) == len(names)
+    assert len(section) == len(recipes)
     for line in section:
-        scene, obs, *numbers = re.findall(r"\w+", line)[:5]
-        recipe = names[scene, obs]
+        name, *numbers = (cell.strip() for cell in line.strip("|").split("|")[:4])
+        scene, obs = re.findall(r"\w+", name)[:2]
+        recipe = recipes[scene, obs, "--base.clean=true" in name]
         assert [int(number) for number in numbers] == [recipe.demos, recipe.clone_steps, recipe.checkpoint]
 
 

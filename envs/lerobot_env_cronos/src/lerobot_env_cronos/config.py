@@ -17,6 +17,7 @@ from lerobot_env_cronos.configurations import SPLITS
 from lerobot_env_cronos.episodic import EpisodicVectorEnv, IndependentVectorEnv, LazyVectorEnv
 from lerobot_env_cronos.observations import AGENT_POS_NAMES, OBS_TYPES, environment_state_names
 from lerobot_env_cronos.registry import gymnasium_id
+from lerobot_env_cronos.rendering import RENDERERS
 from lerobot_env_cronos.scenes import CONTROL_HZ, get_scene
 from lerobot_env_cronos.sequential import ADVANCES, SequentialVectorEnv
 from lerobot_env_cronos.simulation import ACTION_NAMES
@@ -61,6 +62,9 @@ class CronosEnvConfig(EnvConfig):
     """Camera(s), comma-separated: front (sees every body), bridge (the Bridge set-up's third-person view)."""
     render_size: tuple[int, int] = (480, 640)
     """Height and width of videos [px]."""
+    renderer: str = "classic"
+    """Of observations and videos: classic (OpenGL), or filament (physically based, with shadows; needs Vulkan, and
+    is slow without a GPU)."""
     num_threads: int = 0
     """Physics threads, 0 for all cores; results are the same at any number."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
@@ -82,6 +86,7 @@ class CronosEnvConfig(EnvConfig):
         _check("split", self.split, SPLITS)
         _check("advance", self.advance, ADVANCES)
         _check("obs_type", self.obs_type, OBS_TYPES)
+        _check("renderer", self.renderer, RENDERERS)
         if self.fps != CONTROL_HZ:
             raise ValueError(f"env.fps is fixed at {CONTROL_HZ} Hz by the protocol, got {self.fps}")
         self._chosen()
@@ -114,7 +119,7 @@ class CronosEnvConfig(EnvConfig):
         """Keyword arguments of `CronosVectorEnv`."""
         names = (
             "obs_type", "privileged_state", "observation_height", "observation_width", "camera_name",
-            "render_size", "num_threads", "benchmark",
+            "render_size", "renderer", "num_threads", "benchmark",
         )  # fmt: skip
         return {name: getattr(self, name) for name in names}
 

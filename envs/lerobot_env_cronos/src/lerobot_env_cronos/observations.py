@@ -7,7 +7,7 @@ import numpy as np
 from lerobot.envs.utils import parse_camera_names
 
 from lerobot_env_cronos.model import CAMERAS
-from lerobot_env_cronos.rendering import BatchRenderer
+from lerobot_env_cronos.rendering import RENDERERS, BatchRenderer, make_renderer
 from lerobot_env_cronos.scenes import Scene
 from lerobot_env_cronos.simulation import Simulation
 
@@ -49,9 +49,13 @@ class ObservationBuilder:
         width: int,
         camera_name: str,
         render_size: tuple[int, int],
+        renderer: str = "classic",
     ):
         if obs_type not in OBS_TYPES:
             raise ValueError(f"unknown obs_type {obs_type!r}; valid obs_types: {list(OBS_TYPES)}")
+        if renderer not in RENDERERS:
+            raise ValueError(f"unknown renderer {renderer!r}; valid renderers: {list(RENDERERS)}")
+        self.renderer = renderer
         self.cameras = parse_camera_names(camera_name)
         for camera in self.cameras:
             if camera not in CAMERAS:
@@ -107,11 +111,11 @@ class ObservationBuilder:
     def _renderer(self, size: tuple[int, int], camera: str) -> BatchRenderer:
         key = (size, camera)
         if key not in self._renderers:
-            self._renderers[key] = BatchRenderer(self.simulation.model, *size, camera)
+            self._renderers[key] = make_renderer(self.renderer, self.simulation.model, *size, camera)
         return self._renderers[key]
 
     def close(self) -> None:
-        """Free all OpenGL contexts."""
+        """Free all renderers."""
         for renderer in self._renderers.values():
             renderer.close()
         self._renderers.clear()

@@ -1,23 +1,54 @@
-"""Frames of many simulations, by MuJoCo's classic renderer.
+"""Frames of many simulations, by one of MuJoCo's renderers.
 
 All OpenGL work of a process is done in one thread. A context belongs to the thread in which it is current, and
 Mesa's software rasteriser, which spreads every frame over the cores by itself, crashes when two threads draw at
 once.
 """
 
+from __future__ import annotations
+
 import os
 import weakref
 from concurrent.futures import ThreadPoolExecutor
+from typing import Protocol
 
 import mujoco
 import numpy as np
 
 from lerobot_env_cronos import gl
 
+RENDERERS = ("classic", "filament")
+
 _GL_THREAD = ThreadPoolExecutor(1, thread_name_prefix="opengl")
 
 
-class BatchRenderer:
+class BatchRenderer(Protocol):
+    """Draws simulation states; any thread may ask for frames."""
+
+    def render(self, qpos: np.ndarray) -> np.ndarray:
+        """Frames (n, height, width, 3) uint8 of states `qpos` (n, nq)."""
+        ...
+
+    def close(self) -> None:
+        """Free what it draws with."""
+
+
+def make_renderer(name: str, model: mujoco.MjModel, height: int, width: int, camera: str) -> BatchRenderer:
+    """Return the renderer `name` of `RENDERERS` for one camera and size.
+
+    Raises:
+        KeyError: the model has no such camera.
+        RuntimeError: it cannot draw on this machine; says what is missing.
+    """
+    if name == "classic":
+        return ClassicRenderer(model, height, width, camera)
+    # Half a second of imports that nobody else needs.
+    from lerobot_env_cronos.filament import FilamentRenderer
+
+    return FilamentRenderer(model, height, width, camera)
+
+
+class ClassicRenderer:
     """Renders `camera` of simulation states at `height` x `width`.
 
     Shadows and reflections are off unless asked for: in software rendering they cost five times the rest of the

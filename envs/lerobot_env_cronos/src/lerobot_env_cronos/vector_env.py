@@ -35,6 +35,8 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             4); `difference` pays the change of that level between two steps (RL4VLA's code).
         num_threads: physics threads, 0 for all cores; results do not depend on it.
         render_size: (height, width) of `render()` [px].
+        renderer: `classic` (OpenGL) or `filament` (physically based, with shadows; slow without a GPU), of
+            observations and of `render()`.
         benchmark: where the configurations come from: `<owner>/<repository>[@<revision>]` of a dataset on the Hub,
             or a folder; None for this package's.
 
@@ -63,6 +65,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         reward: str = "difference",
         num_threads: int = 0,
         render_size: tuple[int, int] = (480, 640),
+        renderer: str = "classic",
         benchmark: str | None = None,
     ):
         if num_envs < 1:
@@ -77,7 +80,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         self.simulation = Simulation(self.scene, num_envs, num_threads)
         self._observations = ObservationBuilder(
             self.simulation, obs_type, privileged_state, observation_height, observation_width, camera_name,
-            render_size,
+            render_size, renderer,
         )  # fmt: skip
         self.single_observation_space = self._observations.space
         self.single_action_space = gym.spaces.Box(

@@ -1,0 +1,73 @@
+"""MuJoCo's physically based renderer, where this machine has Vulkan, and what is said where it has not."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos.config import CronosEnvConfig
+from lerobot_env_cronos.filament import count_vulkan_devices
+
+needs_vulkan = pytest.mark.skipif(
+    sys.platform == "linux" and not count_vulkan_devices(),
+    reason="no Vulkan (apt-get install mesa-vulkan-drivers)",
+)
+DRAW = """
+import numpy as np
+from lerobot_env_cronos import CronosVectorEnv
+env = CronosVectorEnv(2, renderer="filament")
+print("frames", env.observe()["pixels"]["front"].shape)
+"""
+
+
+def run(code, **variables):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | variables)
+
+
+def centre_of_yellow(frame):
+    """Column and row of the middle of the yellow plate."""
+    red, green, blue = frame.astype(float).transpose(2, 0, 1)
+    rows, columns = np.nonzero((red > 2.5 * blue) & (green > 2 * blue) & (red > 100))
+    return columns.mean(), rows.mean()
+
+
+@needs_vulkan
+def test_both_renderers_show_the_same_scene_from_the_same_place():
+    pictures = {}
+    for renderer in ("classic", "filament"):
+        env = CronosVectorEnv(3, camera_name="front,bridge", renderer=renderer)
+        env.scene_reset(np.arange(3), np.array([3, 9, 20]))
+        pictures[renderer] = env.observe()["pixels"]
+        env.close()
+    for camera in ("front", "bridge"):
+        for classic, filament in zip(pictures["classic"][camera], pictures["filament"][camera], strict=True):
+            np.testing.assert_allclose(centre_of_yellow(filament), centre_of_yellow(classic), atol=4.0)
+            # Shadows and tones: it is another picture.
+            assert np.abs(classic.astype(int) - filament).mean() > 5
+
+
+@needs_vulkan
+def test_a_process_that_used_it_ends_cleanly_and_repeats():
+    code = DRAW + "import hashlib; print(hashlib.sha256(env.render()[1].tobytes()).hexdigest())"
+    first, second = run(code), run(code)
+    assert (first.returncode, second.returncode) == (0, 0), first.stderr
+    assert "frames (2, 128, 128, 3)" in first.stdout
+    assert first.stdout.splitlines()[-1] == second.stdout.splitlines()[-1]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Vulkan is Linux's")
+def test_without_vulkan_the_error_names_the_package():
+    done = run(DRAW, VK_ICD_FILENAMES="/nonexistent.json", VK_DRIVER_FILES="/nonexistent.json")
+    assert done.returncode == 1
+    assert "RuntimeError" in done.stderr
+    assert "mesa-vulkan-drivers" in done.stderr
+    assert "--env.renderer=classic" in done.stderr
+
+
+def test_the_flag():
+    assert CronosEnvConfig().renderer == "classic"
+    assert CronosEnvConfig(renderer="filament").gym_kwargs["renderer"] == "filament"
+    with pytest.raises(ValueError, match=r"unknown env.renderer 'ray'.*classic.*filament"):
+        CronosEnvConfig(renderer="ray")
