@@ -8,12 +8,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cronos_lerobot.experiments.definitions import INTERACTION_STEPS
+from cronos_lerobot.experiments.definitions import INTERACTION_STEPS, INTERVENTIONS
 from cronos_lerobot.experiments.results import ExperimentResult, RowResult, paper_results, sequential
 from cronos_lerobot.report.figures import COLORS, INK, SPLIT_LABELS, draw_curve, style_axes
 from cronos_lerobot.report.series import Curve, mean_curve, segment_rates
 
-AXIS_LABELS = {INTERACTION_STEPS: "interaction steps, all streams", "interventions": "interventions, all streams"}
+AXIS_LABELS = {INTERACTION_STEPS: "interaction steps, all streams", INTERVENTIONS: "interventions, all streams"}
+MUCH_LONGER = 5
+"""Rows whose numbers of interventions differ by so much do not share a linear axis."""
 Panel = tuple[str, str, str | None]
 """Split, axis and task (None: all together) of one set of axes."""
 
@@ -61,6 +63,8 @@ def _grid(result: ExperimentResult, panels: list[list[Panel]]) -> Figure | None:
                 curve = row_curve(row, split, axis, task)
                 draw_curve(ax, curve, i, row_label(row), marker="o", width=1.5, marker_size=3)
             style_axes(ax, AXIS_LABELS[axis])
+            if axis == INTERVENTIONS:
+                _spread_interventions(ax)
             ax.set_ylim(0, 1.02)
             ax.set_title(task or SPLIT_LABELS[split], fontsize=9, color=INK, loc="left")
         split, _, task = line[0]
@@ -69,6 +73,20 @@ def _grid(result: ExperimentResult, panels: list[list[Panel]]) -> Figure | None:
         return None
     _legend_below(figure, list(axes.flat))
     return figure
+
+
+def _spread_interventions(ax: Axes) -> None:
+    """Make room for the rows with few interventions: logarithmic beyond half of the shortest one's."""
+    ends = [end for line in ax.lines if len(x := line.get_xdata()) and (end := float(np.max(x))) > 0]
+    if not ends or max(ends) < MUCH_LONGER * min(ends):
+        return
+    linear_to = min(ends) / 2
+    ax.set_xscale("symlog", linthresh=linear_to, linscale=0.5)
+    ticks = [step * 10**power for power in range(7) for step in (1, 2, 5)]
+    shown = [0, *(tick for tick in ticks if linear_to / 2 <= tick <= max(ends))]
+    ax.set_xticks(shown, [f"{tick:,}" for tick in shown])
+    ax.set_xticks([], minor=True)
+    ax.set_xlabel(f"{ax.get_xlabel()} (log scale)")
 
 
 def _legend_below(figure: Figure, axes: list[Axes]) -> None:
