@@ -77,7 +77,7 @@ def _grid(result: ExperimentResult, panels: list[list[Panel]]) -> Figure | None:
 
 def _spread_interventions(ax: Axes) -> None:
     """Make room for the rows with few interventions: logarithmic beyond half of the shortest one's."""
-    ends = [end for line in ax.lines if len(x := line.get_xdata()) and (end := float(np.max(x))) > 0]
+    ends = [end for line in ax.lines if (end := float(np.max(np.asarray(line.get_xdata()), initial=0.0))) > 0]
     if not ends or max(ends) < MUCH_LONGER * min(ends):
         return
     linear_to = min(ends) / 2

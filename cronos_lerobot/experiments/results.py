@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -93,8 +93,10 @@ class RowResult:
         return [point for seed in self.finished if (point := seed.final(split)) is not None]
 
     def success(self, split: str) -> Summary | None:
-        """Success at the end, over the finished seeds."""
-        return summarise([point.success for point in self.finals(split)])
+        """Success at the end, over the finished seeds; one alone has the interval of its evaluation."""
+        points = self.finals(split)
+        summary = summarise([point.success for point in points])
+        return replace(summary, ci95=points[0].ci95) if summary and len(points) == 1 else summary
 
     def gap(self, axis: str, split: str = "train", up_to: float | None = None) -> Summary | None:
         """D or C, divided by the length of the axis, over the finished seeds."""

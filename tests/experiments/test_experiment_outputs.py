@@ -78,11 +78,10 @@ def test_main_table(options):
     assert t80["shared_budget"] == 8
     assert t80["C_normalised_shared_mean"] == pytest.approx((0.75 + 0.71875) / 2)
     one = row["t1280_eer"]
-    assert (one["success_train_mean"], one["success_train_std"], one["success_train_ci95_low"]) == (
-        0.375,
-        None,
-        None,
-    )
+    assert (one["success_train_mean"], one["success_train_std"]) == (0.375, None)
+    # One seed: Wilson's interval of 12 successes in 32 episodes.
+    assert one["success_train_ci95_low"] == pytest.approx(0.2293, abs=1e-4)
+    assert one["success_train_ci95_high"] == pytest.approx(0.5475, abs=1e-4)
     assert row["t1280"]["success_train_mean"] is None
     assert row["t1280"]["seeds"] == 0
 
@@ -296,7 +295,17 @@ def test_panels(options):
     assert [len(ax.lines) for ax in figure.axes] == [2] * 8 + [0] * 8
     assert [ax.get_title(loc="left").split(",")[0] for ax in figure.axes[:4]] == INSTRUCTIONS
     figure = plots.curves_figure(results(options, "table1"))
-    assert [ax.get_xlabel() for ax in figure.axes] == list(plots.AXIS_LABELS.values())
+    labels = list(plots.AXIS_LABELS.values())
+    # T = 80 has eight times the interventions of the other row.
+    assert [ax.get_xlabel() for ax in figure.axes] == [labels[0], f"{labels[1]} (log scale)"]
+    assert [ax.get_xscale() for ax in figure.axes] == ["linear", "symlog"]
+
+
+def test_rows_with_about_as_many_interventions_share_a_linear_axis(options):
+    make_run(options, "table1", "t1280", 1, (2, 4, 6))
+    make_run(options, "table1", "t1280_eer", 1, (2, 4, 6))
+    figure = plots.curves_figure(results(options, "table1"))
+    assert [ax.get_xscale() for ax in figure.axes] == ["linear", "linear"]
 
 
 def test_report_only_from_the_command_line(options, tmp_path):
