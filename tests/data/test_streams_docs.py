@@ -12,8 +12,8 @@ DOCS = (Path(__file__).parents[2] / "docs/streams.md").read_text()
 
 def test_examples_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "outputs/train/eer").mkdir(parents=True)
-    record(tmp_path / "outputs/train/eer/streams")
+    (tmp_path / "outputs/train/recorded").mkdir(parents=True)
+    record(tmp_path / "outputs/train/recorded/streams")
     selecting, reading = re.findall(r"```python\n(.*?)```", DOCS, re.DOTALL)
     found: dict = {}
     exec(selecting, found)
