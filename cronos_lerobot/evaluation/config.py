@@ -196,7 +196,7 @@ class CronosEvalConfig:
             "scene", "obs_type", "privileged_state", "observation_height", "observation_width", "camera_name"
         )  # fmt: skip
         own = {} if env.benchmark is None else {"benchmark": self.benchmark().fingerprint}
-        if env.renderer != "classic":
+        if env.renderer != "classic" and env.obs_type == "pixels_agent_pos":
             own["renderer"] = env.renderer
         return own | {
             "policy": EXPERT if self.policy is None else fingerprint(self.policy),

@@ -102,6 +102,8 @@ def _caveat(suite: str, split: str, n: int, size: int, results: dict[str, Any]) 
     """In which way an evaluation is not the benchmark's own, if in any."""
     if n != size:
         return f"{n} of the {size} {'chains' if suite == 'sequential' else 'episodes'} of {split} were evaluated"
+    if renderer := (results.get("identity") or {}).get("renderer"):
+        return f"the policy saw pictures of the renderer {renderer}, the benchmark's are classic"
     other = {name: results[name] for name, value in STANDARD.items() if results[name] != value}
     return f"evaluated with {other}, the benchmark has {STANDARD}" if suite == "sequential" and other else None
 

@@ -116,7 +116,10 @@ def describe_observation(env: dict[str, Any]) -> str:
         return "privileged state: the poses of all bodies"
     cameras = " and ".join(f"`{name.strip()}`" for name in env["camera_name"].split(","))
     state = ", with the privileged state beside it" if env["privileged_state"] else ""
-    return f"camera {cameras}, {env['observation_width']} x {env['observation_height']} px{state}"
+    # Runs of before there was a choice do not name it.
+    renderer = env.get("renderer", "classic")
+    drawn = "" if renderer == "classic" else f", drawn by {renderer}"
+    return f"camera {cameras}, {env['observation_width']} x {env['observation_height']} px{drawn}{state}"
 
 
 def is_repository(name: Any) -> bool:

@@ -240,13 +240,14 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
     names = sorted({name for config in flat.values() for name in config})
     differing = [name for name in names if len({config.get(name) for config in flat.values()}) > 1]
     others = [name for name in differing if name not in DESCRIBED]
-    for key, group in groups.items() if differing and len(others) <= 3 else ():
-        protocol = describe_protocol(group.runs[0].config["protocol"]) if others != differing else ""
-        group.label = ", ".join(filter(None, (protocol, _name_values(flat[key], others))))
-    for group in groups.values() if len(groups) == 1 else ():
-        # The name of one run would stand for all of them.
-        if len(group.runs) > 1 and group.runs[0].config.get("protocol"):
-            group.label = describe_protocol(group.runs[0].config["protocol"])
+    for key, group in groups.items():
+        # Where one group is all there is, the name of one of its runs would stand for all of them.
+        is_alone = len(groups) == 1 and len(group.runs) > 1 and "protocol" in group.runs[0].config
+        if is_alone or (differing and len(others) <= 3):
+            protocol = (
+                describe_protocol(group.runs[0].config["protocol"]) if is_alone or others != differing else ""
+            )
+            group.label = ", ".join(filter(None, (protocol, _name_values(flat[key], others))))
     return list(groups.values())
 
 
@@ -263,11 +264,8 @@ def describe_protocol(protocol: dict[str, Any]) -> str:
     interval = protocol.get("scene_reset_interval")
     words = ["no scene resets" if interval is None else f"T = {interval}"]
     ticks = {"EER": "end_effector_reset", "CL": "curriculum", "LSR": "learned_reset", "HSR": "heuristic_reset"}
-    if (
-        interval is not None
-        and interval == protocol.get("task_switch_interval")
-        and not protocol.get("curriculum")
-    ):
+    is_episodic = interval == protocol.get("task_switch_interval") and not protocol.get("curriculum")
+    if interval and is_episodic:
         # A scene reset at every task switch sends the arm home anyway.
         del ticks["EER"]
     words += [word for word, name in ticks.items() if protocol.get(name)]

@@ -13,8 +13,8 @@ from cronos_lerobot.evaluation.store import RESULTS
 SUITES = ("independent", "sequential")
 DECISIVE = ("policy", "scene", "obs_type", "temperature", "seed", "advance", "end_effector_reset")
 """Fields of results.json in which two evaluations of one policy must agree to be shown as one."""
-IDENTITY = ("benchmark", "n_episodes", "orderings")
-"""Fields of its `identity` in which they must agree too."""
+IDENTITY = {"benchmark": "the package's", "n_episodes": None, "orderings": None, "renderer": "classic"}
+"""Fields of its `identity` in which they must agree too, with what it means that one is missing."""
 
 
 @dataclass
@@ -63,7 +63,8 @@ def read_suite_runs(files: Iterable[Path]) -> list[SuiteRun]:
 
 def _settings(results: dict[str, Any]) -> dict[str, Any]:
     identity = results.get("identity", {})
-    return {name: results.get(name) for name in DECISIVE} | {name: identity.get(name) for name in IDENTITY}
+    own = {name: identity.get(name, default) for name, default in IDENTITY.items()}
+    return {name: results.get(name) for name in DECISIVE} | own
 
 
 def policy_name(policy: str) -> str:

@@ -1,14 +1,17 @@
 """Entries of `.eval_results/cronos.yaml`, from numbers that are known."""
 
+import json
+
 import pytest
 from lerobot_env_cronos.benchmark import draw_benchmark
 from lerobot_env_cronos.scenes import Task
 
 from cronos_lerobot.evaluation.results import independent_results, sequential_results
 from cronos_lerobot.hub.benchmark import choose_benchmark
-from cronos_lerobot.hub.config import BenchmarkConfig, PublishConfig, ResultsConfig
+from cronos_lerobot.hub.config import BenchmarkConfig, PolicyConfig, PublishConfig, ResultsConfig
+from cronos_lerobot.hub.policy import write_policy_repository
 from cronos_lerobot.hub.results import make_entries, merge
-from cronos_lerobot.hub.runs import find_checkpoint, is_repository
+from cronos_lerobot.hub.runs import describe_observation, find_checkpoint, is_repository
 
 BENCHMARK = draw_benchmark("kitchen_2x2", seed=0, num_configurations=2, num_orderings=2, chain_length=2)
 
@@ -60,6 +63,30 @@ def test_other_chains_than_the_benchmarks_are_refused(change):
         make_entries(make_results(**change), BENCHMARK, ResultsConfig())
     # Single tasks do not depend on it.
     assert len(make_entries(make_results(**change), BENCHMARK, ResultsConfig(suites="independent"))) == 1
+
+
+def test_pictures_of_another_renderer_are_refused_or_called_so():
+    results = make_results(identity={"renderer": "filament"})
+    with pytest.raises(ValueError, match="the policy saw pictures of the renderer filament"):
+        make_entries(results, BENCHMARK, ResultsConfig())
+    assert len(make_entries(make_results(identity={}), BENCHMARK, ResultsConfig())) == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({}, "camera `front` and `bridge`, 128 x 64 px"),
+        ({"renderer": "classic"}, "camera `front` and `bridge`, 128 x 64 px"),
+        ({"renderer": "filament"}, "camera `front` and `bridge`, 128 x 64 px, drawn by filament"),
+        ({"obs_type": "environment_state_agent_pos"}, "privileged state: the poses of all bodies"),
+    ],
+)
+def test_an_observation_in_words(changes, text):
+    env = {
+        "obs_type": "pixels_agent_pos", "camera_name": "front, bridge", "observation_width": 128,
+        "observation_height": 64, "privileged_state": False,
+    }  # fmt: skip
+    assert describe_observation(env | changes) == text
 
 
 def test_nothing_to_publish():
@@ -125,6 +152,40 @@ def test_where_a_policy_may_be(tmp_path):
         assert (found.run, found.step) == (tmp_path / "run", 100)
     with pytest.raises(FileNotFoundError, match="holds no policy"):
         find_checkpoint(tmp_path)
+
+
+def write_clone(model, env):
+    """A checkpoint of lerobot-train; without an `env` in its config, as after training on demonstrations alone."""
+    model.mkdir(parents=True)
+    (model / "config.json").write_text('{"type": "cronos_mlp"}')
+    (model / "model.safetensors").touch()
+    (model / "train_config.json").write_text(json.dumps({"env": env, "dataset": {"repo_id": "me/demos"}}))
+    return model
+
+
+@pytest.mark.parametrize(
+    ("env", "scene", "flag"),
+    [
+        (None, None, ""),
+        (None, "playroom_2x2", "--env.scene=playroom_2x2 "),
+        ({"scene": "kitchen_3x3"}, None, "--env.scene=kitchen_3x3 "),
+        ({"scene": "kitchen_3x3"}, "kitchen_3x3", "--env.scene=kitchen_3x3 "),
+    ],
+)
+def test_the_scene_in_the_card_of_a_clone(tmp_path, env, scene, flag):
+    model = write_clone(tmp_path / "model", env)
+    (tmp_path / "repository").mkdir()
+    config = PolicyConfig(repo_id="me/clone", path=model, scene=scene)
+    assert write_policy_repository(config, tmp_path / "repository") == "cronos_mlp policy"
+    card = (tmp_path / "repository/README.md").read_text()
+    assert f"lerobot-eval --policy.path=me/clone --env.type=cronos {flag}--env.obs_type=" in card
+    assert "Demonstrations: [me/demos]" in card
+
+
+def test_a_card_for_another_scene_is_refused(tmp_path):
+    config = PolicyConfig(path=write_clone(tmp_path / "model", {"scene": "kitchen_3x3"}), scene="kitchen_2x2")
+    with pytest.raises(ValueError, match="--scene=kitchen_2x2, but the policy was trained in kitchen_3x3"):
+        write_policy_repository(config, tmp_path)
 
 
 def test_what_can_be_a_repository(tmp_path, monkeypatch):

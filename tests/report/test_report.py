@@ -12,7 +12,7 @@ from lerobot_env_cronos.scenes import SCENES
 from synthetic_runs import INSTRUCTIONS, write_evaluation, write_training_run
 
 from cronos_lerobot.report.page import write_report
-from cronos_lerobot.report.runs import find_runs, group_runs
+from cronos_lerobot.report.runs import describe_protocol, find_runs, group_runs
 from cronos_lerobot.report.series import evaluation_curve, segment_history, segment_rates
 from cronos_lerobot.report.statistics import Gain, Rate, newcombe_interval
 from cronos_lerobot.report.suites import policy_name
@@ -205,6 +205,35 @@ def test_many_differences_of_the_protocol_are_put_as_the_paper_does(tmp_path):
     assert labels == ["T = 160", "T = 320, EER, CL, HSR", "T = 320, EER, random order, 1 configuration(s)"]
 
 
+@pytest.mark.parametrize(
+    ("protocol", "name"),
+    [
+        # The paper's T = 80 resets the arm with the scene; with a curriculum it does not at first.
+        ({"scene_reset_interval": 80, "task_switch_interval": 80, "end_effector_reset": True}, "T = 80"),
+        (
+            {"scene_reset_interval": 80, "task_switch_interval": 80, "end_effector_reset": True,
+             "curriculum": [[640, 80]]},
+            "T = 80, EER, CL",
+        ),
+        (
+            {"scene_reset_interval": 1280, "task_switch_interval": 80, "learned_reset": True,
+             "end_effector_reset": True, "extra_resets": ["shelf"]},
+            "T = 1280, EER, LSR, shelf",
+        ),
+        ({"scene_reset_interval": None, "task_switch_interval": 80}, "no scene resets"),
+    ],
+)  # fmt: skip
+def test_a_protocol_is_called_as_in_table_1(protocol, name):
+    assert describe_protocol(protocol) == name
+
+
+def test_seeds_of_one_protocol_are_called_by_it_and_a_run_by_its_name(tmp_path):
+    for seed in (0, 1):
+        write_training_run(tmp_path / f"mine_{seed}", seed=seed, interval=160)
+    assert [group.label for group in group_runs(find_runs([tmp_path])[0])] == ["T = 160"]
+    assert [group.label for group in group_runs(find_runs([tmp_path / "mine_1"])[0])] == ["mine_1"]
+
+
 def test_resumed_run_stays_in_its_group(tmp_path):
     for name in "ab":
         manifest = write_training_run(tmp_path / name, seed=ord(name)) / "manifest.json"
@@ -279,6 +308,16 @@ def test_a_quick_evaluation_does_not_replace_the_whole_one(tmp_path):
     runs = find_runs([tmp_path])[2]
     assert [(run.name, run.results["sequential"]["train"]["positions"][0]["success"]) for run in runs] == [
         ("me/policy (n_episodes=64)", 0.75), ("me/policy (n_episodes=16)", 0.25),
+    ]  # fmt: skip
+
+
+def test_pictures_of_another_renderer_are_another_evaluation(tmp_path):
+    identity = {"policy": "1a2b", "n_episodes": 64, "orderings": 10}
+    for name, successes, own in (("a", [0.75, 0.5], {}), ("b", [0.25, 0.0], {"renderer": "filament"})):
+        content = {"sequential": {"train": chains(successes)}}
+        write_results(tmp_path / name, "me/policy", content, identity=identity | own)
+    assert [run.name for run in find_runs([tmp_path])[2]] == [
+        "me/policy (renderer=classic)", "me/policy (renderer=filament)",
     ]  # fmt: skip
 
 
