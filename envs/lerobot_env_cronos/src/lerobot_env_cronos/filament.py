@@ -11,6 +11,7 @@ import threading
 import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
+from functools import cache
 from queue import SimpleQueue
 from typing import Any
 
@@ -50,7 +51,14 @@ class _Thread:
                 future.set_result(function(*args))
             except BaseException as error:
                 future.set_exception(error)
+            # Waiting for the next call must not keep the arguments of this one alive.
             del future, function, args
+
+
+@cache
+def _thread() -> _Thread:
+    """The process's, from the first renderer on."""
+    return _Thread()
 
 
 class FilamentRenderer:
@@ -64,12 +72,12 @@ class FilamentRenderer:
     def __init__(self, model: mujoco.MjModel, height: int, width: int, camera: str):
         self.model, self.height, self.width = model, height, width
         self.camera = model.camera(camera).id
-        self._view: list[Any] = _THREAD.call(_open, model, self.camera)
-        self._finalizer = weakref.finalize(self, _THREAD.call, self._view.clear)
+        self._view: list[Any] = _thread().call(_open, model, self.camera)
+        self._finalizer = weakref.finalize(self, _thread().call, self._view.clear)
 
     def render(self, qpos: np.ndarray) -> np.ndarray:
         """Render states `qpos` (n, nq) to uint8 frames (n, height, width, 3)."""
-        return _THREAD.call(self._render, qpos)
+        return _thread().call(self._render, qpos)
 
     def _render(self, qpos: np.ndarray) -> np.ndarray:
         data, renderer, scene, view = self._view
@@ -141,6 +149,3 @@ def count_vulkan_devices() -> int:
     vulkan.vkEnumeratePhysicalDevices(instance, ctypes.byref(count), None)
     vulkan.vkDestroyInstance(instance, None)
     return count.value
-
-
-_THREAD = _Thread()

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from lerobot_env_cronos import gl
+from lerobot_env_cronos.filament import FilamentRenderer
 
 RENDERERS = ("classic", "filament")
 
@@ -42,9 +43,6 @@ def make_renderer(name: str, model: mujoco.MjModel, height: int, width: int, cam
     """
     if name == "classic":
         return ClassicRenderer(model, height, width, camera)
-    # Half a second of imports that nobody else needs.
-    from lerobot_env_cronos.filament import FilamentRenderer
-
     return FilamentRenderer(model, height, width, camera)
 
 
