@@ -18,6 +18,7 @@ import numpy as np
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, get_scene
 from lerobot_env_cronos.expert import ScriptedExpert
+from lerobot_env_cronos.rendering import RENDERERS
 from lerobot_env_cronos.simulation import Simulation
 
 PARTS = ("state", "pixels", "expert", "inference", "train")
@@ -62,10 +63,10 @@ def physics_rate(num_envs: int, scene: str, seconds: float) -> float:
     return rate(segment, seconds)
 
 
-def env_rate(num_envs: int, scene: str, obs_type: str, seconds: float) -> float:
+def env_rate(num_envs: int, scene: str, obs_type: str, renderer: str, seconds: float) -> float:
     """Control steps per second of the environment, observation and reward included."""
     actions, poses = recorded_actions(num_envs, scene)
-    env = CronosVectorEnv(num_envs, scene, obs_type=obs_type)
+    env = CronosVectorEnv(num_envs, scene, obs_type=obs_type, renderer=renderer)
     ids = np.arange(num_envs)
 
     def segment() -> int:
@@ -165,6 +166,7 @@ def main() -> None:
     """Print one line per part."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", default="kitchen_2x2")
+    parser.add_argument("--renderer", default="classic", choices=RENDERERS, help="of `pixels`")
     parser.add_argument("--num_envs", type=int, default=64)
     parser.add_argument("--seconds", type=float, default=8.0, help="time spent on each part [s]")
     parser.add_argument("--skip", nargs="*", default=[], choices=PARTS)
@@ -176,7 +178,7 @@ def main() -> None:
     print(f"{'pure physics (bound)':28s} {bound:8.0f} steps/s  1.00")
     for name, obs_type in (("state", "environment_state_agent_pos"), ("pixels", "pixels_agent_pos")):
         if name not in args.skip:
-            speed = env_rate(args.num_envs, args.scene, obs_type, args.seconds)
+            speed = env_rate(args.num_envs, args.scene, obs_type, args.renderer, args.seconds)
             print(f"{'environment, ' + name:28s} {speed:8.0f} steps/s  {speed / bound:.2f}")
     if "expert" not in args.skip:
         speed = expert_rate(args.num_envs, args.scene, args.seconds)
