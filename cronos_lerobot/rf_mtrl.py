@@ -60,6 +60,7 @@ def rf_mtrl(
                 o_tp1 = env.observe()
             o_t = o_tp1
         segment = loop.end_segment()
+        # Only now: what diverged in the last step belongs to the scene that it was in.
         resets.divergence.put_back(env, loop, info["diverged"])
         resets.end_effector.apply_if_due(env, loop)  # 21, 22
         resets.heuristic.apply_if_due(env, loop)  # 23, 24
