@@ -1,6 +1,6 @@
 """What a policy's second task suffers from: the arm or the bodies being where the first one left them.
 
-    python -m cronos_lerobot.start_bias --policy.path=<checkpoint> [--split=train] [--output=bias.csv]
+    python -m cronos_lerobot.start_bias --policy.path=<checkpoint> [--seeds=5] [--output=bias.csv]
 
 The paper (Section 5) blames the end effector: demonstrations begin with the arm at home, reset-free segments do
 not. Here every task is done for 80 steps from every configuration, then the next task of the training cycle is
@@ -90,6 +90,19 @@ def _run_task(env: CronosVectorEnv, agent: Spectator, name: str) -> np.ndarray:
     return success
 
 
+def pool(repetitions: list[list[SecondTask]]) -> list[SecondTask]:
+    """The outcomes of several `run_second_tasks`, condition by condition."""
+    return [
+        SecondTask(
+            same[0].bodies,
+            same[0].arm,
+            np.concatenate([outcome.success for outcome in same]),
+            np.concatenate([outcome.complete for outcome in same]),
+        )
+        for same in zip(*repetitions, strict=True)
+    ]
+
+
 Row = tuple[str, str, int, int, float, float, int]
 
 
@@ -109,7 +122,9 @@ def main() -> None:
     parser.add_argument("--policy.device", dest="device", default="cpu")
     parser.add_argument("--scene", help="default: that of the policy's training, or kitchen_2x2")
     parser.add_argument("--split", default="train", choices=["train", "held_out"])
-    parser.add_argument("--seed", type=int, default=0, help="of the policy's sampling")
+    parser.add_argument(
+        "--seeds", type=int, default=1, help="of the policy's sampling: all of it so often, from seeds 0, 1, ..."
+    )
     parser.add_argument("--output", type=Path, help="CSV to write")
     args = parser.parse_args()
     register_third_party_plugins()
@@ -117,7 +132,7 @@ def main() -> None:
     benchmark = load_benchmark(env_config.benchmark, env_config.scene)
     num_envs = len(benchmark.scene.tasks) * len(benchmark.configurations[args.split])
     env = CronosVectorEnv(num_envs, env_config.scene, **env_config.gym_kwargs)
-    table = rows(run_second_tasks(env, agent, args.split, args.seed))
+    table = rows(pool([run_second_tasks(env, agent, args.split, seed) for seed in range(args.seeds)]))
     env.close()
     print("bodies  arm   success  95 % interval    n  complete from the start (left out)")
     for bodies, arm, k, n, low, high, complete in table:

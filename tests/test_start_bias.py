@@ -7,7 +7,7 @@ from lerobot_env_cronos.robot import HOME_QPOS
 from lerobot_env_cronos.simulation import NUM_ARM_JOINTS
 
 from cronos_lerobot.report.stream_video import ExpertSpectator
-from cronos_lerobot.start_bias import CONDITIONS, rows, run_second_tasks
+from cronos_lerobot.start_bias import CONDITIONS, SecondTask, pool, rows, run_second_tasks
 
 
 class Watchful(ExpertSpectator):
@@ -61,3 +61,14 @@ def test_the_next_task_of_the_cycle_is_given_and_the_expert_does_it(watched):
     assert [(o.bodies, o.arm) for o in outcomes] == list(CONDITIONS)
     for (*_, k, n, _low, _high, complete), outcome in zip(rows(outcomes), outcomes, strict=True):
         assert (k, n, complete) == (4, 4, 0), outcome
+
+
+def test_seeds_are_counted_together_but_not_conditions():
+    def outcome(bodies, success, complete):
+        return SecondTask(bodies, "home", np.array(success), np.array(complete))
+
+    first = [outcome("new", [True, False], [False, False]), outcome("left", [True, True], [True, False])]
+    second = [outcome("new", [True, True], [False, False]), outcome("left", [False, False], [False, False])]
+    table = [(bodies, k, n, complete) for bodies, _, k, n, _, _, complete in rows(pool([first, second]))]
+    # A task that was complete when it was given does not count.
+    assert table == [("new", 3, 4, 0), ("left", 1, 3, 1)]
