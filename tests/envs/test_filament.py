@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 from lerobot_env_cronos import CronosVectorEnv, filament
 from lerobot_env_cronos.config import CronosEnvConfig
-from lerobot_env_cronos.filament import count_vulkan_devices
 
 needs_vulkan = pytest.mark.skipif(
-    sys.platform == "linux" and not count_vulkan_devices(),
+    sys.platform == "linux" and not filament.count_vulkan_devices(),
     reason="no Vulkan (apt-get install mesa-vulkan-drivers)",
 )
 DRAW = """
-import numpy as np
-from lerobot_env_cronos import CronosVectorEnv, filament
+from lerobot_env_cronos import CronosVectorEnv
 env = CronosVectorEnv(2, renderer="filament")
 print("frames", env.observe()["pixels"]["front"].shape)
 """
@@ -49,12 +47,16 @@ def test_both_renderers_show_the_same_scene_from_the_same_place():
 
 
 @needs_vulkan
-def test_a_process_that_used_it_ends_cleanly_and_repeats():
-    code = DRAW + "import hashlib; print(hashlib.sha256(env.render()[1].tobytes()).hexdigest())"
-    first, second = run(code), run(code)
-    assert (first.returncode, second.returncode) == (0, 0), first.stderr
-    assert "frames (2, 128, 128, 3)" in first.stdout
-    assert first.stdout.splitlines()[-1] == second.stdout.splitlines()[-1]
+def test_a_process_that_used_it_ends_cleanly_and_another_draws_the_same(tmp_path):
+    """Up to the few values at edges that depend on how the renderer's threads fell."""
+    frames = []
+    for path in (tmp_path / "first.npy", tmp_path / "second.npy"):
+        result = run(DRAW + f"import numpy as np; np.save({str(path)!r}, env.render())")
+        assert result.returncode == 0, result.stderr
+        assert "frames (2, 128, 128, 3)" in result.stdout
+        frames.append(np.load(path))
+    assert frames[0].shape == (2, 480, 640, 3)
+    assert (frames[0] != frames[1]).mean() < 1e-3
 
 
 def test_without_vulkan_the_error_names_the_package(monkeypatch):
