@@ -98,14 +98,18 @@ def make_entries(results: dict[str, Any], benchmark: Benchmark, config: ResultsC
     return entries
 
 
-def _caveat(suite: str, split: str, n: int, size: int, results: dict[str, Any]) -> str | None:
-    """In which way an evaluation is not the benchmark's own, if in any."""
+def _caveat(suite: str, split: str, n: int, size: int, results: dict[str, Any]) -> str:
+    """In which ways an evaluation is not the benchmark's own; empty if in none."""
+    caveats = []
     if n != size:
-        return f"{n} of the {size} {'chains' if suite == 'sequential' else 'episodes'} of {split} were evaluated"
+        whole = "chains" if suite == "sequential" else "episodes"
+        caveats.append(f"{n} of the {size} {whole} of {split} were evaluated")
     if renderer := (results.get("identity") or {}).get("renderer"):
-        return f"the policy saw pictures of the renderer {renderer}, the benchmark's are classic"
+        caveats.append(f"the policy saw pictures of the renderer {renderer}, the benchmark's are classic")
     other = {name: results[name] for name, value in STANDARD.items() if results[name] != value}
-    return f"evaluated with {other}, the benchmark has {STANDARD}" if suite == "sequential" and other else None
+    if suite == "sequential" and other:
+        caveats.append(f"evaluated with {other}, the benchmark has {STANDARD}")
+    return "; ".join(caveats)
 
 
 def _value(suite: str, scores: dict[str, Any]) -> float:

@@ -72,6 +72,15 @@ def test_pictures_of_another_renderer_are_refused_or_called_so():
     assert len(make_entries(make_results(identity={}), BENCHMARK, ResultsConfig())) == 2
 
 
+def test_a_note_names_every_way_in_which_an_evaluation_is_another():
+    results = make_results(identity={"renderer": "filament"}, advance="on_success")
+    results["sequential"]["train"]["n"] = 3
+    (entry,) = make_entries(results, BENCHMARK, ResultsConfig(suites="sequential", partial=True))
+    assert entry.notes is not None
+    assert entry.notes.startswith("PARTIAL: 3 of the 4 chains of train were evaluated; the policy saw pictures of")
+    assert "; evaluated with {'advance': 'on_success'}, the benchmark has" in entry.notes
+
+
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
