@@ -127,6 +127,8 @@ def main() -> None:
     )
     parser.add_argument("--output", type=Path, help="CSV to write")
     args = parser.parse_args()
+    if args.seeds < 1:
+        parser.error(f"--seeds={args.seeds}: give 1 or more")
     register_third_party_plugins()
     env_config, agent = make_spectator(args.policy_path, args.device, args.scene)
     benchmark = load_benchmark(env_config.benchmark, env_config.scene)
