@@ -1,5 +1,6 @@
 """Run folders with made-up numbers, in the formats of cronos-train and lerobot-eval."""
 
+import csv
 import json
 from pathlib import Path
 
@@ -92,3 +93,9 @@ def write_evaluation(folder, suite="independent_train", successes=(1, 2, 3, 4), 
     Path(folder).mkdir(parents=True, exist_ok=True)
     (Path(folder) / "eval_info.json").write_text(json.dumps({"per_task": per_task}))
     return folder
+
+
+def read_csv(path):
+    """A CSV file of a report, a dict for each line."""
+    with path.open() as file:
+        return list(csv.DictReader(file))

@@ -1,0 +1,111 @@
+"""Evaluations of cronos-eval in the report: which belong together, and what they are called."""
+
+import base64
+import json
+import re
+
+import pytest
+from synthetic_runs import INSTRUCTIONS, read_csv
+
+from cronos_lerobot.report.page import write_report
+from cronos_lerobot.report.runs import find_runs
+from cronos_lerobot.report.suites import policy_name
+from cronos_lerobot.scripts.report import make_report
+
+
+def write_results(folder, policy, content, **settings):
+    folder.mkdir(parents=True)
+    head = {"format": 1, "policy": policy, "temperature": 0.6, "scene": "kitchen_2x2"} | settings
+    (folder / "results.json").write_text(json.dumps(head | content))
+
+
+def rate(success, n=64, std=0.1):
+    return {"success": success, "n": n, "ci95": [max(0, success - 0.1), min(1, success + 0.1)], "std": std}
+
+
+def chains(successes):
+    length = {"mean": sum(successes), "std": 0.2, "ci95": [0.5, 2.5]}
+    return {"n": 640, "positions": [rate(s, 640) for s in successes], "average_chain_length": length}
+
+
+def test_results_of_cronos_eval(tmp_path):
+    """Both suites, in a folder each, of one policy; another temperature is another evaluation."""
+    policy = "outputs/train/eer/checkpoints/0010240/pretrained_model"
+    single = {"independent": {"train": rate(0.75) | {"per_task": {INSTRUCTIONS[0]: rate(0.5, 16)}}}}
+    write_results(tmp_path / "e/single", policy, single)
+    sequential = {"sequential": {"train": chains([0.75, 0.5]), "held_out": chains([0.25, 0.0])}}
+    video = {"path": "videos/a.mp4", "suite": "sequential", "split": "train", "kind": "good", "number": 3}
+    sequential["videos"] = [video | {"configuration": 7, "length": 2}]
+    write_results(tmp_path / "e/chains", policy, sequential)
+    (tmp_path / "e/chains/videos").mkdir()
+    (tmp_path / "e/chains/videos/a.mp4").write_bytes(b"a chain")
+    (tmp_path / "e/results.json").write_text('{"something": "else"}')
+    write_results(tmp_path / "greedy", policy, {"sequential": {"train": chains([1.0, 1.0])}}, temperature=0)
+    page = write_report(
+        make_report([tmp_path / "e/single", tmp_path / "e/chains"]), tmp_path / "report"
+    ).read_text()
+    rows = read_csv(tmp_path / "report/sequential.csv")
+    assert [(r["policy"], r["split"], r["SEQ 0"], r["SEQ 1"], r["chain length"], r["chains"]) for r in rows] == [
+        ("eer 0010240", "train", "0.75", "0.5", "1.25", "640"),
+        ("eer 0010240", "held_out", "0.25", "0.0", "0.25", "640"),
+    ]
+    rows = read_csv(tmp_path / "report/independent.csv")
+    assert [(r["task"], r["success"], r["n"]) for r in rows] == [
+        ("all tasks", "0.75", "64"),
+        (INSTRUCTIONS[0], "0.5", "16"),
+    ]
+    assert "1.25 ± 0.2 [0.5, 2.5]" in page
+    assert base64.b64encode(b"a chain").decode() in page
+    assert "eer 0010240, ordering 3, configuration 7: 2 done" in page
+    content = base64.b64encode((tmp_path / "report/sequential.png").read_bytes()).decode()
+    assert content in page
+    runs = find_runs([tmp_path / "e/chains", tmp_path / "greedy"])[2]
+    assert [run.name for run in runs] == ["eer 0010240 (temperature=0.6)", "eer 0010240 (temperature=0)"]
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/results.json").write_text("[]")
+    with pytest.raises(FileNotFoundError, match="cronos-eval"):
+        find_runs([tmp_path / "other"])
+
+
+def test_a_quick_evaluation_does_not_replace_the_whole_one(tmp_path):
+    for name, successes, n in (("whole", [0.75, 0.5], 64), ("whole_quick", [0.25, 0.0], 16)):
+        identity = {"identity": {"policy": "1a2b", "n_episodes": n, "orderings": 10}}
+        write_results(tmp_path / name, "me/policy", {"sequential": {"train": chains(successes)}}, **identity)
+    runs = find_runs([tmp_path])[2]
+    assert [(run.name, run.results["sequential"]["train"]["positions"][0]["success"]) for run in runs] == [
+        ("me/policy (n_episodes=64)", 0.75), ("me/policy (n_episodes=16)", 0.25),
+    ]  # fmt: skip
+
+
+def test_pictures_of_another_renderer_are_another_evaluation(tmp_path):
+    identity = {"policy": "1a2b", "n_episodes": 64, "orderings": 10}
+    for name, successes, own in (("a", [0.75, 0.5], {}), ("b", [0.25, 0.0], {"renderer": "filament"})):
+        content = {"sequential": {"train": chains(successes)}}
+        write_results(tmp_path / name, "me/policy", content, identity=identity | own)
+    assert [run.name for run in find_runs([tmp_path])[2]] == [
+        "me/policy (renderer=classic)", "me/policy (renderer=filament)",
+    ]  # fmt: skip
+
+
+def test_columns_of_scenes_with_more_tasks_stay_in_their_place(tmp_path):
+    write_results(tmp_path / "a", "me/two", {"sequential": {"train": chains([0.75, 0.5])}})
+    write_results(
+        tmp_path / "b", "me/three", {"sequential": {"train": chains([0.7, 0.6, 0.4])}}, scene="kitchen_3x3"
+    )
+    page = write_report(make_report([tmp_path]), tmp_path / "report").read_text()
+    table = page[page.index("<th>SEQ 0</th>") :]
+    table = table[: table.index("</table>")]
+    names = re.findall(r"<th>(.*?)</th>", page[: page.index(table) + len(table)].split("<table>")[-1])
+    rows = [re.findall(r"<td>(.*?)</td>", line) for line in table.splitlines() if "<td>" in line]
+    two, three = (dict(zip(names, row, strict=True)) for row in rows)
+    assert (two["chain length"].split()[0], two["SEQ 2"]) == ("1.25", "")
+    assert (three["chain length"].split()[0], three["SEQ 2"].split()[0]) == ("1.7", "0.4")
+
+
+def test_policies_in_short():
+    assert (
+        policy_name("out/runs/t80_1300k/seed1/train/checkpoints/0102400/pretrained_model")
+        == "t80_1300k/seed1 0102400"
+    )
+    assert policy_name("outputs/train/eer/checkpoints/last/pretrained_model") == "eer last"
+    assert policy_name("someone/policy") == "someone/policy"
