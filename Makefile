@@ -46,7 +46,7 @@ format: ## Format and fix
 	$(RUN) ruff check --fix .
 
 bench: setup ## Steps per second: physics, pixels, training
-	$(RUN) python -m cronos_lerobot.benchmark
+	$(RUN) python -m cronos_lerobot.studies.speed
 
 wheels: $(UV) ## Build the wheels into dist/
 	$(UV) build --all-packages --wheel

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 import numpy as np
-from lerobot_env_cronos.scenes import SCENES
+from lerobot_env_cronos.scene.scenes import SCENES
 
 from cronos_lerobot.training.evaluation import EvaluationResult
 

@@ -7,9 +7,10 @@ from typing import Protocol
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, REWARD
 from lerobot_env_cronos import CronosVectorEnv, Task
-from lerobot_env_cronos.configurations import sample_configuration
-from lerobot_env_cronos.simulation import ACTION_HIGH, ACTION_LOW
+from lerobot_env_cronos.benchmark.configurations import sample_configuration
+from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW
 
+from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.data.perturbations import (
     ActionNoise,
     GraspMisses,
@@ -17,7 +18,7 @@ from cronos_lerobot.data.perturbations import (
     NoiseConfig,
     move_arm_at_random,
 )
-from cronos_lerobot.data.schema import SUCCESS, observation_columns
+from cronos_lerobot.data.schema import SUCCESS
 from cronos_lerobot.data.writer import SegmentWriter
 
 ARM_POSES = ("home", "random", "after_task")

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from lerobot_env_cronos import CronosVectorEnv
-from lerobot_env_cronos.kinematics import inverse_kinematics
-from lerobot_env_cronos.simulation import ACTION_HIGH, ACTION_LOW
+from lerobot_env_cronos.simulation.kinematics import inverse_kinematics
+from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW
 
 MOTION = slice(0, 6)
 """The end-effector part of an action; the gripper command is never perturbed by noise."""

@@ -10,6 +10,7 @@ import numpy as np
 from lerobot.utils.constants import ACTION, DONE, OBS_IMAGES, REWARD
 from lerobot_env_cronos import CronosVectorEnv
 
+from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.data.drawing import LateCamera, UndrawnFrames
 from cronos_lerobot.data.schema import (
     INTERVENTION,
@@ -23,14 +24,13 @@ from cronos_lerobot.data.schema import (
     SUCCESS_FRAME,
     TOTAL_INTERVENTIONS,
     VALUE,
-    Intervention,
     feature_names,
     frame_format,
-    observation_columns,
     stream_features,
     with_cameras,
 )
 from cronos_lerobot.data.writer import SegmentWriter
+from cronos_lerobot.protocol.interventions import Intervention
 
 
 class StreamRecorder:

@@ -8,15 +8,16 @@ LeRobot never takes them for an input or an output of a policy.
 """
 
 from collections.abc import Mapping, Sequence
-from enum import IntEnum
 from typing import Any, cast
 
 import gymnasium
 import numpy as np
-from lerobot.utils.constants import ACTION, DONE, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE, REWARD
+from lerobot.utils.constants import ACTION, DONE, OBS_IMAGES, REWARD
 from lerobot_env_cronos import CronosVectorEnv
-from lerobot_env_cronos.observations import AGENT_POS_NAMES, environment_state_names
-from lerobot_env_cronos.simulation import ACTION_NAMES
+from lerobot_env_cronos.simulation.observations import AGENT_POS_NAMES, environment_state_names
+from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
+
+from cronos_lerobot.agents.processing import VECTOR_KEYS
 
 SUCCESS = "next.success"
 STREAM_ID = "cronos.stream_id"
@@ -32,29 +33,6 @@ SUCCESS_FRAME = "cronos.success_frame"
 """Of an episode's row in `meta/episodes`: the first frame after which the task was complete, -1 if none."""
 
 Features = dict[str, dict[str, Any]]
-
-
-class Intervention(IntEnum):
-    """What happened to a stream right before a frame (column `cronos.intervention`).
-
-    Ordered by strength. Where several happen at one task switch, the frame carries the strongest:
-    `max(kinds)`. Every value but NONE stands on the first frame of a segment, and only there.
-    """
-
-    NONE = 0
-    """The frame follows its predecessor by one control step."""
-    TASK_SWITCH = 1
-    """Only the instruction changed; the scene and the arm are as the segment before left them."""
-    END_EFFECTOR_RESET = 2
-    """The arm went home with the gripper open; the bodies stayed. Free."""
-    HEURISTIC_RESET = 3
-    """Bodies that had left the workspace were put back. Counts towards the budget."""
-    SCENE_RESET = 4
-    """Every body went to a benchmark configuration, the arm home. Counts towards the budget."""
-    DIVERGENCE = 5
-    """A scene reset that the simulation forced, because its state was no longer finite."""
-    INITIAL = 6
-    """The stream's very first placement. Free."""
 
 
 _STREAM_COLUMNS: dict[str, str] = {
@@ -102,10 +80,10 @@ def demonstration_features(
             cameras = cast(gymnasium.spaces.Dict, space)
             for camera, box in cameras.items():
                 features[f"{OBS_IMAGES}.{camera}"] = _camera_feature(box.shape or (), video)
-        elif key in _VECTOR_KEYS:
-            features[_VECTOR_KEYS[key]] = _vector_feature(key, space.shape or (), names[key])
+        elif key in VECTOR_KEYS:
+            features[VECTOR_KEYS[key]] = _vector_feature(key, space.shape or (), names[key])
         else:
-            raise ValueError(f"unknown observation {key!r}; valid: 'pixels', {sorted(_VECTOR_KEYS)}")
+            raise ValueError(f"unknown observation {key!r}; valid: 'pixels', {sorted(VECTOR_KEYS)}")
     features[ACTION] = _vector_feature(ACTION, (len(ACTION_NAMES),), ACTION_NAMES)
     features[REWARD] = _scalar_feature("float32")
     features[SUCCESS] = _scalar_feature("bool")
@@ -162,24 +140,6 @@ def frame_format(feature: Mapping[str, Any]) -> tuple[tuple[int, ...], np.dtype]
     """Shape and dtype of one frame of a feature as the writer takes it: pixels are uint8 (H, W, 3)."""
     shape = () if feature["shape"] == (1,) else tuple(feature["shape"])
     return shape, np.dtype(np.uint8 if feature["dtype"] in ("image", "video") else feature["dtype"])
-
-
-def observation_columns(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """A raw batched observation by LeRobot's names.
-
-    Args:
-        observation: the environment's observation dict, every array with leading dimension n.
-
-    Returns:
-        `observation.images.<camera>` uint8 (n, H, W, 3), `observation.state` and
-        `observation.environment_state` float32 (n, D): those of them that are there. Not copied.
-    """
-    columns = {f"{OBS_IMAGES}.{camera}": pixels for camera, pixels in observation.get("pixels", {}).items()}
-    columns |= {name: observation[key] for key, name in _VECTOR_KEYS.items() if key in observation}
-    return columns
-
-
-_VECTOR_KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
 
 
 def _camera_feature(shape: tuple[int, ...], video: bool) -> dict[str, Any]:

@@ -1,9 +1,5 @@
 """Checks that recorded streams are whole: every step once, every annotation where it belongs."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pandas as pd
 
@@ -14,19 +10,22 @@ from cronos_lerobot.data.schema import (
     STREAM_ID,
     STREAM_INTERVENTIONS,
     TOTAL_INTERVENTIONS,
-    Intervention,
 )
-from cronos_lerobot.protocol import COUNTED_INTERVENTIONS
+from cronos_lerobot.protocol.config import COUNTED_INTERVENTIONS
+from cronos_lerobot.protocol.interventions import Intervention
 
-if TYPE_CHECKING:
-    from cronos_lerobot.data.streams import StreamDataset
+COLUMNS = (
+    "index", "episode_index", "frame_index", STREAM_ID, STEP, SEGMENT_INDEX, INTERVENTION, STREAM_INTERVENTIONS,
+    TOTAL_INTERVENTIONS,
+)  # fmt: skip
+"""What a check reads of every frame."""
 
 
 class StreamError(ValueError):
     """A recorded stream is not whole."""
 
 
-def check(streams: StreamDataset) -> None:
+def check(frames: pd.DataFrame, total_frames: int, total_episodes: int) -> None:
     """Check every frame's place in its stream.
 
     - LeRobot's indices count frames and episodes without a gap, and an episode is one segment of one stream.
@@ -35,19 +34,17 @@ def check(streams: StreamDataset) -> None:
     - The counts of interventions never fall, and rise where an intervention that counts stands.
 
     Args:
-        streams: of a whole recording; a filtered one has gaps.
+        frames: the columns `COLUMNS` of a whole recording, in LeRobot's order; a filtered one has gaps.
+        total_frames: as `info.json` counts them.
+        total_episodes: the same.
 
     Raises:
         StreamError: names the stream, the step and what is wrong there.
     """
-    names = ["index", "episode_index", "frame_index", STREAM_ID, STEP, SEGMENT_INDEX]
-    names += [INTERVENTION, STREAM_INTERVENTIONS, TOTAL_INTERVENTIONS]
-    frames = streams.annotations(names)
-    meta = streams.meta
-    if len(frames) != meta.total_frames:
-        raise StreamError(f"the data files hold {len(frames)} frames, info.json counts {meta.total_frames}")
+    if len(frames) != total_frames:
+        raise StreamError(f"the data files hold {len(frames)} frames, info.json counts {total_frames}")
     _expect(frames, frames["index"] == np.arange(len(frames)), "its index is not its row, {index}")
-    _check_episodes(frames, meta.total_episodes)
+    _check_episodes(frames, total_episodes)
     ids = frames[STREAM_ID].unique()
     if missing := sorted(set(range(int(ids.max()) + 1)) - set(ids.tolist())):
         raise StreamError(f"the streams {missing} are missing; recorded are the first ones up to {ids.max()}")

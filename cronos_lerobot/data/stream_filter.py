@@ -26,12 +26,12 @@ from cronos_lerobot.data.schema import (
     STREAM_ID,
     SUCCESS,
     SUCCESS_FRAME,
-    Intervention,
 )
 from cronos_lerobot.data.stats import Stats, episode_stats
 from cronos_lerobot.data.storage import INCOMPLETE, Shard, stats_of_row
 from cronos_lerobot.data.streams import Segment, StreamDataset, to_array
 from cronos_lerobot.data.video import MAX_FILE_DURATION_S, Clip, CopiedVideoFile, read_frames
+from cronos_lerobot.protocol.interventions import Intervention
 
 PROVENANCE = "meta/filter.json"
 """What a filtered dataset was made of, and how."""

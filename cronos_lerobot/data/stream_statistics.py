@@ -9,8 +9,8 @@ from typing import Any
 from lerobot_env_cronos.statistics import wilson_interval
 from rich.table import Table
 
-from cronos_lerobot.data.schema import Intervention
 from cronos_lerobot.data.streams import Segment, StreamDataset
+from cronos_lerobot.protocol.interventions import Intervention
 
 NUM_PERIODS = 10
 """Parts of the recording that segments are counted in."""

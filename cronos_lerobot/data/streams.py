@@ -35,9 +35,10 @@ from cronos_lerobot.data.schema import (
     STREAM_ID,
     SUCCESS,
     SUCCESS_FRAME,
-    Intervention,
 )
+from cronos_lerobot.data.stream_check import COLUMNS, check
 from cronos_lerobot.data.video import Clip, read_frames
+from cronos_lerobot.protocol.interventions import Intervention
 
 SCENE_RESETS = (Intervention.INITIAL, Intervention.SCENE_RESET, Intervention.DIVERGENCE)
 """After these the whole scene is new."""
@@ -258,9 +259,7 @@ class StreamDataset:
         Raises:
             StreamError: a step is missing or there twice, or an annotation is wrong.
         """
-        from cronos_lerobot.data.stream_check import check
-
-        check(self)
+        check(self.annotations(COLUMNS), self.meta.total_frames, self.meta.total_episodes)
 
     def _episodes(self) -> pd.DataFrame:
         """One row per segment: LeRobot's columns and ours."""

@@ -11,11 +11,10 @@ import torch
 from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosVectorEnv
-from lerobot_env_cronos.expert import ScriptedExpert
+from lerobot_env_cronos.expert.expert import ScriptedExpert
 
-from cronos_lerobot.data.schema import observation_columns
-from cronos_lerobot.rl.policy import TrainablePolicy
-from cronos_lerobot.rl.processing import PolicyProcessors, make_processors
+from cronos_lerobot.agents.base import TrainablePolicy
+from cronos_lerobot.agents.processing import PolicyProcessors, make_processors, observation_columns
 
 
 class Actor(Protocol):

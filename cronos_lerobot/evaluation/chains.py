@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from lerobot_env_cronos import SequentialVectorEnv, Task
 from lerobot_env_cronos.sequential import ChainStep
-from lerobot_env_cronos.simulation import ACTION_NAMES
+from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 
 from cronos_lerobot.evaluation.actors import Actor
 

@@ -14,9 +14,10 @@ from typing import Any
 import draccus
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs.configs import EnvConfig
-from lerobot_env_cronos import Benchmark, CronosEnvConfig, configurations, load_benchmark, orderings
-from lerobot_env_cronos.benchmark import SUITES
-from lerobot_env_cronos.configurations import SPLITS
+from lerobot_env_cronos import Benchmark, CronosEnvConfig, load_benchmark
+from lerobot_env_cronos.benchmark import configurations, orderings
+from lerobot_env_cronos.benchmark.benchmark import SUITES
+from lerobot_env_cronos.benchmark.configurations import SPLITS
 
 from cronos_lerobot.evaluation.policy_env import observations_of, trained_scene
 

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from lerobot.envs.utils import parse_camera_names
 from lerobot_env_cronos import CronosEnvConfig, get_scene
-from lerobot_env_cronos.model import build_model
-from lerobot_env_cronos.rendering import BatchRenderer, make_renderer
+from lerobot_env_cronos.scene.model import build_model
+from lerobot_env_cronos.simulation.rendering import BatchRenderer, make_renderer
 from tqdm import tqdm
 
 from cronos_lerobot.evaluation.chains import Chain, Trajectory
 from cronos_lerobot.evaluation.plan import Part
 from cronos_lerobot.evaluation.store import ResultStore, chain_key
-from cronos_lerobot.report.overlay import Status, draw_status
-from cronos_lerobot.report.stream_video import write_mp4
+from cronos_lerobot.film.encode import write_mp4
+from cronos_lerobot.film.overlay import Status, draw_status
 
 GOOD, BAD = "good", "bad"
 FPS = 20

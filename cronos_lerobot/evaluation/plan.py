@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from lerobot_env_cronos import Benchmark, EpisodeGroup
-from lerobot_env_cronos.benchmark import SUITES
-from lerobot_env_cronos.configurations import SPLITS
-from lerobot_env_cronos.scenes import STEPS_PER_TASK
+from lerobot_env_cronos.benchmark.benchmark import SUITES
+from lerobot_env_cronos.benchmark.configurations import SPLITS
+from lerobot_env_cronos.scene.scenes import STEPS_PER_TASK
 
 from cronos_lerobot.evaluation.chains import Chain, Noise, chain_noise
 

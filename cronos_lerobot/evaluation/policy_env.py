@@ -9,8 +9,8 @@ from typing import Any
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
-from lerobot_env_cronos.model import CAMERAS
-from lerobot_env_cronos.scenes import SCENES
+from lerobot_env_cronos.scene.model import CAMERAS
+from lerobot_env_cronos.scene.scenes import SCENES
 
 
 def observations_of(policy: PreTrainedConfig) -> dict[str, Any]:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from lerobot_env_cronos.orderings import Ordering
-from lerobot_env_cronos.scenes import Task
+from lerobot_env_cronos.benchmark.orderings import Ordering
+from lerobot_env_cronos.scene.scenes import Task
 from rich.table import Table
 
 from cronos_lerobot.evaluation.rates import SuccessRate

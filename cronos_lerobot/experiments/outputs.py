@@ -12,7 +12,7 @@ from cronos_lerobot.experiments import plots, tables
 from cronos_lerobot.experiments.definitions import Experiment, Row
 from cronos_lerobot.experiments.results import ExperimentResult, RowResult, collect, paper_results
 from cronos_lerobot.experiments.specs import Options, base_policy
-from cronos_lerobot.metrics import Summary
+from cronos_lerobot.protocol.metrics import Summary
 from cronos_lerobot.report.statistics import Rate
 from cronos_lerobot.report.tables import write_csv
 from cronos_lerobot.training.logging import METRICS

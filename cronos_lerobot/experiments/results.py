@@ -16,7 +16,7 @@ from cronos_lerobot.experiments.definitions import INTERVENTIONS, CheckpointEval
 from cronos_lerobot.experiments.jobs import changed_flags, read_record
 from cronos_lerobot.experiments.plan import train_job
 from cronos_lerobot.experiments.specs import Options, RunSpec, base_evaluation_folder, run_specs
-from cronos_lerobot.metrics import Gap, Summary, performance_gap, success_at, summarise
+from cronos_lerobot.protocol.metrics import Gap, Summary, performance_gap, success_at, summarise
 from cronos_lerobot.report.runs import Group, TrainingRun, read_training_run
 from cronos_lerobot.training.logging import METRICS
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from cronos_lerobot.experiments.definitions import INTERACTION_STEPS, INTERVENTIONS
 from cronos_lerobot.experiments.results import ExperimentResult, RowResult, paper_results, sequential
-from cronos_lerobot.metrics import Summary, interpolate, summarise
+from cronos_lerobot.protocol.metrics import Summary, interpolate, summarise
 from cronos_lerobot.report.series import segment_rates, task_rates
 from cronos_lerobot.report.statistics import Rate
 

@@ -9,7 +9,7 @@ import yaml
 from huggingface_hub import EvalResultEntry, HfApi, eval_result_entries_to_yaml
 from huggingface_hub.errors import EntryNotFoundError
 from lerobot_env_cronos import Benchmark, gymnasium_id, load_benchmark
-from lerobot_env_cronos.benchmark import SUITES
+from lerobot_env_cronos.benchmark.benchmark import SUITES
 
 from cronos_lerobot.hub.benchmark import task_id
 from cronos_lerobot.hub.config import ResultsConfig

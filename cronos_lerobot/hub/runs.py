@@ -11,7 +11,7 @@ from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 
 from cronos_lerobot.hub.cards import command_line
-from cronos_lerobot.protocol import COUNTED_INTERVENTIONS
+from cronos_lerobot.protocol.config import COUNTED_INTERVENTIONS
 from cronos_lerobot.report.runs import TrainingRun, describe_protocol, read_training_run
 from cronos_lerobot.training.logging import MANIFEST, METRICS
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from lerobot.datasets.utils import INFO_PATH
 from lerobot_env_cronos import gymnasium_id
-from lerobot_env_cronos.scenes import SCENES
+from lerobot_env_cronos.scene.scenes import SCENES
 from lerobot_env_cronos.statistics import wilson_interval
 
 from cronos_lerobot.data.schema import STREAM_ID

@@ -10,7 +10,7 @@ from typing import Any
 
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
-from lerobot_env_cronos.scenes import SCENES
+from lerobot_env_cronos.scene.scenes import SCENES
 
 from cronos_lerobot.evaluation.store import RESULTS
 from cronos_lerobot.report.statistics import Gain, Rate

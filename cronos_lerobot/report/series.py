@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cronos_lerobot.metrics import interpolate
+from cronos_lerobot.protocol.metrics import interpolate
 from cronos_lerobot.report.runs import Group, TrainingRun
 from cronos_lerobot.report.statistics import Rate
 

@@ -16,35 +16,29 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.configs import PreTrainedConfig, RGBEncoderConfig
+from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
-from lerobot_env_cronos.expert import ScriptedExpert
-from PIL import Image
+from lerobot_env_cronos.expert.expert import ScriptedExpert
 from tqdm import tqdm
 
-from cronos_lerobot.data.schema import Intervention, observation_columns
-from cronos_lerobot.data.video import VideoFile
+from cronos_lerobot.agents.base import ActionSample
+from cronos_lerobot.agents.processing import PolicyProcessors, make_processors, observation_columns
 from cronos_lerobot.evaluation.policy_env import observations_of, trained_scene
-from cronos_lerobot.loop_state import SegmentEnd, Step
-from cronos_lerobot.protocol import ProtocolConfig
-from cronos_lerobot.report.overlay import Status, draw_status
-from cronos_lerobot.resets import make_resets
-from cronos_lerobot.rf_mtrl import rf_mtrl
-from cronos_lerobot.rl.policy import ActionSample
-from cronos_lerobot.rl.processing import PolicyProcessors, make_processors
-from cronos_lerobot.task_orders import TaskSet, make_task_order
+from cronos_lerobot.film.encode import write_gif, write_mp4
+from cronos_lerobot.film.overlay import Status, draw_status
+from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.protocol.interventions import Intervention
+from cronos_lerobot.protocol.loop_state import SegmentEnd, Step
+from cronos_lerobot.protocol.resets import make_resets
+from cronos_lerobot.protocol.rf_mtrl import rf_mtrl
+from cronos_lerobot.protocol.task_orders import TaskSet, make_task_order
 
 EXPERT = "expert"
 NOTICE_STEPS = 8
 """Control steps for which an intervention stays announced."""
-GIF_SIZE = (320, 240)
-GIF_FPS = 10
-MAX_GIF_BYTES = 1_500_000
-GIF_QUALITIES = ((2, 128), (2, 64), (3, 64), (4, 48), (6, 32), (8, 32), (12, 24))
-"""(every how many-th control step, colours), tried in this order until the file is small enough."""
 
 
 class Spectator:
@@ -170,33 +164,6 @@ def make_spectator(
         policy_config, policy_path, preprocessor_overrides={"device_processor": {"device": device}}
     )
     return env_config, PolicySpectator(policy, make_processors(policy, *processors))
-
-
-def write_mp4(path: Path, frames: list[np.ndarray], fps: int) -> None:
-    """Encode frames (H, W, 3) uint8 as h264 that every browser plays."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    encoder = RGBEncoderConfig(vcodec="h264", preset="medium", g=10 * fps, crf=28)
-    with VideoFile(path, fps, *frames[0].shape[:2], encoder) as video:
-        video.append(np.stack(frames))
-
-
-def write_gif(path: Path, frames: list[np.ndarray], max_bytes: int = MAX_GIF_BYTES) -> int:
-    """Write a sped-up GIF of at most `max_bytes`, if the coarsest setting allows; returns its size [bytes]."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    for stride, colors in GIF_QUALITIES:
-        images = [Image.fromarray(frame).resize(GIF_SIZE, Image.Resampling.LANCZOS) for frame in frames[::stride]]
-        # One palette for all frames, and no dithering, so that what stands still costs nothing.
-        sheet = Image.new("RGB", (GIF_SIZE[0], GIF_SIZE[1] * 8))
-        for i, number in enumerate(np.linspace(0, len(images) - 1, 8).astype(int)):
-            sheet.paste(images[number], (0, i * GIF_SIZE[1]))
-        palette = sheet.quantize(colors, method=Image.Quantize.MEDIANCUT)
-        small = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-        small[0].save(
-            path, save_all=True, append_images=small[1:], duration=1000 // GIF_FPS, loop=0, optimize=True
-        )
-        if path.stat().st_size <= max_bytes:
-            break
-    return path.stat().st_size
 
 
 def make_parser() -> argparse.ArgumentParser:

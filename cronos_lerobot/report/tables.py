@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from cronos_lerobot.metrics import performance_gap, success_at, summarise
+from cronos_lerobot.protocol.metrics import performance_gap, success_at, summarise
 from cronos_lerobot.report.runs import Comparison, EvaluationRun, Group, TrainingRun, evaluation_rates
 from cronos_lerobot.report.statistics import Gain, Rate
 

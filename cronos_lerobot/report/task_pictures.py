@@ -12,8 +12,8 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from lerobot_env_cronos import CronosVectorEnv
-from lerobot_env_cronos.rendering import RENDERERS
-from lerobot_env_cronos.scenes import get_scene
+from lerobot_env_cronos.scene.scenes import get_scene
+from lerobot_env_cronos.simulation.rendering import RENDERERS
 from PIL import Image, ImageDraw, ImageFont
 
 from cronos_lerobot.data.png import encode_palette_png

@@ -74,7 +74,7 @@ class RecordDemosConfig(DemoConfig):
 @parser.wrap()
 def record_demos(cfg: RecordDemosConfig) -> None:
     """Record the demonstrations; Ctrl-C ends early and keeps what is there."""
-    from lerobot_env_cronos.expert import ScriptedExpert
+    from lerobot_env_cronos.expert.expert import ScriptedExpert
 
     assert isinstance(cfg.env, CronosEnvConfig)
     env = CronosVectorEnv(cfg.num_envs, cfg.env.scene, **cfg.env.gym_kwargs)

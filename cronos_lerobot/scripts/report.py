@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from lerobot_env_cronos.scenes import SCENES
+from lerobot_env_cronos.scene.scenes import SCENES
 
 from cronos_lerobot.report.page import Report, write_report
 from cronos_lerobot.report.runs import EvaluationRun, find_runs

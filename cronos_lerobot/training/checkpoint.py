@@ -35,9 +35,9 @@ from lerobot.utils.random_utils import deserialize_rng_state, load_rng_state, sa
 from lerobot.utils.utils import flatten_dict, unflatten_dict
 from safetensors.torch import load_file, load_model, save_file, save_model
 
-from cronos_lerobot.loop_state import LoopState
+from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.processes import Processes
-from cronos_lerobot.rl.ppo import PPO
+from cronos_lerobot.protocol.loop_state import LoopState
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.seeding import NamedGenerators
 

@@ -18,11 +18,11 @@ from lerobot.envs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
+from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.data.writer import FLUSH_INTERVAL_S
-from cronos_lerobot.protocol import ProtocolConfig
-from cronos_lerobot.resets import check_extra_resets
-from cronos_lerobot.rl.ppo_config import PPOConfig
-from cronos_lerobot.task_orders import check_task_order
+from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.protocol.resets import check_extra_resets
+from cronos_lerobot.protocol.task_orders import check_task_order
 
 NUM_CONFIGURATIONS = 64
 """Benchmark configurations of each split."""

@@ -14,10 +14,9 @@ import numpy as np
 import torch
 from lerobot_env_cronos import STEPS_PER_TASK
 
-from cronos_lerobot.data.schema import observation_columns
+from cronos_lerobot.agents.processing import PolicyProcessors, observation_columns
 from cronos_lerobot.evaluation.rates import SuccessRate
 from cronos_lerobot.processes import Processes
-from cronos_lerobot.rl.processing import PolicyProcessors
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 
-from cronos_lerobot.rl.policy import check_trainable
+from cronos_lerobot.agents.base import check_trainable
 from cronos_lerobot.training.config import CronosTrainConfig
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from cronos_lerobot.loop_state import Event, LoopState, SegmentEnd, Step
+from cronos_lerobot.protocol.loop_state import Event, LoopState, SegmentEnd, Step
 from cronos_lerobot.provenance import git_commit, package_versions
 from cronos_lerobot.training.config import CronosTrainConfig
 

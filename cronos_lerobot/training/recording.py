@@ -14,7 +14,7 @@ from lerobot_env_cronos import CronosEnvConfig
 from cronos_lerobot.data.drawing import LateCamera
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.writer import RecordingError
-from cronos_lerobot.loop_state import Step
+from cronos_lerobot.protocol.loop_state import Step
 from cronos_lerobot.training.config import CronosTrainConfig
 
 FILM = "film"

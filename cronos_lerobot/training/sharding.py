@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from cronos_lerobot.loop_state import Step
+from cronos_lerobot.agents.base import ActionSample, Agent
 from cronos_lerobot.processes import Processes
-from cronos_lerobot.rl.policy import ActionSample, Agent
+from cronos_lerobot.protocol.loop_state import Step
 from cronos_lerobot.training.recording import FILM
 
 INFO = ("is_success", "is_grasped", "diverged")

@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from cronos_lerobot.loop_state import Event, SegmentEnd, Step, Update
+from cronos_lerobot.agents.ppo.agent import PPOAgent
+from cronos_lerobot.agents.ppo.config import PPOConfig
+from cronos_lerobot.agents.ppo.ppo import PPO
+from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
+from cronos_lerobot.agents.processing import make_processors
 from cronos_lerobot.processes import Processes, bit_sum
-from cronos_lerobot.resets import make_resets
-from cronos_lerobot.rf_mtrl import rf_mtrl
-from cronos_lerobot.rl.agent import PPOAgent
-from cronos_lerobot.rl.ppo import PPO
-from cronos_lerobot.rl.ppo_config import PPOConfig
-from cronos_lerobot.rl.processing import make_processors
-from cronos_lerobot.rl.rollout_buffer import RolloutBuffer
+from cronos_lerobot.protocol.loop_state import Event, SegmentEnd, Step, Update
+from cronos_lerobot.protocol.resets import make_resets
+from cronos_lerobot.protocol.rf_mtrl import rf_mtrl
+from cronos_lerobot.protocol.task_orders import TaskSet, make_task_order
 from cronos_lerobot.stopwatch import Stopwatch
-from cronos_lerobot.task_orders import TaskSet, make_task_order
 from cronos_lerobot.training.checkpoint import RunState, load_checkpoint, save_checkpoint
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.evaluation import evaluate_independent

@@ -4,8 +4,9 @@ import numpy as np
 from synthetic_segments import FPS, STATE_DIM, images, observation_space
 
 from cronos_lerobot.data.recorder import StreamRecorder
-from cronos_lerobot.data.schema import Intervention, stream_features
+from cronos_lerobot.data.schema import stream_features
 from cronos_lerobot.data.writer import SegmentWriter
+from cronos_lerobot.protocol.interventions import Intervention
 
 K = 4
 STREAMS = 3

@@ -8,8 +8,8 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.config import CronosEnvConfig
-from lerobot_env_cronos.expert import ScriptedExpert
-from lerobot_env_cronos.robot import HOME_QPOS
+from lerobot_env_cronos.expert.expert import ScriptedExpert
+from lerobot_env_cronos.scene.robot import HOME_QPOS
 
 from cronos_lerobot.data.demos import DemoCollector, DemoConfig, StartConfig
 from cronos_lerobot.data.perturbations import ActionNoise, MissConfig, NoiseConfig

@@ -4,8 +4,9 @@ from lerobot.datasets import LeRobotDataset
 from synthetic_segments import FPS, STATE_DIM, images, observation_space
 
 from cronos_lerobot.data.recorder import StreamRecorder
-from cronos_lerobot.data.schema import Intervention, stream_features
+from cronos_lerobot.data.schema import stream_features
 from cronos_lerobot.data.writer import SegmentWriter
+from cronos_lerobot.protocol.interventions import Intervention
 
 K = 4
 SWITCH = [Intervention.TASK_SWITCH, Intervention.END_EFFECTOR_RESET, Intervention.SCENE_RESET]

@@ -5,13 +5,9 @@ from lerobot.configs import FeatureType
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from synthetic_segments import observation_space
 
-from cronos_lerobot.data.schema import (
-    STREAM_COLUMNS,
-    Intervention,
-    demonstration_features,
-    observation_columns,
-    stream_features,
-)
+from cronos_lerobot.agents.processing import observation_columns
+from cronos_lerobot.data.schema import STREAM_COLUMNS, demonstration_features, stream_features
+from cronos_lerobot.protocol.interventions import Intervention
 
 
 def test_annotations_are_no_policy_features():

@@ -10,11 +10,11 @@ from lerobot.datasets.dataset_tools import delete_episodes
 from synthetic_segments import FPS, features, segment
 from synthetic_streams import PICTURES, STEPS, STREAMS, TASKS, UPDATE, K, record
 
-from cronos_lerobot.data.schema import Intervention
 from cronos_lerobot.data.stream_check import StreamError
 from cronos_lerobot.data.stream_statistics import make_tables, statistics
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.data.writer import SegmentWriter
+from cronos_lerobot.protocol.interventions import Intervention
 
 FRONT = "observation.images.front"
 

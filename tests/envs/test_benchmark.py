@@ -7,9 +7,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, load_benchmark
-from lerobot_env_cronos.benchmark import draw_benchmark, packaged_benchmark
-from lerobot_env_cronos.benchmark_files import BenchmarkError, read_benchmark, write_benchmark
-from lerobot_env_cronos.configurations import load_configurations
+from lerobot_env_cronos.benchmark.benchmark import draw_benchmark, packaged_benchmark
+from lerobot_env_cronos.benchmark.configurations import load_configurations
+from lerobot_env_cronos.benchmark.files import BenchmarkError, read_benchmark, write_benchmark
 
 STATE = "environment_state_agent_pos"
 # A change of these is another benchmark: a new version of the environment id.

@@ -7,7 +7,7 @@ from importlib import resources
 import numpy as np
 import pytest
 from lerobot_env_cronos import SCENES, CronosVectorEnv, get_scene
-from lerobot_env_cronos.configurations import (
+from lerobot_env_cronos.benchmark.configurations import (
     CLEARANCE_M,
     SPLITS,
     footprint_corners,

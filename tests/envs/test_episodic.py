@@ -11,7 +11,7 @@ from lerobot.envs.factory import make_env, make_env_config
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import SCENES, CronosEnvConfig, IndependentVectorEnv, get_scene
-from lerobot_env_cronos.configurations import load_configurations
+from lerobot_env_cronos.benchmark.configurations import load_configurations
 
 STATE = "environment_state_agent_pos"
 TASK = get_scene("kitchen_2x2").tasks[0]

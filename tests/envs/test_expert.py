@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 from lerobot_env_cronos import CronosVectorEnv, get_scene
-from lerobot_env_cronos.configurations import NUM_CONFIGURATIONS, SPLITS
-from lerobot_env_cronos.expert import ScriptedExpert
-from lerobot_env_cronos.expert_ceiling import (
+from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS, SPLITS
+from lerobot_env_cronos.expert.ceiling import (
     has_lost_body,
     measure_independent,
     measure_reset_free,
@@ -13,7 +12,8 @@ from lerobot_env_cronos.expert_ceiling import (
     success_rate,
     write_csv,
 )
-from lerobot_env_cronos.simulation import ACTION_HIGH, ACTION_LOW
+from lerobot_env_cronos.expert.expert import ScriptedExpert
+from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW
 
 SCENE = "kitchen_2x2"
 TASKS = get_scene(SCENE).tasks

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 from lerobot_env_cronos import SCENES, CronosVectorEnv, Task
-from lerobot_env_cronos.body_boxes import SceneBoxes, WorldBoxes
-from lerobot_env_cronos.expert import ScriptedExpert
-from lerobot_env_cronos.expert_ceiling import run_segment
-from lerobot_env_cronos.grasping import choose_grasps, grasp_candidates
-from lerobot_env_cronos.kinematics import quaternion_to_matrix
-from lerobot_env_cronos.model import build_model
-from lerobot_env_cronos.robot import HOME_QPOS
+from lerobot_env_cronos.expert.body_boxes import SceneBoxes, WorldBoxes
+from lerobot_env_cronos.expert.ceiling import run_segment
+from lerobot_env_cronos.expert.expert import ScriptedExpert
+from lerobot_env_cronos.expert.grasping import choose_grasps, grasp_candidates
+from lerobot_env_cronos.scene.model import build_model
+from lerobot_env_cronos.scene.robot import HOME_QPOS
+from lerobot_env_cronos.simulation.kinematics import quaternion_to_matrix
 
 SCENE = SCENES["kitchen_3x3"]
 BEAR, SHOVEL, BOTTLE, PLATE, CLOTH, CARPET = range(6)

@@ -6,8 +6,9 @@ import sys
 
 import numpy as np
 import pytest
-from lerobot_env_cronos import CronosVectorEnv, filament
+from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.config import CronosEnvConfig
+from lerobot_env_cronos.simulation import filament
 
 needs_vulkan = pytest.mark.skipif(
     sys.platform == "linux" and not filament.count_vulkan_devices(),
@@ -69,7 +70,7 @@ def test_without_vulkan_the_error_names_the_package(monkeypatch):
 
 def test_without_a_driver_there_are_no_devices():
     nothing = {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json"}
-    code = "from lerobot_env_cronos.filament import count_vulkan_devices; print(count_vulkan_devices())"
+    code = "from lerobot_env_cronos.simulation.filament import count_vulkan_devices; print(count_vulkan_devices())"
     assert run(code, **nothing).stdout == "0\n"
 
 

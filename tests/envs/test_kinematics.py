@@ -4,15 +4,15 @@ import mujoco
 import numpy as np
 import pytest
 from lerobot_env_cronos import get_scene
-from lerobot_env_cronos.kinematics import (
+from lerobot_env_cronos.scene.model import build_model
+from lerobot_env_cronos.scene.robot import EE_SITE, HOME_QPOS
+from lerobot_env_cronos.simulation.kinematics import (
     forward_kinematics,
     inverse_kinematics,
     matrix_to_rotation_vector,
     quaternion_to_matrix,
     rotation_vector_to_matrix,
 )
-from lerobot_env_cronos.model import build_model
-from lerobot_env_cronos.robot import EE_SITE, HOME_QPOS
 
 
 @pytest.fixture(scope="module")

@@ -6,16 +6,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from lerobot_env_cronos import SCENES, Body, CronosEnvConfig, CronosVectorEnv, Scene, gymnasium_id, register_scene
-from lerobot_env_cronos.configurations import (
+from lerobot_env_cronos.benchmark.configurations import (
     _files,
     _load_splits,
     footprint_corners,
     footprint_gap,
     load_configurations,
 )
-from lerobot_env_cronos.expert import ScriptedExpert
-from lerobot_env_cronos.expert_ceiling import run_segment
-from lerobot_env_cronos.scenes import BODIES
+from lerobot_env_cronos.expert.ceiling import run_segment
+from lerobot_env_cronos.expert.expert import ScriptedExpert
+from lerobot_env_cronos.scene.scenes import BODIES
 
 BLOCK = Body("red block", (0.03, 0.03, 0.03), 600, "box", (0.8, 0.1, 0.1))
 COASTER = Body("blue coaster", (0.09, 0.09, 0.005), 900, "disc", (0.1, 0.3, 0.8))
@@ -130,7 +130,7 @@ def test_a_file_of_something_else_is_refused(tmp_path, bodies, n, message):
 
 
 def test_bodies_that_do_not_fit_are_an_error(monkeypatch):
-    monkeypatch.setattr("lerobot_env_cronos.configurations.MAX_ATTEMPTS", 20)
+    monkeypatch.setattr("lerobot_env_cronos.benchmark.configurations.MAX_ATTEMPTS", 20)
     crowded = Scene(
         "crowded", ("ketchup bottle",), ("yellow plate", "cloth"), spawn_low=(0.3, 0.0), spawn_high=(0.32, 0.02)
     )

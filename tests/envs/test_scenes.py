@@ -3,13 +3,18 @@
 import numpy as np
 import pytest
 from lerobot_env_cronos import SCENES, CronosVectorEnv, Task
-from lerobot_env_cronos.configurations import NUM_CONFIGURATIONS, SPLITS, footprint_corners, load_configurations
-from lerobot_env_cronos.expert import ScriptedExpert
-from lerobot_env_cronos.expert_ceiling import has_lost_body, measure_reset_free, run_segment
-from lerobot_env_cronos.kinematics import forward_kinematics, inverse_kinematics
-from lerobot_env_cronos.robot import HOME_QPOS
-from lerobot_env_cronos.scenes import BODIES
-from lerobot_env_cronos.workspace import is_in_view
+from lerobot_env_cronos.benchmark.configurations import (
+    NUM_CONFIGURATIONS,
+    SPLITS,
+    footprint_corners,
+    load_configurations,
+)
+from lerobot_env_cronos.expert.ceiling import has_lost_body, measure_reset_free, run_segment
+from lerobot_env_cronos.expert.expert import ScriptedExpert
+from lerobot_env_cronos.scene.robot import HOME_QPOS
+from lerobot_env_cronos.scene.scenes import BODIES
+from lerobot_env_cronos.simulation.kinematics import forward_kinematics, inverse_kinematics
+from lerobot_env_cronos.simulation.workspace import is_in_view
 
 # kitchen_2x2 has tests of its own, on all configurations: test_expert.py.
 NEW_SCENES = ("kitchen_3x3", "playroom_2x2")

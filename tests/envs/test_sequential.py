@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from lerobot.envs.factory import make_env, make_env_config
 from lerobot_env_cronos import SCENES, CronosEnvConfig, SequentialVectorEnv, get_scene, load_orderings
-from lerobot_env_cronos.configurations import load_configurations
-from lerobot_env_cronos.expert import ScriptedExpert
-from lerobot_env_cronos.orderings import draw_orderings
+from lerobot_env_cronos.benchmark.configurations import load_configurations
+from lerobot_env_cronos.benchmark.orderings import draw_orderings
+from lerobot_env_cronos.expert.expert import ScriptedExpert
 from scripted_env import ScriptedEnv
 
 STATE = "environment_state_agent_pos"

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from lerobot_env_cronos import CronosVectorEnv, Task, get_scene
-from lerobot_env_cronos.robot import HOME_QPOS
-from lerobot_env_cronos.simulation import ACTION_HIGH, ACTION_LOW
+from lerobot_env_cronos.scene.robot import HOME_QPOS
+from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW
 
 STATE = "environment_state_agent_pos"
 BOTTLE, PLATE = "ketchup bottle", "yellow plate"

@@ -3,12 +3,12 @@
 import mujoco
 import numpy as np
 import pytest
-from lerobot_env_cronos import model as model_module
-from lerobot_env_cronos.model import CAMERAS, build_model
-from lerobot_env_cronos.robot import HOME_QPOS, PAD_HALF_SIZE, PAD_POS
-from lerobot_env_cronos.scenes import BODIES, SCENES
-from lerobot_env_cronos.visuals.meshes import VISUAL_GROUP, loft, prism, rectangle
-from lerobot_env_cronos.visuals.objects import LOOKS
+from lerobot_env_cronos.scene import model as model_module
+from lerobot_env_cronos.scene.model import CAMERAS, build_model
+from lerobot_env_cronos.scene.robot import HOME_QPOS, PAD_HALF_SIZE, PAD_POS
+from lerobot_env_cronos.scene.scenes import BODIES, SCENES
+from lerobot_env_cronos.scene.visuals.meshes import VISUAL_GROUP, loft, prism, rectangle
+from lerobot_env_cronos.scene.visuals.objects import LOOKS
 
 SCENE = SCENES["kitchen_2x2"]
 BODIES_OF_SCENES = [(scene, body) for scene in SCENES for body in SCENES[scene].bodies]

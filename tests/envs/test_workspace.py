@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from lerobot_env_cronos import CronosVectorEnv
-from lerobot_env_cronos.workspace import Unsuitable, find_unsuitable, is_in_view
+from lerobot_env_cronos.simulation.workspace import Unsuitable, find_unsuitable, is_in_view
 
 UPRIGHT = [1.0, 0.0, 0.0, 0.0]
 ON_EDGE = [np.cos(np.pi / 4), np.sin(np.pi / 4), 0.0, 0.0]

@@ -11,8 +11,8 @@ from cronos_lerobot.experiments.plan import make_jobs, train_flags
 from cronos_lerobot.experiments.results import paper_results
 from cronos_lerobot.experiments.scales import PIXELS, SCALES, STATE, base_recipe
 from cronos_lerobot.experiments.specs import Options, run_specs
-from cronos_lerobot.protocol import ProtocolConfig
-from cronos_lerobot.task_orders import TASK_ORDERS
+from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.protocol.task_orders import TASK_ORDERS
 
 TABLE1 = [
     # T, EER, CL, LSR, HSR: the ticks of Table 1.

@@ -3,8 +3,8 @@
 import json
 
 import pytest
-from lerobot_env_cronos.benchmark import draw_benchmark
-from lerobot_env_cronos.scenes import Task
+from lerobot_env_cronos.benchmark.benchmark import draw_benchmark
+from lerobot_env_cronos.scene.scenes import Task
 
 from cronos_lerobot.evaluation.results import independent_results, sequential_results
 from cronos_lerobot.hub.benchmark import choose_benchmark

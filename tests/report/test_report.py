@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from lerobot_env_cronos.scenes import SCENES
+from lerobot_env_cronos.scene.scenes import SCENES
 from synthetic_runs import INSTRUCTIONS, read_csv, write_evaluation, write_training_run
 
 from cronos_lerobot.report.page import write_report

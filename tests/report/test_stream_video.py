@@ -6,14 +6,15 @@ import pytest
 from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
-from lerobot_env_cronos.scenes import SCENES
+from lerobot_env_cronos.scene.scenes import SCENES
 from PIL import Image
 
-from cronos_lerobot.data.schema import Intervention
-from cronos_lerobot.protocol import ProtocolConfig
+from cronos_lerobot.film.encode import write_gif, write_mp4
+from cronos_lerobot.film.overlay import FAILURE, SUCCESS, Status, draw_status
+from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.report import stream_video
-from cronos_lerobot.report.overlay import FAILURE, SUCCESS, Status, draw_status
-from cronos_lerobot.report.stream_video import ExpertSpectator, film_stream, make_spectator, write_gif, write_mp4
+from cronos_lerobot.report.stream_video import ExpertSpectator, film_stream, make_spectator
 from cronos_lerobot.report.task_pictures import draw_sheet, render_tasks
 
 

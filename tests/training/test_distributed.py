@@ -19,16 +19,16 @@ from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
 from test_trainer import STEPS_PER_UPDATE, STREAMS, KilledError, assert_same_run, config, metrics, weights
 
 from cronos_lerobot import processes as processes_module
-from cronos_lerobot.data.schema import Intervention
+from cronos_lerobot.agents.base import ActionSample
+from cronos_lerobot.agents.ppo.config import PPOConfig
+from cronos_lerobot.agents.ppo.ppo import PPO
+from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
+from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.processes import Processes, bit_sum
-from cronos_lerobot.protocol import ProtocolConfig
-from cronos_lerobot.rl.policy import ActionSample
-from cronos_lerobot.rl.ppo import PPO
-from cronos_lerobot.rl.ppo_config import PPOConfig
-from cronos_lerobot.rl.processing import PolicyProcessors
-from cronos_lerobot.rl.rollout_buffer import RolloutBuffer
+from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.protocol.interventions import Intervention
+from cronos_lerobot.protocol.task_orders import TASK_ORDERS
 from cronos_lerobot.stopwatch import Stopwatch
-from cronos_lerobot.task_orders import TASK_ORDERS
 from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
 from cronos_lerobot.training.factory import make_env
 from cronos_lerobot.training.sharding import ShardedEnv

@@ -3,8 +3,8 @@ import pytest
 import torch
 from dummies import TASKS, DummyEnv, DummyPolicy, identity_processors
 
+from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.evaluation.rates import SuccessRate
-from cronos_lerobot.rl.processing import PolicyProcessors
 from cronos_lerobot.training.evaluation import evaluate_independent
 
 PROCESSORS = PolicyProcessors(*identity_processors())

@@ -13,14 +13,14 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from safetensors.torch import load_file
 
+from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.data.drawing import LateCamera
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.data.video import read_frames
-from cronos_lerobot.kill_test import KillTest
-from cronos_lerobot.protocol import ProtocolConfig
-from cronos_lerobot.rl.ppo_config import PPOConfig
+from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.scripts import train as script
+from cronos_lerobot.studies.kill_test import KillTest
 from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
 from cronos_lerobot.training.recording import FILM, FilmedEnv
 from cronos_lerobot.training.trainer import Trainer
@@ -193,7 +193,7 @@ def test_filmed_streams_are_a_dataset_of_their_own(tmp_path):
 
 
 def test_killed_runs_lose_nothing_that_was_flushed(tmp_path):
-    """A real run from pixels, killed at random moments; `cronos_lerobot.kill_test` does it twenty times."""
+    """A real run from pixels, killed at random moments; `studies.kill_test` does it twenty times."""
     tally = KillTest(tmp_path / "killed", seed=1, report=lambda line: None).run(4)
     assert tally.kills == 4
     assert tally.segments_checked > 0

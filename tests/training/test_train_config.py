@@ -5,7 +5,7 @@ import pytest
 from dummies import DummyPolicyConfig
 from lerobot_env_cronos import CronosEnvConfig
 
-from cronos_lerobot.rl.ppo_config import PaperPPOConfig, PPOConfig
+from cronos_lerobot.agents.ppo.config import PaperPPOConfig, PPOConfig
 from cronos_lerobot.scripts import train as script
 from cronos_lerobot.training.config import CronosTrainConfig
 

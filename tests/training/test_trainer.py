@@ -10,8 +10,8 @@ from dummies import DummyEnv, DummyPolicy, DummyPolicyConfig, identity_processor
 from lerobot.utils.random_utils import set_seed
 from safetensors.torch import load_file
 
-from cronos_lerobot.protocol import ProtocolConfig
-from cronos_lerobot.rl.ppo_config import PPOConfig
+from cronos_lerobot.agents.ppo.config import PPOConfig
+from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.training.config import CronosTrainConfig, PeriodicEvaluationConfig, RecordConfig
 from cronos_lerobot.training.trainer import Trainer
 

@@ -5,7 +5,7 @@ import re
 from dataclasses import fields
 from pathlib import Path
 
-from cronos_lerobot.protocol import ProtocolConfig
+from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.training.config import CronosTrainConfig, PeriodicEvaluationConfig
 
 DOCS = (Path(__file__).parents[2] / "docs/training.md").read_text()

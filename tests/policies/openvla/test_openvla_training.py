@@ -17,11 +17,11 @@ from openvla_samples import CAMERA, TASKS, make_batch, make_config
 from peft import PeftModel
 from safetensors.torch import load_file
 
-from cronos_lerobot.rl.agent import PPOAgent
-from cronos_lerobot.rl.ppo import PPO
-from cronos_lerobot.rl.ppo_config import PaperPPOConfig
-from cronos_lerobot.rl.processing import make_processors
-from cronos_lerobot.rl.rollout_buffer import RolloutBuffer
+from cronos_lerobot.agents.ppo.agent import PPOAgent
+from cronos_lerobot.agents.ppo.config import PaperPPOConfig
+from cronos_lerobot.agents.ppo.ppo import PPO
+from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
+from cronos_lerobot.agents.processing import make_processors
 from cronos_lerobot.scripts import train as cronos_script
 
 SMALL_LOOP = (

@@ -1,13 +1,14 @@
 """CRONOS scenes as a LeRobot environment plugin."""
 
-from lerobot_env_cronos import gl as gl  # isort: skip  # chooses the OpenGL platform before mujoco is imported
+from lerobot_env_cronos.simulation import gl as gl  # isort: skip  # chooses OpenGL's platform before mujoco
 
-from lerobot_env_cronos.benchmark import Benchmark, EpisodeGroup, load_benchmark
+from lerobot_env_cronos.benchmark.benchmark import Benchmark, EpisodeGroup
+from lerobot_env_cronos.benchmark.load import load_benchmark
+from lerobot_env_cronos.benchmark.orderings import load_orderings
+from lerobot_env_cronos.benchmark.registry import gymnasium_id, register_gymnasium, register_scene
 from lerobot_env_cronos.config import CronosEnvConfig
 from lerobot_env_cronos.episodic import CronosEnv, IndependentVectorEnv
-from lerobot_env_cronos.orderings import load_orderings
-from lerobot_env_cronos.registry import gymnasium_id, register_gymnasium, register_scene
-from lerobot_env_cronos.scenes import CONTROL_HZ, SCENES, STEPS_PER_TASK, Body, Scene, Task, get_scene
+from lerobot_env_cronos.scene.scenes import CONTROL_HZ, SCENES, STEPS_PER_TASK, Body, Scene, Task, get_scene
 from lerobot_env_cronos.sequential import SequentialVectorEnv
 from lerobot_env_cronos.vector_env import CronosVectorEnv
 

@@ -12,15 +12,16 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import parse_camera_names
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from lerobot_env_cronos.benchmark import SUITES, EpisodeGroup, benchmark_scene, load_benchmark
-from lerobot_env_cronos.configurations import SPLITS
+from lerobot_env_cronos.benchmark.benchmark import SUITES, EpisodeGroup
+from lerobot_env_cronos.benchmark.configurations import SPLITS
+from lerobot_env_cronos.benchmark.load import benchmark_scene, load_benchmark
+from lerobot_env_cronos.benchmark.registry import gymnasium_id
 from lerobot_env_cronos.episodic import EpisodicVectorEnv, IndependentVectorEnv, LazyVectorEnv
-from lerobot_env_cronos.observations import AGENT_POS_NAMES, OBS_TYPES, environment_state_names
-from lerobot_env_cronos.registry import gymnasium_id
-from lerobot_env_cronos.rendering import RENDERERS
-from lerobot_env_cronos.scenes import CONTROL_HZ, get_scene
+from lerobot_env_cronos.scene.scenes import CONTROL_HZ, get_scene
 from lerobot_env_cronos.sequential import ADVANCES, SequentialVectorEnv
-from lerobot_env_cronos.simulation import ACTION_NAMES
+from lerobot_env_cronos.simulation.observations import AGENT_POS_NAMES, OBS_TYPES, environment_state_names
+from lerobot_env_cronos.simulation.rendering import RENDERERS
+from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 
 DEFAULT_SCENE = "kitchen_2x2"
 

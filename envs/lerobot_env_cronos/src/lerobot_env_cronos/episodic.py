@@ -9,8 +9,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from lerobot_env_cronos.configurations import check_split
-from lerobot_env_cronos.scenes import STEPS_PER_TASK, Task, get_scene
+from lerobot_env_cronos.benchmark.configurations import check_split
+from lerobot_env_cronos.scene.scenes import STEPS_PER_TASK, Task, get_scene
 from lerobot_env_cronos.vector_env import CronosVectorEnv
 
 

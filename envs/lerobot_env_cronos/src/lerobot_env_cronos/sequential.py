@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from lerobot_env_cronos.episodic import EpisodicVectorEnv
-from lerobot_env_cronos.scenes import STEPS_PER_TASK, Task
+from lerobot_env_cronos.scene.scenes import STEPS_PER_TASK, Task
 
 ADVANCES = ("window", "on_success")
 

@@ -11,12 +11,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from lerobot_env_cronos.benchmark import load_benchmark
-from lerobot_env_cronos.configurations import check_split
-from lerobot_env_cronos.observations import ObservationBuilder
-from lerobot_env_cronos.scenes import CONTROL_HZ, Task, get_scene
-from lerobot_env_cronos.simulation import ACTION_HIGH, ACTION_LOW, Simulation
-from lerobot_env_cronos.workspace import find_free_pose, find_unsuitable
+from lerobot_env_cronos.benchmark.configurations import check_split
+from lerobot_env_cronos.benchmark.load import load_benchmark
+from lerobot_env_cronos.scene.scenes import CONTROL_HZ, Task, get_scene
+from lerobot_env_cronos.simulation.observations import ObservationBuilder
+from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW, Simulation
+from lerobot_env_cronos.simulation.workspace import find_free_pose, find_unsuitable
 
 GRASP_REWARD, SUCCESS_REWARD = 0.1, 1.0
 REWARDS = ("difference", "level")

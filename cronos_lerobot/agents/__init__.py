@@ -1,0 +1,1 @@
+"""Who learns: the interface that every agent and policy has, and PPO."""

@@ -1,0 +1,103 @@
+"""What the reset-free loop asks of a policy and of an agent. A policy plugin never imports this module."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Columns = dict[str, np.ndarray]
+"""Observations by LeRobot's names, as the environment made them: images uint8 (B, H, W, 3), vectors float32."""
+Batch = dict[str, Any]
+"""A batch by LeRobot's names, after the policy's preprocessor: `observation.*` (B, ...), `task`: B strings.
+Images are (B, 3, H, W), floats in [0, 1] or, if the policy does not normalise images, uint8 in 0..255."""
+
+POLICY_METHODS = ("sample_actions", "evaluate_actions", "predict_values", "rl_parameter_groups")
+
+
+@runtime_checkable
+class TrainablePolicy(Protocol):
+    """A LeRobot policy that PPO can train: it says how likely its own actions were.
+
+    A policy whose first layers are frozen may also have `encode_observation(batch) -> Batch` (or None there),
+    which replaces inputs by what those layers make of them. It is called once for each observation; what it
+    returns is kept until the update and handed to the other methods in place of the batch.
+
+    `sample_actions` may also take `uniform`, numbers (B, A) in [0, 1) that are its randomness in place of a
+    generator. An evaluation then draws them for each episode and step, and an episode's actions do not depend on
+    which others share its batch.
+    """
+
+    def sample_actions(
+        self, batch: Batch, *, temperature: float = 1.0, generator: torch.Generator | None = None
+    ) -> dict[str, Tensor]:
+        """Return `action` (B, A) normalised, `tokens` (B, A) int64, `log_prob` (B,) [nats], `value` (B,)."""
+        ...
+
+    def evaluate_actions(self, batch: Batch, tokens: Tensor, *, temperature: float = 1.0) -> dict[str, Tensor]:
+        """Return, differentiably, `log_prob` (B,), `entropy` (B,) (mean over dimensions), `value` (B,)."""
+        ...
+
+    def predict_values(self, batch: Batch) -> Tensor:
+        """Return, differentiably, the values (B,) of observations."""
+        ...
+
+    def rl_parameter_groups(self) -> list[dict[str, Any]]:
+        """Return two groups, {"name": "policy" or "value", "params": [...]}, without a parameter in common."""
+        ...
+
+
+def check_trainable(policy: Any) -> None:
+    """Check that `policy` has what TrainablePolicy names.
+
+    Raises:
+        TypeError: a method is missing.
+    """
+    missing = [name for name in POLICY_METHODS if not callable(getattr(policy, name, None))]
+    if missing:
+        raise TypeError(
+            f"{type(policy).__name__} cannot be trained by reinforcement: it has no {', '.join(missing)}. "
+            f"A trainable policy has {', '.join(POLICY_METHODS)}; see cronos_lerobot.agents.base.TrainablePolicy."
+        )
+
+
+@dataclass(frozen=True)
+class ActionSample:
+    """Actions of N streams and what is needed to learn from them."""
+
+    action: np.ndarray
+    """(N, A) float32 in physical units, as the environment takes them."""
+    tokens: np.ndarray
+    """(N, A) int64, the action as the policy drew it."""
+    log_prob: np.ndarray
+    """(N,) float32 [nats], under the policy that drew it."""
+    value: np.ndarray
+    """(N,) float32, that policy's value of the observation."""
+
+
+class Agent(Protocol):
+    """Lines 11, 13 and 16 to 18 of Algorithm 1."""
+
+    def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
+        """Sample actions for the raw observation `o_t` under the instructions `tau`."""
+        ...
+
+    def store(
+        self,
+        o_t: dict[str, Any],
+        tau: list[str],
+        a_t: ActionSample,
+        r_t: np.ndarray,
+        o_tp1: dict[str, Any],
+        cut_t: np.ndarray,
+        diverged_t: np.ndarray,
+    ) -> None:
+        """Keep one transition of every stream; `cut_t` is (N,) bool, where the trace ends with it."""
+        ...
+
+    def update(self) -> dict[str, float]:
+        """Learn from what was stored, forget it, and return metrics."""
+        ...

@@ -1,0 +1,84 @@
+"""The agent of Algorithm 1: a policy that acts, remembers and learns with PPO."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from cronos_lerobot.agents.base import ActionSample, Columns
+from cronos_lerobot.agents.ppo.ppo import PPO
+from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
+from cronos_lerobot.agents.processing import observation_columns
+from cronos_lerobot.stopwatch import Stopwatch
+
+
+class PPOAgent:
+    """Acts, stores and updates.
+
+    Args:
+        ppo: holds the policy, its processors and the optimizer.
+        buffer: holds the transitions since the last update.
+        generator: draws the actions.
+        stopwatch: told the time spent in `act` ("infer") and `update` ("update").
+    """
+
+    def __init__(
+        self, ppo: PPO, buffer: RolloutBuffer, generator: torch.Generator, stopwatch: Stopwatch | None = None
+    ) -> None:
+        self.ppo = ppo
+        self.buffer = buffer
+        self.generator = generator
+        self.stopwatch = stopwatch or Stopwatch()
+        self._encoded: Columns = {}
+        # Dropout and the like stay off in the update too, or the ratio would not be 1 before its first step.
+        ppo.policy.eval()
+
+    @torch.inference_mode()
+    def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
+        """Sample an action for each of the N streams."""
+        with self.stopwatch("infer"):
+            self._encoded = self.ppo.processors.encode(observation_columns(o_t), tau)
+            batch = self.ppo.processors.encoded_batch(self._encoded, tau)
+            sample = self.ppo.policy.sample_actions(
+                batch, temperature=self.ppo.config.temperature, generator=self.generator
+            )
+            return ActionSample(
+                action=self.ppo.processors.physical_actions(sample["action"]),
+                tokens=sample["tokens"].cpu().numpy(),
+                log_prob=sample["log_prob"].float().cpu().numpy(),
+                value=sample["value"].float().cpu().numpy(),
+            )
+
+    def store(
+        self,
+        o_t: dict[str, Any],
+        tau: list[str],
+        a_t: ActionSample,
+        r_t: np.ndarray,
+        o_tp1: dict[str, Any],
+        cut_t: np.ndarray,
+        diverged_t: np.ndarray,
+    ) -> None:
+        """Keep one transition of every stream, with the value to bootstrap from where the trace is cut.
+
+        `o_t` is kept as `act` encoded it.
+        """
+        bootstrap = a_t.value
+        if (cut_t & ~diverged_t).any():
+            bootstrap = np.where(diverged_t, a_t.value, self._values(o_tp1, tau))
+        self.buffer.add(self._encoded, tau, a_t, r_t, cut_t, bootstrap)
+
+    def update(self) -> dict[str, float]:
+        """Learn from the buffer and clear it."""
+        with self.stopwatch("update"):
+            metrics = self.ppo.update(self.buffer)
+            self.buffer.clear()
+            return metrics
+
+    @torch.inference_mode()
+    def _values(self, observation: dict[str, Any], tau: list[str]) -> np.ndarray:
+        encoded = self.ppo.processors.encode(observation_columns(observation), tau)
+        batch = self.ppo.processors.encoded_batch(encoded, tau)
+        return self.ppo.policy.predict_values(batch).float().cpu().numpy()

@@ -1,0 +1,154 @@
+"""Storage for the U x N transitions between two policy updates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from cronos_lerobot.agents.base import ActionSample, Columns
+from cronos_lerobot.agents.ppo.gae import compute_gae
+
+
+@dataclass(frozen=True)
+class Minibatch:
+    """B transitions in random order."""
+
+    indices: np.ndarray
+    """(B,) row * num_streams + stream."""
+    observation: Columns
+    instructions: list[str]
+    tokens: np.ndarray
+    log_prob: np.ndarray
+    value: np.ndarray
+    advantage: np.ndarray
+    return_: np.ndarray
+
+
+class RolloutBuffer:
+    """Preallocated at the first `add`; images stay uint8, instructions are kept as indices.
+
+    Args:
+        num_rows: U, transitions of each stream.
+        num_streams: N.
+    """
+
+    def __init__(self, num_rows: int, num_streams: int) -> None:
+        shape = (num_rows, num_streams)
+        self.num_rows = num_rows
+        self.num_streams = num_streams
+        self.rows = 0
+        """Rows in use."""
+        self.rewards = np.zeros(shape, np.float32)
+        self.values = np.zeros(shape, np.float32)
+        self.log_probs = np.zeros(shape, np.float32)
+        self.boundaries = np.zeros(shape, np.bool_)
+        self.bootstrap_values = np.zeros(shape, np.float32)
+        self.advantages = np.zeros(shape, np.float32)
+        self.returns = np.zeros(shape, np.float32)
+        self.instruction_ids = np.zeros(shape, np.int64)
+        self.tokens: np.ndarray | None = None
+        self.observations: Columns = {}
+        self._instructions: list[str] = []
+
+    def __len__(self) -> int:
+        """Transitions in the buffer, over all streams."""
+        return self.rows * self.num_streams
+
+    def add(
+        self,
+        observation: Columns,
+        instructions: list[str],
+        sample: ActionSample,
+        reward: np.ndarray,
+        boundary: np.ndarray,
+        bootstrap_value: np.ndarray,
+    ) -> None:
+        """Copy one transition of every stream.
+
+        Args:
+            observation: what was acted on, columns (N, ...).
+            instructions: N instructions acted under.
+            sample: the action, its log-probability, and the value of the observation.
+            reward: (N,).
+            boundary: (N,) bool, the trace is cut after this transition.
+            bootstrap_value: (N,), read where `boundary` is set.
+
+        Raises:
+            RuntimeError: the buffer is full.
+        """
+        if self.rows == self.num_rows:
+            raise RuntimeError(f"The rollout buffer is full: it holds {self.num_rows} rows; update and clear it.")
+        if self.tokens is None:
+            self._allocate(observation, sample)
+        assert self.tokens is not None
+        row = self.rows
+        for name, column in observation.items():
+            self.observations[name][row] = column
+        self.instruction_ids[row] = [self._instruction_id(text) for text in instructions]
+        self.tokens[row] = sample.tokens
+        self.log_probs[row] = sample.log_prob
+        self.values[row] = sample.value
+        self.rewards[row] = reward
+        self.boundaries[row] = boundary
+        self.bootstrap_values[row] = bootstrap_value
+        self.rows += 1
+
+    def compute_advantages(self, gamma: float, gae_lambda: float) -> None:
+        """Fill `advantages` and `returns` of the rows in use."""
+        used = slice(0, self.rows)
+        self.advantages[used], self.returns[used] = compute_gae(
+            self.rewards[used],
+            self.values[used],
+            self.boundaries[used],
+            self.bootstrap_values[used],
+            gamma,
+            gae_lambda,
+        )
+
+    def results(self) -> Columns:
+        """Return `rewards`, `values`, `advantages` and `returns` of the rows in use, (rows, num_streams) each."""
+        names = ("rewards", "values", "advantages", "returns")
+        return {name: getattr(self, name)[: self.rows] for name in names}
+
+    def normalize_advantages(self, mean: float, std: float) -> None:
+        """Shift and scale the advantages so that `mean` becomes 0 and `std` 1."""
+        advantages = self.advantages[: self.rows]
+        advantages[:] = (advantages - mean) / (std + 1e-8)
+
+    def minibatches(self, batch_size: int, rng: np.random.Generator) -> Iterator[Minibatch]:
+        """Yield every transition exactly once, in an order drawn from `rng`; the last batch may be smaller."""
+        order = rng.permutation(len(self))
+        for start in range(0, len(order), batch_size):
+            yield self._gather(order[start : start + batch_size])
+
+    def clear(self) -> None:
+        """Forget the transitions; the memory is kept."""
+        self.rows = 0
+
+    def _gather(self, indices: np.ndarray) -> Minibatch:
+        assert self.tokens is not None
+        row, stream = np.divmod(indices, self.num_streams)
+        return Minibatch(
+            indices=indices,
+            observation={name: column[row, stream] for name, column in self.observations.items()},
+            instructions=[self._instructions[i] for i in self.instruction_ids[row, stream]],
+            tokens=self.tokens[row, stream],
+            log_prob=self.log_probs[row, stream],
+            value=self.values[row, stream],
+            advantage=self.advantages[row, stream],
+            return_=self.returns[row, stream],
+        )
+
+    def _allocate(self, observation: Columns, sample: ActionSample) -> None:
+        shape = (self.num_rows, self.num_streams)
+        self.tokens = np.zeros((*shape, sample.tokens.shape[1]), np.int64)
+        self.observations = {
+            name: np.zeros((*shape, *column.shape[1:]), column.dtype) for name, column in observation.items()
+        }
+
+    def _instruction_id(self, text: str) -> int:
+        if text not in self._instructions:
+            self._instructions.append(text)
+        return self._instructions.index(text)

@@ -1,0 +1,223 @@
+"""Reset strategies: who is helped at a task switch, how, and what it counts as."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cronos_lerobot.protocol.config import NUM_TRAIN_CONFIGURATIONS, ProtocolConfig
+from cronos_lerobot.protocol.interventions import Intervention
+from cronos_lerobot.protocol.loop_state import LoopState
+
+
+class ResetStrategy(ABC):
+    """One kind of intervention: which streams need it now, and how it is applied to them.
+
+    It keeps nothing of its own besides its generator; what it has to remember of a stream is in `LoopState`, so
+    that a run can be resumed.
+    """
+
+    kind: Intervention
+    """What it is counted and recorded as; `protocol.COUNTED_INTERVENTIONS` are those that spend the budget."""
+
+    @abstractmethod
+    def due(self, env: Any, loop: LoopState) -> np.ndarray:
+        """Return the ids, a (k,) int array, of the streams to intervene on now."""
+
+    @abstractmethod
+    def apply(self, env: Any, ids: np.ndarray) -> None:
+        """Intervene on the streams `ids`."""
+
+    def apply_if_due(self, env: Any, loop: LoopState) -> bool:
+        """Intervene where it is due and count it; returns whether any stream was touched."""
+        ids = self.due(env, loop)
+        if len(ids) == 0:
+            return False
+        self.apply(env, ids)
+        loop.count_intervention(ids, self.kind)
+        return True
+
+
+class NoReset(ResetStrategy):
+    """A strategy that is switched off."""
+
+    kind = Intervention.NONE
+
+    def due(self, env: Any, loop: LoopState) -> np.ndarray:
+        """No stream, ever."""
+        return np.empty(0, np.int64)
+
+    def apply(self, env: Any, ids: np.ndarray) -> None:
+        """Nothing to do: `due` names no stream."""
+
+
+class EndEffectorReset(ResetStrategy):
+    """The arm of every stream goes home, the objects stay (EER). Free."""
+
+    kind = Intervention.END_EFFECTOR_RESET
+
+    def due(self, env: Any, loop: LoopState) -> np.ndarray:
+        """Every stream, at every task switch."""
+        return np.arange(loop.num_streams)
+
+    def apply(self, env: Any, ids: np.ndarray) -> None:
+        """Send the arms home."""
+        env.end_effector_reset(ids)
+
+
+class HeuristicReset(ResetStrategy):
+    """Bodies that no task can reach any more are put back on the table, the others stay (HSR).
+
+    A body is, if its centre is outside the end effector's workspace or the camera's picture, or if it fell; see
+    `lerobot_env_cronos.simulation.workspace`. One event for each stream, however many bodies it had to put back.
+
+    Args:
+        rng: draws the free places.
+    """
+
+    kind = Intervention.HEURISTIC_RESET
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+
+    def due(self, env: Any, loop: LoopState) -> np.ndarray:
+        """Streams with an unsuitable body."""
+        return np.flatnonzero(env.unsuitable_bodies().any(axis=1))
+
+    def apply(self, env: Any, ids: np.ndarray) -> None:
+        """Put every unsuitable body of the streams `ids` at a free place."""
+        unsuitable = env.unsuitable_bodies()
+        for stream in ids:
+            for body in np.flatnonzero(unsuitable[stream]):
+                env.put_back(int(stream), env.scene.bodies[body], self.rng)
+
+
+class SceneReset(ResetStrategy):
+    """Bodies go back to a random training configuration and the arm goes home. The base of three strategies.
+
+    Args:
+        rng: draws the configuration of the train split, one for each stream.
+        num_configurations: draws only from the first so many of the split's 64.
+    """
+
+    def __init__(self, rng: np.random.Generator, num_configurations: int = NUM_TRAIN_CONFIGURATIONS) -> None:
+        self.rng = rng
+        self.num_configurations = num_configurations
+
+    def apply(self, env: Any, ids: np.ndarray) -> None:
+        """Place the streams `ids` in configurations of the training split."""
+        env.scene_reset(ids, self.rng.integers(self.num_configurations, size=len(ids)))
+
+
+class PeriodicSceneReset(SceneReset):
+    """Every stream is reset every T steps (paper, Section 5), where T may follow a curriculum."""
+
+    kind = Intervention.SCENE_RESET
+
+    def __init__(self, rng: np.random.Generator, protocol: ProtocolConfig) -> None:
+        super().__init__(rng, protocol.num_configurations)
+        self.interval_at = protocol.scene_reset_interval_at
+
+    def due(self, env: Any, loop: LoopState) -> np.ndarray:
+        """Every stream when its step count is a multiple of the T in force."""
+        interval = self.interval_at(loop.n)
+        due_now = interval is not None and loop.t % interval == 0
+        return np.arange(loop.num_streams if due_now else 0)
+
+
+class InitialPlacement(SceneReset):
+    """The very first placement of every stream. Free."""
+
+    kind = Intervention.INITIAL
+
+    def due(self, env: Any, loop: LoopState) -> np.ndarray:
+        """Every stream of a run that has not begun; none of a resumed one."""
+        return np.arange(loop.num_streams if loop.t == 0 else 0)
+
+
+class DivergenceReset(SceneReset):
+    """A simulation that broke down is put back at once, wherever it is in its segment (not in the paper)."""
+
+    kind = Intervention.DIVERGENCE
+
+    def __init__(self, rng: np.random.Generator, num_configurations: int = NUM_TRAIN_CONFIGURATIONS) -> None:
+        super().__init__(rng, num_configurations)
+        self.diverged: np.ndarray = np.empty(0, np.bool_)
+
+    def due(self, env: Any, loop: LoopState) -> np.ndarray:
+        """Streams marked in the last step's info["diverged"]."""
+        return np.flatnonzero(self.diverged)
+
+    def put_back(self, env: Any, loop: LoopState, diverged: np.ndarray) -> bool:
+        """Reset the streams where `diverged`, (N,) bool; returns whether there was any."""
+        self.diverged = diverged
+        return self.apply_if_due(env, loop)
+
+
+@dataclass(frozen=True)
+class Resets:
+    """The strategies of one run, in the order of Algorithm 1."""
+
+    initial: ResetStrategy
+    divergence: DivergenceReset
+    end_effector: ResetStrategy
+    heuristic: ResetStrategy
+    extra: tuple[ResetStrategy, ...]
+    scene: ResetStrategy
+
+
+ResetFactory = Callable[[np.random.Generator, ProtocolConfig], ResetStrategy]
+
+EXTRA_RESETS: dict[str, ResetFactory] = {}
+"""Strategies of users by name."""
+
+
+def register_reset(name: str) -> Callable[[ResetFactory], ResetFactory]:
+    """Make a strategy selectable as `--protocol.extra_resets='[name]'`.
+
+    It decorates a class whose constructor, or a function that, takes the generator of the run's resets and the
+    protocol.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+
+    def register(factory: ResetFactory) -> ResetFactory:
+        if name in EXTRA_RESETS:
+            raise ValueError(f"there is a reset {name!r} already; taken names: {sorted(EXTRA_RESETS)}.")
+        EXTRA_RESETS[name] = factory
+        return factory
+
+    return register
+
+
+def check_extra_resets(names: Sequence[str]) -> None:
+    """Raise a ValueError that lists the valid names, unless all of `names` are registered."""
+    unknown = [name for name in names if name not in EXTRA_RESETS]
+    if unknown:
+        raise ValueError(
+            f"protocol.extra_resets has {unknown}; registered: {sorted(EXTRA_RESETS)}. Register your own "
+            "with cronos_lerobot.protocol.resets.register_reset, in a module named by "
+            "--protocol.discover_packages_path."
+        )
+
+
+def make_resets(protocol: ProtocolConfig, rng: np.random.Generator) -> Resets:
+    """Return the strategies that `protocol` enables; `rng` draws every configuration and place of the run.
+
+    Raises:
+        ValueError: an extra reset is not registered.
+    """
+    check_extra_resets(protocol.extra_resets)
+    return Resets(
+        initial=InitialPlacement(rng, protocol.num_configurations),
+        divergence=DivergenceReset(rng, protocol.num_configurations),
+        end_effector=EndEffectorReset() if protocol.end_effector_reset else NoReset(),
+        heuristic=HeuristicReset(rng) if protocol.heuristic_reset else NoReset(),
+        extra=tuple(EXTRA_RESETS[name](rng, protocol) for name in protocol.extra_resets),
+        scene=PeriodicSceneReset(rng, protocol),
+    )

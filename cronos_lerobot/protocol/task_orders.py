@@ -1,0 +1,140 @@
+"""Task orders: which task a stream gets at its next task switch (paper, Section 5 and Appendix E)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.protocol.loop_state import LoopState
+
+
+@dataclass(frozen=True)
+class TaskSet:
+    """The tasks of a run: those that are evaluated and, with learned resets, one reset task for each object."""
+
+    tasks: tuple[Any, ...]
+    reset_tasks: tuple[Any, ...] = ()
+
+    @classmethod
+    def of(cls, scene: Any, protocol: ProtocolConfig) -> TaskSet:
+        """The tasks of `scene` that `protocol` trains."""
+        return cls(tuple(scene.tasks), tuple(scene.reset_tasks) if protocol.learned_reset else ())
+
+    @property
+    def all(self) -> tuple[Any, ...]:
+        """Every task, in the order of the indices that `LoopState.task` holds."""
+        return self.tasks + self.reset_tasks
+
+    def reset_task_of(self) -> np.ndarray:
+        """Index of the reset task of each task's object, (len(tasks),)."""
+        objects = [task.object for task in self.reset_tasks]
+        return np.array([len(self.tasks) + objects.index(task.object) for task in self.tasks])
+
+    def new_loop(self, num_streams: int) -> LoopState:
+        """The state of a run that has not begun."""
+        return LoopState(num_streams, len(self.tasks), len(self.reset_tasks))
+
+
+class TaskOrder(Protocol):
+    """TASKSCHEDULER of Algorithm 1.
+
+    `loop` has each stream's history: `attempts` and `successes` by task, `recent_task` and `recent_success` one by
+    one. An order keeps nothing of its own besides its generator, so that a run can be resumed.
+    """
+
+    def draw(self, loop: LoopState) -> np.ndarray:
+        """Return the next task of every stream, (N,) indices below `loop.num_tasks`."""
+        ...
+
+
+TaskOrderFactory = Callable[[np.random.Generator], TaskOrder]
+
+TASK_ORDERS: dict[str, TaskOrderFactory] = {}
+"""Task orders by name."""
+
+
+def register_task_order(name: str) -> Callable[[TaskOrderFactory], TaskOrderFactory]:
+    """Make a task order selectable as `--protocol.task_order=name`.
+
+    It decorates a class whose constructor, or a function that, takes the generator of the order's random draws.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+
+    def register(factory: TaskOrderFactory) -> TaskOrderFactory:
+        if name in TASK_ORDERS:
+            raise ValueError(f"there is a task order {name!r} already; taken names: {sorted(TASK_ORDERS)}.")
+        TASK_ORDERS[name] = factory
+        return factory
+
+    return register
+
+
+@register_task_order("heuristic")
+class HeuristicOrder:
+    """The fixed cycle of Appendix E: objects outer, receptacles inner.
+
+    Stream i starts i tasks into the cycle, so that every update sees all tasks.
+    """
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        """`rng` is not used: nothing is random."""
+
+    def draw(self, loop: LoopState) -> np.ndarray:
+        """The successor of each stream's task in the cycle."""
+        return (np.arange(loop.num_streams) + loop.round) % loop.num_tasks
+
+
+@register_task_order("random")
+class RandomOrder:
+    """Uniform over the task set, independent of everything before."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+
+    def draw(self, loop: LoopState) -> np.ndarray:
+        """One uniform draw for each stream."""
+        return self.rng.integers(loop.num_tasks, size=loop.num_streams)
+
+
+class LearnedReset:
+    """Every second segment, the stream puts the object of its last task back on the table (paper, Section 5, LSR).
+
+    Args:
+        order: draws the tasks in between.
+        reset_task: (num_tasks,) index of the reset task that follows each task.
+    """
+
+    def __init__(self, order: TaskOrder, reset_task: np.ndarray) -> None:
+        self.order = order
+        self.reset_task = reset_task
+
+    def draw(self, loop: LoopState) -> np.ndarray:
+        """A task for every stream, or the reset task of every stream, in turns."""
+        if loop.switches % 2:
+            return self.reset_task[loop.task]
+        return self.order.draw(loop)
+
+
+def check_task_order(name: str) -> None:
+    """Raise a ValueError that lists the valid names, unless `name` is one of them."""
+    if name not in TASK_ORDERS:
+        raise ValueError(f"protocol.task_order must be one of {sorted(TASK_ORDERS)}, got {name!r}.")
+
+
+def make_task_order(name: str, rng: np.random.Generator, task_set: TaskSet | None = None) -> TaskOrder:
+    """Return the task order `name`, with a learned reset after every task if `task_set` has reset tasks.
+
+    Raises:
+        ValueError: no task order has that name.
+    """
+    check_task_order(name)
+    order = TASK_ORDERS[name](rng)
+    if task_set is None or not task_set.reset_tasks:
+        return order
+    return LearnedReset(order, task_set.reset_task_of())

@@ -1,1 +1,0 @@
-"""Reinforcement learning: the policy's interface, rollouts, advantages, PPO."""

@@ -1,0 +1,1 @@
+"""Longer measurements, each a command."""

@@ -1,0 +1,1 @@
+"""What is asked: configurations, orderings, benchmarks as files, Gymnasium ids."""

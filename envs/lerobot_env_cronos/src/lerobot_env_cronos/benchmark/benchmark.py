@@ -1,0 +1,154 @@
+"""What is evaluated: the configurations of a scene, and the episodes and chains that start from them.
+
+The package has one benchmark for each scene. Another one, with configurations and chains of its author's, is a
+dataset repository on the Hub or a folder of the same layout (`lerobot_env_cronos.benchmark.files`).
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from math import factorial
+
+import numpy as np
+
+from lerobot_env_cronos.benchmark.configurations import (
+    SPLITS,
+    check_split,
+    load_configurations,
+    sample_configuration,
+)
+from lerobot_env_cronos.benchmark.orderings import load_orderings
+from lerobot_env_cronos.scene.scenes import BODIES, STEPS_PER_TASK, Scene, Task, get_scene
+
+SUITES = ("independent", "sequential")
+
+
+@dataclass(frozen=True)
+class EpisodeGroup:
+    """Episodes of one task (independent) or chains of one ordering of tasks (sequential)."""
+
+    number: int
+    """Of the task or the ordering, within its suite and split."""
+    tasks: tuple[Task, ...]
+    """One after the other; a single one if independent."""
+    configurations: tuple[int, ...]
+    """Where the episodes start: indices into the split."""
+
+    @property
+    def instructions(self) -> list[str]:
+        """Of its tasks."""
+        return [task.instruction for task in self.tasks]
+
+
+Groups = Mapping[str, tuple[EpisodeGroup, ...]]
+
+
+@dataclass(frozen=True, eq=False)
+class Benchmark:
+    """Configurations of one scene, and what is done from them. Every mapping is by split."""
+
+    scene: Scene
+    configurations: Mapping[str, np.ndarray]
+    """Poses (n, bodies, 7): position [m], quaternion (w, x, y, z), bodies in the scene's order."""
+    independent: Groups
+    sequential: Groups
+    source: str
+    """Where it comes from: `<repository>@<commit>`, a folder, or this package with its version."""
+
+    def groups(self, suite: str, split: str) -> tuple[EpisodeGroup, ...]:
+        """The episodes of a suite on a split; a ValueError names the valid ones."""
+        check_split(split)
+        if suite not in SUITES:
+            raise ValueError(f"unknown suite {suite!r}; valid suites: {list(SUITES)}")
+        return getattr(self, suite)[split]
+
+    def size(self, suite: str, split: str) -> int:
+        """Number of episodes or chains."""
+        return sum(len(group.configurations) for group in self.groups(suite, split))
+
+    @property
+    def fingerprint(self) -> str:
+        """A hash of everything that decides a result here: bodies, poses, tasks, chains; not of `source`."""
+        content = {
+            "scene": self.scene.name,
+            "bodies": [asdict(BODIES[name]) for name in self.scene.bodies],
+            "window_steps": STEPS_PER_TASK,
+            "episodes": {
+                f"{suite}/{split}": [
+                    [g.number, g.instructions, g.configurations] for g in self.groups(suite, split)
+                ]
+                for suite in SUITES
+                for split in SPLITS
+            },
+        }
+        digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
+        for split in SPLITS:
+            digest.update(np.ascontiguousarray(self.configurations[split], dtype="<f8").tobytes())
+        return digest.hexdigest()[:16]
+
+
+def packaged_benchmark(scene_name: str) -> Benchmark:
+    """The benchmark of a scene: every task, and ten orderings of them all, from all 64 configurations."""
+    scene = get_scene(scene_name)
+    poses = {split: load_configurations(scene_name, split) for split in SPLITS}
+    source = f"lerobot_env_cronos {version('lerobot_env_cronos')}"
+    return _cross(scene, poses, load_orderings(scene_name), source)
+
+
+def draw_benchmark(
+    scene_name: str,
+    seed: int,
+    num_configurations: int = 64,
+    num_orderings: int = 10,
+    chain_length: int | None = None,
+) -> Benchmark:
+    """Draw another benchmark of a scene: every task, and some chains of tasks, from new configurations.
+
+    Args:
+        scene_name: of a scene.
+        seed: decides configurations and orderings.
+        num_configurations: of each split.
+        num_orderings: of each split, the same in both; all different.
+        chain_length: tasks of a chain, all different; null for all of the scene.
+
+    Raises:
+        ValueError: there are not so many different orderings, or a number is out of range.
+    """
+    scene = get_scene(scene_name)
+    length = len(scene.tasks) if chain_length is None else chain_length
+    if not 1 <= length <= len(scene.tasks):
+        raise ValueError(f"chain_length must be 1 to {len(scene.tasks)}, the tasks of {scene_name}, got {length}")
+    most = factorial(len(scene.tasks)) // factorial(len(scene.tasks) - length)
+    if not 1 <= num_orderings <= most:
+        raise ValueError(f"num_orderings must be 1 to {most}, all of {length} tasks, got {num_orderings}")
+    if num_configurations < 1 or seed < 0:
+        raise ValueError(f"need a configuration and a seed >= 0, got {num_configurations} and {seed}")
+    rng = np.random.default_rng(seed)
+    poses = {
+        split: np.stack([sample_configuration(scene, rng).round(6) for _ in range(num_configurations)])
+        for split in SPLITS
+    }
+    drawn: list[tuple[Task, ...]] = []
+    while len(drawn) < num_orderings:
+        ordering = tuple(scene.tasks[i] for i in rng.permutation(len(scene.tasks))[:length])
+        if ordering not in drawn:
+            drawn.append(ordering)
+    return _cross(scene, poses, drawn, f"drawn with seed {seed}")
+
+
+def _cross(
+    scene: Scene, poses: Mapping[str, np.ndarray], orderings: Sequence[tuple[Task, ...]], source: str
+) -> Benchmark:
+    """Every task and every ordering from every configuration."""
+    everywhere = {split: tuple(range(len(poses[split]))) for split in SPLITS}
+    chains = {"independent": [(task,) for task in scene.tasks], "sequential": orderings}
+    groups = {
+        suite: {
+            split: tuple(EpisodeGroup(i, tuple(tasks), everywhere[split]) for i, tasks in enumerate(chains[suite]))
+            for split in SPLITS
+        }
+        for suite in SUITES
+    }
+    return Benchmark(scene, poses, groups["independent"], groups["sequential"], source)

@@ -1,0 +1,181 @@
+"""Benchmark configurations: frozen poses of every body, 64 for training and 64 held out per scene.
+
+They were drawn once by `python -m lerobot_env_cronos.benchmark.configurations SCENE` from a fixed seed and are
+data of this package (`data/<scene>.json`); a change of them is a new version of the environment id. Scenes from
+outside the package come with a file of their own, or theirs are drawn from the same seed when they are first used.
+"""
+
+import argparse
+import json
+from functools import cache
+from importlib import import_module, resources
+from pathlib import Path
+
+import numpy as np
+
+from lerobot_env_cronos.scene.scenes import BODIES, Scene, get_scene
+
+SPLITS = ("train", "held_out")
+NUM_CONFIGURATIONS = 64
+VERSION = 0
+"""Version of the configurations and of the dynamics, as in the environment id `...-v0`."""
+
+CLEARANCE_M = 0.015
+"""Smallest gap between the footprints of two bodies [m]."""
+OBJECT_YAWS = np.array([0.0, 0.25, 0.5, 0.75]) * np.pi
+RECEPTACLE_YAWS = np.array([0.0, 0.5]) * np.pi
+MAX_ATTEMPTS, MAX_RESTARTS = 10_000, 20
+SEED = 2026
+"""Of the packaged configurations, and of those of scenes without a file."""
+
+
+def check_split(split: str) -> None:
+    """Raise a ValueError that names the valid splits, unless this is one."""
+    if split not in SPLITS:
+        raise ValueError(f"unknown split {split!r}; valid splits: {list(SPLITS)}")
+
+
+_files: dict[str, Path] = {}
+"""Files of scenes that are not part of the package."""
+
+
+def load_configurations(scene_name: str, split: str) -> np.ndarray:
+    """Poses (64, bodies, 7) of a split: position [m], quaternion (w, x, y, z), bodies in the scene's order."""
+    check_split(split)
+    return _load_splits(get_scene(scene_name), _files.get(scene_name))[split]
+
+
+def set_configurations_file(scene: Scene, path: Path) -> None:
+    """Read the configurations of `scene` from `path` from now on.
+
+    Raises:
+        ValueError: the file is of other bodies, or a split has not 64 configurations.
+    """
+    _load_splits(scene, path)
+    _files[scene.name] = path
+
+
+@cache
+def _load_splits(scene: Scene, path: Path | None) -> dict[str, np.ndarray]:
+    packaged = resources.files("lerobot_env_cronos").joinpath(f"data/{scene.name}.json")
+    if path is not None or packaged.is_file():
+        content = json.loads((path or packaged).read_text())
+        _check_content(scene, content, path or packaged)
+    else:
+        content = _generate(scene, SEED)
+    splits = {split: np.array(content["splits"][split]) for split in SPLITS}
+    for poses in splits.values():
+        poses.flags.writeable = False
+    return splits
+
+
+def _check_content(scene: Scene, content: dict, source: object) -> None:
+    version, bodies, splits = (content.get(key) for key in ("version", "bodies", "splits"))
+    if tuple(bodies or ()) != scene.bodies or version != VERSION:
+        found = f"v{version} of bodies {bodies}"
+        raise ValueError(f"{source} is {found}; {scene.name} needs v{VERSION} of bodies {list(scene.bodies)}")
+    shape = (NUM_CONFIGURATIONS, len(scene.bodies), 7)
+    for split in SPLITS:
+        if np.shape((splits or {}).get(split, ())) != shape:
+            raise ValueError(f"split {split} of {source} must be of shape {shape}")
+
+
+def footprint_corners(name: str, xy: np.ndarray, yaw: float) -> np.ndarray:
+    """Corners (4, 2) of a body's bounding box on the table [m]."""
+    half = np.array(BODIES[name].size[:2]) / 2
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half
+    c, s = np.cos(yaw), np.sin(yaw)
+    return corners @ np.array([[c, s], [-s, c]]) + xy
+
+
+def footprint_gap(a: np.ndarray, b: np.ndarray) -> float:
+    """Separation of two rectangles along their best separating axis [m]; negative if they overlap."""
+    gaps = []
+    for corners in (a, b):
+        edges = np.roll(corners, -1, axis=0)[:2] - corners[:2]
+        normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1)[:, None]
+        pa, pb = normals @ a.T, normals @ b.T
+        gaps.append(np.maximum(pa.min(1) - pb.max(1), pb.min(1) - pa.max(1)).max())
+    return max(gaps)
+
+
+def sample_place(
+    scene: Scene, body: str, others: list[np.ndarray], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw a free place for `body` in the spawn area.
+
+    Args:
+        others: footprints (4, 2) that it must keep `CLEARANCE_M` away from.
+
+    Returns:
+        The pose (7,) on the table, and its footprint (4, 2).
+
+    Raises:
+        RuntimeError: no free place was found.
+    """
+    yaws = OBJECT_YAWS if body in scene.objects else RECEPTACLE_YAWS
+    for _ in range(MAX_ATTEMPTS):
+        xy = rng.uniform(scene.spawn_low, scene.spawn_high)
+        yaw = rng.choice(yaws)
+        corners = footprint_corners(body, xy, yaw)
+        if all(footprint_gap(corners, other) > CLEARANCE_M for other in others):
+            pose = [*xy, BODIES[body].size[2] / 2, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
+            return np.array(pose), corners
+    raise RuntimeError(f"no free place for the {body} among {len(others)} bodies")
+
+
+def sample_configuration(scene: Scene, rng: np.random.Generator) -> np.ndarray:
+    """Draw poses (bodies, 7) of all bodies at rest on the table, no two touching.
+
+    Raises:
+        RuntimeError: the bodies do not fit into the spawn area.
+    """
+    for _ in range(MAX_RESTARTS):
+        poses, footprints = {}, []
+        try:
+            # Receptacles are large: placed first, they leave room for the objects.
+            for body in scene.receptacles + scene.objects:
+                poses[body], corners = sample_place(scene, body, footprints, rng)
+                footprints.append(corners)
+        except RuntimeError:
+            continue
+        return np.stack([poses[body] for body in scene.bodies])
+    raise RuntimeError(
+        f"{scene.name}: {len(scene.bodies)} bodies do not fit into the spawn area {scene.spawn_low} to "
+        f"{scene.spawn_high} with {CLEARANCE_M} m between them"
+    )
+
+
+def _generate(scene: Scene, seed: int) -> dict:
+    rng = np.random.default_rng(seed)
+    drawn = [sample_configuration(scene, rng).round(6) for _ in range(len(SPLITS) * NUM_CONFIGURATIONS)]
+    splits = {
+        split: [pose.tolist() for pose in drawn[i * NUM_CONFIGURATIONS : (i + 1) * NUM_CONFIGURATIONS]]
+        for i, split in enumerate(SPLITS)
+    }
+    return {"scene": scene.name, "version": VERSION, "seed": seed, "bodies": scene.bodies, "splits": splits}
+
+
+def write_configurations(scene_name: str, folder: Path, seed: int = SEED) -> Path:
+    """Draw the configurations of a scene and write them to `folder/<scene>.json`; returns the path."""
+    scene = get_scene(scene_name)
+    path = folder / f"{scene.name}.json"
+    path.write_text(json.dumps(_generate(scene, seed)) + "\n")
+    return path
+
+
+def main() -> None:
+    """Write the configurations of a scene; for maintainers, when a new version is made."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("scene")
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--output", type=Path, default=Path("."), help="folder")
+    parser.add_argument("--discover_packages_path", help="package to import first, which registers the scene")
+    args = parser.parse_args()
+    if args.discover_packages_path:
+        import_module(args.discover_packages_path)
+    print(f"wrote {write_configurations(args.scene, args.output, args.seed)}")
+
+
+if __name__ == "__main__":
+    main()

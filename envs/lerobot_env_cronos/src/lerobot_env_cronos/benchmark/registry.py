@@ -1,0 +1,77 @@
+"""Scenes from outside the package: registered by name, they work wherever the built-in ones do."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import gymnasium as gym
+
+from lerobot_env_cronos.benchmark.configurations import set_configurations_file
+from lerobot_env_cronos.scene.bodies import SHAPES
+from lerobot_env_cronos.scene.scenes import BODIES, SCENES, Body, Scene
+from lerobot_env_cronos.scene.visuals.objects import LOOKS
+
+# Part of Gymnasium's environment ids and of file names.
+NAME_PATTERN = re.compile(r"[a-z0-9_]+")
+
+
+def register_scene(scene: Scene, bodies: Sequence[Body] = (), configurations: Path | str | None = None) -> None:
+    """Make `scene` usable by name: `CronosVectorEnv`, `--env.scene`, and `gym.make` as `gymnasium_id(scene.name)`.
+
+    Registering the same scene again changes nothing.
+
+    Args:
+        scene: its objects and receptacles are built-in bodies or among `bodies`.
+        bodies: new bodies; `Body.shape` names an entry of `bodies.SHAPES` and `visuals.objects.LOOKS`.
+        configurations: JSON file written by `python -m lerobot_env_cronos.benchmark.configurations`; without one,
+            64 training and 64 held-out configurations are drawn from a fixed seed in every process.
+
+    Raises:
+        ValueError: the name is taken by something else or malformed, a shape or a body is unknown, or the file
+            is of another scene. Nothing is registered then.
+    """
+    new_bodies = {body.name: body for body in bodies}
+    _check(scene, new_bodies)
+    known = scene.name in SCENES
+    if configurations is not None:
+        set_configurations_file(scene, Path(configurations))
+    BODIES.update(new_bodies)
+    SCENES[scene.name] = scene
+    if not known:
+        _register_gymnasium(scene.name)
+
+
+def _check(scene: Scene, new_bodies: dict[str, Body]) -> None:
+    if not NAME_PATTERN.fullmatch(scene.name):
+        raise ValueError(f"scene name {scene.name!r} must consist of a-z, 0-9 and _")
+    if SCENES.get(scene.name, scene) != scene:
+        raise ValueError(f"there is another scene {scene.name!r}; names in use: {sorted(SCENES)}")
+    valid_shapes = sorted(SHAPES.keys() & LOOKS.keys())
+    for name, body in new_bodies.items():
+        if BODIES.get(name, body) != body:
+            raise ValueError(f"there is another body {name!r}; names in use: {sorted(BODIES)}")
+        if body.shape not in valid_shapes:
+            raise ValueError(f"unknown shape {body.shape!r} of the {name}; valid shapes: {valid_shapes}")
+        if min(body.size) <= 0 or body.density <= 0:
+            raise ValueError(f"size and density of the {name} must be positive, got {body.size}, {body.density}")
+    if not scene.objects or not scene.receptacles or len(set(scene.bodies)) < len(scene.bodies):
+        raise ValueError(f"a scene needs objects and receptacles, each once; {scene.name} has {scene.bodies}")
+    for name in scene.bodies:
+        if name not in BODIES and name not in new_bodies:
+            raise ValueError(f"unknown body {name!r}; valid bodies: {sorted(BODIES | new_bodies)}")
+
+
+def gymnasium_id(scene: str) -> str:
+    """Gymnasium id of a scene's single-environment form."""
+    return f"lerobot_env_cronos/{scene}-v0"
+
+
+def register_gymnasium() -> None:
+    """Register every scene of `SCENES` with Gymnasium."""
+    for scene in SCENES:
+        _register_gymnasium(scene)
+
+
+def _register_gymnasium(scene: str) -> None:
+    entry_point = "lerobot_env_cronos.episodic:CronosEnv"
+    gym.register(id=gymnasium_id(scene), entry_point=entry_point, kwargs={"scene": scene})

@@ -1,0 +1,1 @@
+"""The scripted expert, and how often it succeeds."""

@@ -1,0 +1,1 @@
+"""What there is: scenes, bodies, the robot, their model and looks."""

@@ -1,0 +1,91 @@
+"""Collision geometry of the objects and receptacles: primitives that fill their published bounding boxes.
+
+Each builder adds geoms to an MjSpec body whose origin is the centre of the bounding box, resting pose, z up.
+Looks are added by `lerobot_env_cronos.scene.visuals`; only the geometry here has mass and collides.
+"""
+
+from collections.abc import Callable
+
+import mujoco
+
+from lerobot_env_cronos.scene.robot import CONTACT_SOLIMP, CONTACT_SOLREF
+from lerobot_env_cronos.scene.scenes import Body
+
+# Sliding 1.0 as in SimplerEnv; torsional and rolling friction (condim 6) keep round bodies from rolling away.
+FRICTION = [1.0, 0.01, 0.003]
+
+COLLISION_GROUP = 3
+
+
+def _add_geom(spec_body: mujoco.MjsBody, body: Body, geom_type: mujoco.mjtGeom, size, pos=(0, 0, 0), **extra):
+    spec_body.add_geom(
+        type=geom_type, size=size, pos=pos, density=body.density, group=COLLISION_GROUP, condim=6,
+        friction=FRICTION, solref=CONTACT_SOLREF, solimp=CONTACT_SOLIMP, **extra,
+    )  # fmt: skip
+
+
+def _add_bottle(spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A squeeze bottle lying on its flat side: a box-shaped belly and a narrower neck along +y."""
+    hx, hy, hz = (s / 2 for s in body.size)
+    neck = 0.28 * hy
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    _add_geom(spec_body, body, box, [hx, hy - neck, hz], [0, -neck, 0])
+    _add_geom(spec_body, body, box, [0.55 * hx, neck, 0.55 * hz], [0, hy - neck, 0])
+
+
+SHOVEL_BLADE_SHARE = 0.42
+SHOVEL_HANDLE_HALF_WIDTH = 0.009
+
+
+def _add_shovel(spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A flat blade (towards -y) on the table and a handle (towards +y) as thick as the bounding box."""
+    hx, hy, hz = (s / 2 for s in body.size)
+    blade_hy = SHOVEL_BLADE_SHARE * hy
+    blade_hz = 0.35 * hz
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    _add_geom(spec_body, body, box, [hx, blade_hy, blade_hz], [0, -hy + blade_hy, -hz + blade_hz])
+    _add_geom(spec_body, body, box, [SHOVEL_HANDLE_HALF_WIDTH, hy - blade_hy, hz], [0, blade_hy, 0])
+
+
+BEAR_BODY_SHARE = 0.55
+BEAR_HEAD_DEPTH, BEAR_HEAD_WIDTH = 0.75, 0.85
+
+
+def _add_bear(spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A sitting bear: body and legs as wide as the bounding box, so that it stands firmly, and a smaller head."""
+    hx, hy, hz = (s / 2 for s in body.size)
+    lower, upper = BEAR_BODY_SHARE * hz, (1 - BEAR_BODY_SHARE) * hz
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    _add_geom(spec_body, body, box, [hx, hy, lower], [0, 0, -hz + lower])
+    _add_geom(spec_body, body, box, [BEAR_HEAD_DEPTH * hx, BEAR_HEAD_WIDTH * hy, upper], [0, 0, hz - upper])
+
+
+def _add_plate(spec_body: mujoco.MjsBody, body: Body) -> None:
+    _add_geom(spec_body, body, mujoco.mjtGeom.mjGEOM_CYLINDER, [body.size[0] / 2, body.size[2] / 2, 0])
+
+
+def _add_slab(spec_body: mujoco.MjsBody, body: Body) -> None:
+    _add_geom(spec_body, body, mujoco.mjtGeom.mjGEOM_BOX, [s / 2 for s in body.size])
+
+
+SHAPES: dict[str, Callable[[mujoco.MjsBody, Body], None]] = {
+    "bottle": _add_bottle,
+    "shovel": _add_shovel,
+    "plate": _add_plate,
+    "cloth": _add_slab,
+    "bear": _add_bear,
+    "water bottle": _add_bottle,
+    "carpet": _add_slab,
+    "newspaper": _add_slab,
+    "box": _add_slab,
+    "disc": _add_plate,
+}
+"""How to build a body, by `Body.shape`; another shape is another entry here and in `visuals.objects.LOOKS`."""
+
+
+def add_body(spec: mujoco.MjSpec, body: Body) -> mujoco.MjsBody:
+    """Add `body` as a free body to `spec` and return it."""
+    spec_body = spec.worldbody.add_body(name=body.name, pos=[0, 0, body.size[2] / 2])
+    spec_body.add_freejoint(name=body.name)
+    SHAPES[body.shape](spec_body, body)
+    return spec_body

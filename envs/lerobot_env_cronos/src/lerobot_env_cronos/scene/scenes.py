@@ -1,0 +1,114 @@
+"""The benchmark's vocabulary: objects, receptacles, tasks and scenes.
+
+Sizes and densities are those of the SimplerEnv Bridge table and its multi-object extension RL4VLA
+(Li et al. 2024, Liu et al. 2025), which the CRONOS paper builds on (Section 4). A scene is one entry of
+`SCENES`; everything else (model, tasks, configurations, observations) follows from it. Scenes from outside the
+package are added by `lerobot_env_cronos.benchmark.registry.register_scene`.
+"""
+
+from dataclasses import dataclass
+
+CONTROL_HZ = 5
+"""Control frequency of the environment, of `render_fps` and of every dataset [Hz]."""
+
+STEPS_PER_TASK = 80
+"""K, the task-switch interval and the window of an evaluation episode [control steps] (paper, Section 4)."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A free rigid body of the scene.
+
+    `size` is the full extent of its bounding box in its resting pose, z up [m]; `density` is that of the
+    collision geometry [kg/m^3]; `shape` names a builder of `lerobot_env_cronos.scene.bodies` and a look of
+    `lerobot_env_cronos.scene.visuals`; `colour` is the RGB (0 to 1) of the plain shapes `box` and `disc`.
+    """
+
+    name: str
+    size: tuple[float, float, float]
+    density: float
+    shape: str
+    colour: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Task:
+    """One pick-and-place task; a `receptacle` of None means the table, that is a reset task."""
+
+    object: str
+    receptacle: str | None
+
+    @property
+    def instruction(self) -> str:
+        """The language instruction, in the paper's wording."""
+        return f"put the {self.object} on the {self.receptacle or 'table'}"
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Objects and receptacles that share one table.
+
+    The reference scatters ONE object and ONE receptacle over a square of 0.15 m. A shared scene holds all of
+    them without overlap, so `spawn_low` and `spawn_high` widen it to 0.20 x 0.30 m, all within reach [m]; six
+    bodies need 0.25 x 0.30 m.
+    """
+
+    name: str
+    objects: tuple[str, ...]
+    receptacles: tuple[str, ...]
+    spawn_low: tuple[float, float] = (0.20, -0.15)
+    spawn_high: tuple[float, float] = (0.40, 0.15)
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """All free bodies, objects first; the order of the state vector."""
+        return self.objects + self.receptacles
+
+    @property
+    def tasks(self) -> tuple[Task, ...]:
+        """N x M tasks in the order of the paper's Appendix E: objects outer, receptacles inner."""
+        return tuple(Task(o, r) for o in self.objects for r in self.receptacles)
+
+    @property
+    def reset_tasks(self) -> tuple[Task, ...]:
+        """The learned-reset tasks "put the [object] on the table" (paper, Section 5)."""
+        return tuple(Task(o, None) for o in self.objects)
+
+
+BODIES: dict[str, Body] = {
+    body.name: body
+    for body in (
+        # Long axis along y, lying on the table.
+        Body("ketchup bottle", (0.0208, 0.0813, 0.0208), 500, "bottle"),
+        Body("kitchen shovel", (0.0571, 0.1488, 0.0212), 557, "shovel"),
+        Body("yellow plate", (0.110, 0.110, 0.006), 1003, "plate"),
+        Body("cloth", (0.110, 0.110, 0.0094), 6975, "cloth"),
+        # Sitting upright, facing +x, which is towards the front camera.
+        Body("toy bear", (0.0426, 0.0386, 0.0564), 667, "bear"),
+        Body("plastic bottle", (0.0361, 0.1216, 0.0390), 1916, "water bottle"),
+        Body("carpet", (0.110, 0.0943, 0.0037), 2815, "carpet"),
+        Body("newspaper", (0.0815, 0.1161, 0.0041), 2278, "newspaper"),
+    )
+}
+
+SCENES: dict[str, Scene] = {
+    scene.name: scene
+    for scene in (
+        Scene("kitchen_2x2", ("ketchup bottle", "kitchen shovel"), ("yellow plate", "cloth")),
+        Scene(
+            "kitchen_3x3",
+            ("toy bear", "kitchen shovel", "ketchup bottle"),
+            ("yellow plate", "cloth", "carpet"),
+            spawn_low=(0.17, -0.15),
+            spawn_high=(0.42, 0.15),
+        ),
+        Scene("playroom_2x2", ("toy bear", "plastic bottle"), ("newspaper", "carpet")),
+    )
+}
+
+
+def get_scene(name: str) -> Scene:
+    """Look a scene up by name; a ValueError names the valid ones."""
+    if name not in SCENES:
+        raise ValueError(f"unknown scene {name!r}; valid scenes: {sorted(SCENES)}")
+    return SCENES[name]

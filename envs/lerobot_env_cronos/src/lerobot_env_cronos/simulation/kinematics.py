@@ -1,0 +1,116 @@
+"""Batched forward and inverse kinematics of the arm, in numpy, for many streams at once.
+
+Frames: w the world (= robot base), e the end-effector site. Shapes lead with n, the number of streams.
+"""
+
+import numpy as np
+
+from lerobot_env_cronos.scene.robot import EE_OFFSET, LINKS
+
+_OFFSETS = np.array([link.pos for link in LINKS])  # (6, 3) joint positions in the parent frame [m]
+_AXES = np.array([link.axis for link in LINKS], dtype=float)  # (6, 3)
+_AXIS_INDEX = _AXES.argmax(axis=1)
+JOINT_LOW = np.array([link.range[0] for link in LINKS])
+JOINT_HIGH = np.array([link.range[1] for link in LINKS])
+TARGET_LOW = np.maximum(JOINT_LOW, [-1.6, -np.inf, -1.2, -1.6, 0.1, -np.inf])
+TARGET_HIGH = np.minimum(JOINT_HIGH, [1.6, np.inf, np.inf, 1.6, np.inf, np.inf])
+"""Range of the joint targets [rad]. It keeps the arm on the branch of its home pose: facing the table, elbow up,
+wrist down. On another branch small motions of the hand lead nowhere but into the joint limits, for good."""
+
+
+def forward_kinematics(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pose and geometric Jacobian of the end-effector site.
+
+    Args:
+        q: (n, 6) joint positions [rad].
+
+    Returns:
+        p_we (n, 3) [m], R_we (n, 3, 3), and the Jacobian (n, 6, 6): linear rows, then angular rows, world frame.
+    """
+    n = len(q)
+    R = np.broadcast_to(np.eye(3), (n, 3, 3))
+    p = np.zeros((n, 3))
+    origins, axes = np.empty((6, n, 3)), np.empty((6, n, 3))
+    cos, sin = np.cos(q), np.sin(q)
+    for j in range(6):
+        p = p + R @ _OFFSETS[j]
+        origins[j], axes[j] = p, R[:, :, _AXIS_INDEX[j]]
+        R = R @ _axis_rotation(_AXIS_INDEX[j], cos[:, j], sin[:, j])
+    p = p + R @ EE_OFFSET
+    jacobian = np.empty((n, 6, 6))
+    jacobian[:, :3] = np.cross(axes, p - origins).transpose(1, 2, 0)
+    jacobian[:, 3:] = axes.transpose(1, 2, 0)
+    return p, R, jacobian
+
+
+def _axis_rotation(axis: int, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
+    R = np.zeros((len(cos), 3, 3))
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    R[:, axis, axis] = 1.0
+    R[:, i, i], R[:, j, j] = cos, cos
+    R[:, i, j], R[:, j, i] = -sin, sin
+    return R
+
+
+def rotation_vector_to_matrix(w: np.ndarray) -> np.ndarray:
+    """Exponential map SO(3), (..., 3) [rad] -> (..., 3, 3)."""
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    K = _skew(w)
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    return np.eye(3) + a * K + b * (K @ K)
+
+
+def matrix_to_rotation_vector(R: np.ndarray) -> np.ndarray:
+    """Logarithm SO(3), (..., 3, 3) -> (..., 3) [rad], for angles below pi."""
+    v = 0.5 * np.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1
+    )
+    sin = np.linalg.norm(v, axis=-1)
+    cos = 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1)
+    angle = np.arctan2(sin, cos)
+    return v * np.where(sin > 1e-9, angle / np.maximum(sin, 1e-9), 1.0)[..., None]
+
+
+def quaternion_to_matrix(quat: np.ndarray) -> np.ndarray:
+    """Unit quaternions (..., 4) as (w, x, y, z) -> (..., 3, 3)."""
+    w, x, y, z = np.moveaxis(quat, -1, 0)
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
+        ],
+        axis=-2,
+    )
+
+
+def _skew(w: np.ndarray) -> np.ndarray:
+    x, y, z = np.moveaxis(w, -1, 0)
+    o = np.zeros_like(x)
+    return np.stack([np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], axis=-2)
+
+
+def inverse_kinematics(
+    q: np.ndarray, p_target: np.ndarray, R_target: np.ndarray, iterations: int = 4, damping: float = 0.02
+) -> np.ndarray:
+    """Damped least squares from `q` towards a target pose (Nakamura and Hanafusa 1986).
+
+    Args:
+        q: (n, 6) joint positions to start from [rad].
+        p_target: (n, 3) [m].
+        R_target: (n, 3, 3).
+
+    Returns:
+        (n, 6) joint positions between TARGET_LOW and TARGET_HIGH; the closest that `iterations` steps found.
+    """
+    for _ in range(iterations):
+        p, R, jacobian = forward_kinematics(q)
+        error = np.concatenate([p_target - p, matrix_to_rotation_vector(R_target @ R.transpose(0, 2, 1))], axis=1)
+        # Rotations weigh 0.3 m/rad, so that a position error is not traded for a tiny rotation error.
+        weight = np.array([1, 1, 1, 0.3, 0.3, 0.3])
+        Jw, ew = jacobian * weight[:, None], error * weight
+        JJt = Jw @ Jw.transpose(0, 2, 1) + damping**2 * np.eye(6)
+        step = (Jw.transpose(0, 2, 1) @ np.linalg.solve(JJt, ew[..., None]))[..., 0]
+        q = np.clip(q + np.clip(step, -0.4, 0.4), TARGET_LOW, TARGET_HIGH)
+    return q

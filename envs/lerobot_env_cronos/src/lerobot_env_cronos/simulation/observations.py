@@ -1,0 +1,121 @@
+"""Observations: pixels, proprioception and the privileged state, in Gymnasium's and LeRobot's raw format."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from lerobot.envs.utils import parse_camera_names
+
+from lerobot_env_cronos.scene.model import CAMERAS
+from lerobot_env_cronos.scene.scenes import Scene
+from lerobot_env_cronos.simulation.rendering import RENDERERS, BatchRenderer, make_renderer
+from lerobot_env_cronos.simulation.simulation import Simulation
+
+OBS_TYPES = ("pixels_agent_pos", "environment_state_agent_pos")
+
+AGENT_POS_NAMES = (
+    *(f"ee.{axis}" for axis in "xyz"),
+    *(f"ee.r{row}{column}" for column in (1, 2) for row in (1, 2, 3)),
+    "gripper.opening",
+    *(f"ee_target_offset.{axis}" for axis in "xyz"),
+)
+"""Proprioception (13): end-effector position [m], the first two columns of its rotation matrix, gripper opening
+(0 closed, 1 open), and the commanded minus the measured position [m]."""
+
+
+STATE_LIMIT = 10.0
+"""Bound of every state observation; a body further away than this has left the room [m]."""
+
+
+def environment_state_names(scene: Scene) -> tuple[str, ...]:
+    """Names of the privileged state: 12 per body: position [m], two rotation columns, position from the hand."""
+    parts = (
+        *(f"{axis}" for axis in "xyz"),
+        *(f"r{row}{column}" for column in (1, 2) for row in (1, 2, 3)),
+        *(f"from_ee.{axis}" for axis in "xyz"),
+    )
+    return tuple(f"{body}.{part}".replace(" ", "_") for body in scene.bodies for part in parts)
+
+
+class ObservationBuilder:
+    """Reads observations from a simulation; renders lazily, so state-only runs need no OpenGL."""
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        obs_type: str,
+        privileged_state: bool,
+        height: int,
+        width: int,
+        camera_name: str,
+        render_size: tuple[int, int],
+        renderer: str = "classic",
+    ):
+        if obs_type not in OBS_TYPES:
+            raise ValueError(f"unknown obs_type {obs_type!r}; valid obs_types: {list(OBS_TYPES)}")
+        if renderer not in RENDERERS:
+            raise ValueError(f"unknown renderer {renderer!r}; valid renderers: {list(RENDERERS)}")
+        self.renderer = renderer
+        self.cameras = parse_camera_names(camera_name)
+        for camera in self.cameras:
+            if camera not in CAMERAS:
+                raise ValueError(f"unknown camera {camera!r}; valid cameras: {sorted(CAMERAS)}")
+        self.simulation = simulation
+        self.pixels = obs_type == "pixels_agent_pos"
+        self.privileged = privileged_state or not self.pixels
+        self.size, self.render_size = (height, width), tuple(render_size)
+        self._renderers: dict[tuple, BatchRenderer] = {}
+        self.space = self._space()
+
+    def _space(self) -> gym.spaces.Dict:
+        def box(n: int) -> gym.spaces.Box:
+            return gym.spaces.Box(-STATE_LIMIT, STATE_LIMIT, (n,), np.float32)
+
+        spaces: dict[str, gym.Space] = {"agent_pos": box(len(AGENT_POS_NAMES))}
+        if self.privileged:
+            spaces["environment_state"] = box(len(environment_state_names(self.simulation.scene)))
+        if self.pixels:
+            image = gym.spaces.Box(0, 255, (*self.size, 3), np.uint8)
+            spaces["pixels"] = gym.spaces.Dict(dict.fromkeys(self.cameras, image))
+        return gym.spaces.Dict(spaces)
+
+    def observe(self, ids: np.ndarray) -> dict[str, Any]:
+        """Observation of simulations `ids`, leading dimension k; arrays are fresh at every call."""
+        p, R = self.simulation.end_effector()
+        observation: dict[str, Any] = {"agent_pos": self._agent_pos(p, R)[ids]}
+        if self.privileged:
+            observation["environment_state"] = self._environment_state(p)[ids]
+        if self.pixels:
+            qpos = self.simulation.qpos[ids]
+            observation["pixels"] = {
+                camera: self._renderer(self.size, camera).render(qpos) for camera in self.cameras
+            }
+        return observation
+
+    def render(self, qpos: np.ndarray) -> np.ndarray:
+        """Frames (k, height, width, 3) of states `qpos` (k, nq) for videos, from the first camera."""
+        return self._renderer(self.render_size, self.cameras[0]).render(qpos)
+
+    def _agent_pos(self, p: np.ndarray, R: np.ndarray) -> np.ndarray:
+        sim = self.simulation
+        columns = (p, R[:, :, 0], R[:, :, 1], sim.gripper_opening()[:, None], sim.target_position() - p)
+        return np.concatenate(columns, axis=1, dtype=np.float32).clip(-STATE_LIMIT, STATE_LIMIT)
+
+    def _environment_state(self, p: np.ndarray) -> np.ndarray:
+        position = self.simulation.body_poses()[..., :3]
+        R = self.simulation.body_rotations()
+        parts = (position, R[..., 0], R[..., 1], position - p[:, None])
+        flat = np.concatenate(parts, axis=2, dtype=np.float32).reshape(len(p), -1)
+        return flat.clip(-STATE_LIMIT, STATE_LIMIT)
+
+    def _renderer(self, size: tuple[int, int], camera: str) -> BatchRenderer:
+        key = (size, camera)
+        if key not in self._renderers:
+            self._renderers[key] = make_renderer(self.renderer, self.simulation.model, *size, camera)
+        return self._renderers[key]
+
+    def close(self) -> None:
+        """Free all renderers."""
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()

@@ -1,0 +1,270 @@
+"""Many copies of one scene on MuJoCo's batched engine: control, contacts, and putting things somewhere.
+
+The action is a delta of the end effector's TARGET pose (facts of the Bridge set-up: the delta is applied to the
+previous target, not to the measured pose) and a gripper command. Targets become joint targets by inverse
+kinematics and are ramped over most of the control step.
+"""
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch, SimulationError
+
+from lerobot_env_cronos.scene.model import SUBSTEPS, build_model, grasp_sensor, support_sensor
+from lerobot_env_cronos.scene.robot import FINGER_CLOSED, FINGER_OPEN, FINGERTIP_REACH, HOME_QPOS
+from lerobot_env_cronos.scene.scenes import BODIES, Scene
+from lerobot_env_cronos.simulation.kinematics import (
+    forward_kinematics,
+    inverse_kinematics,
+    quaternion_to_matrix,
+    rotation_vector_to_matrix,
+)
+
+ACTION_LOW = np.array([-0.028727253, -0.0417035, -0.026093859, -0.08092105, -0.092886995, -0.20718276, 0.0])
+ACTION_HIGH = np.array([0.028309678, 0.040855255, 0.040161587, 0.0819204776, 0.0779285, 0.203825745, 1.0])
+"""q01 and q99 of `bridge_orig`, the range that OpenVLA's action tokens span: m, rad, gripper (1 open)."""
+ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
+
+EE_LOW, EE_HIGH = np.array([0.10, -0.30, 0.0]), np.array([0.50, 0.30, 0.35])
+"""Box that the end effector's target is clamped to; the fingertips stay above the table [m]."""
+
+RAMP_CHUNKS, CHUNK_SUBSTEPS = 8, 4
+"""The joint targets move linearly over 8 x 4 of the 40 substeps. Without the ramp, grasped objects slip."""
+
+NUM_ARM_JOINTS, NUM_ROBOT_JOINTS = 6, 8
+MAX_SPEED = 200.0
+"""Joint or body speed beyond which a simulation counts as diverged [m/s, rad/s]."""
+
+SETTLE_CHUNK, SETTLE_MAX_CHUNKS, SETTLE_SPEED = 20, 10, 0.02
+"""After an arm teleport bodies fall for at most 1 s, checked every 0.1 s, until slower than 0.02 m/s."""
+
+
+class Simulation:
+    """`num_sims` copies of `scene`, stepped together on `num_threads` threads (bit-identical at any number).
+
+    Attributes are live arrays: `qpos` (n, nq), `qvel` (n, nv), `sensordata` (n, nsensor).
+    """
+
+    def __init__(self, scene: Scene, num_sims: int, num_threads: int = 0):
+        self.scene = scene
+        self.num_sims = num_sims
+        self.model = build_model(scene)
+        self._batch = Batch(self.model, num_sims, num_threads, persistent=True)
+        self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
+        self._ctrl, self.sensordata = self._batch.bind("ctrl"), self._batch.bind("sensordata")
+        self._qpos_slice = {
+            name: slice(NUM_ROBOT_JOINTS + 7 * i, NUM_ROBOT_JOINTS + 7 * (i + 1))
+            for i, name in enumerate(scene.bodies)
+        }
+        self._sensor_slice = self._find_sensors()
+        self.arm_target = np.tile(HOME_QPOS, (num_sims, 1))
+        self.gripper_target = np.full(num_sims, FINGER_OPEN)
+        self._heights = {name: BODIES[name].size[2] for name in scene.bodies}
+
+    def _find_sensors(self) -> dict[str, slice]:
+        sensors = (self.model.sensor(i) for i in range(self.model.nsensor))
+        return {s.name: slice(int(s.adr[0]), int(s.adr[0]) + int(s.dim[0])) for s in sensors}
+
+    # Control ----------------------------------------------------------------------------------------------
+
+    def step(self, actions: np.ndarray, ids: np.ndarray) -> np.ndarray:
+        """Advance the simulations `ids` by one control step.
+
+        Args:
+            actions: (len(ids), 7) in physical units, within bounds.
+            ids: (k,) indices of the simulations.
+
+        Returns:
+            (k,) bool, the simulations that diverged; each is back in its state before the step, at rest.
+        """
+        before = self.qpos[ids].copy()
+        start = self.arm_target[ids]
+        goal = self._next_arm_target(start, actions)
+        self.arm_target[ids] = goal
+        self.gripper_target[ids] = np.where(actions[:, 6] > 0.5, FINGER_OPEN, FINGER_CLOSED)
+        self._ctrl[ids, NUM_ARM_JOINTS] = self.gripper_target[ids]
+        broken = np.zeros(self.num_sims, dtype=bool)
+        for k in range(1, RAMP_CHUNKS + 1):
+            self._ctrl[ids, :NUM_ARM_JOINTS] = start + (k / RAMP_CHUNKS) * (goal - start)
+            last = k == RAMP_CHUNKS
+            nstep = SUBSTEPS - (RAMP_CHUNKS - 1) * CHUNK_SUBSTEPS if last else CHUNK_SUBSTEPS
+            broken |= self._advance(ids, nstep)
+        diverged = broken[ids] | self._is_diverged(ids)
+        if diverged.any():
+            self._restore(ids[diverged], before[diverged])
+        return diverged
+
+    def _advance(self, ids: np.ndarray, nstep: int) -> np.ndarray:
+        broken = np.zeros(self.num_sims, dtype=bool)
+        try:
+            self._batch.step(ids, nstep=nstep)
+        except SimulationError as error:
+            broken[error.ids] = True
+        return broken
+
+    def _next_arm_target(self, q: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        p, R, _ = forward_kinematics(q)
+        R = rotation_vector_to_matrix(actions[:, 3:6]) @ R
+        p = np.clip(p + actions[:, :3], EE_LOW, EE_HIGH)
+        # The fingertips' target stays above the table, however the hand is tilted.
+        p[:, 2] = np.maximum(p[:, 2], 0.001 - FINGERTIP_REACH * np.minimum(R[:, 2, 0], 0.0))
+        return inverse_kinematics(q, p, R)
+
+    def _is_diverged(self, ids: np.ndarray) -> np.ndarray:
+        finite = np.isfinite(self.qpos[ids]).all(1) & np.isfinite(self.qvel[ids]).all(1)
+        with np.errstate(invalid="ignore"):
+            return ~finite | (np.abs(self.qvel[ids]).max(1) > MAX_SPEED)
+
+    # Interventions ----------------------------------------------------------------------------------------
+
+    def _restore(self, ids: np.ndarray, qpos: np.ndarray) -> None:
+        """Put the simulations into `qpos` at rest, everything awake, targets where the arm is."""
+        self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.qpos[ids] = qpos
+        self.qvel[ids] = 0.0
+        self.arm_target[ids] = qpos[:, :NUM_ARM_JOINTS]
+        self._ctrl[ids, :NUM_ARM_JOINTS] = self.arm_target[ids]
+        self._ctrl[ids, NUM_ARM_JOINTS] = self.gripper_target[ids]
+        self._batch.forward(ids)
+
+    def place(self, ids: np.ndarray, poses: np.ndarray) -> None:
+        """Put every body of the simulations `ids` at `poses` (k, bodies, 7) and the arm home."""
+        qpos = np.empty((len(ids), self.model.nq))
+        qpos[:, NUM_ROBOT_JOINTS:] = np.asarray(poses).reshape(len(ids), -1)
+        self._home(ids, qpos)
+
+    def send_arm_home(self, ids: np.ndarray) -> None:
+        """Put the arm home with an open gripper; bodies stay, and those that were held fall and settle."""
+        self._home(ids, self.qpos[ids].copy())
+        self.settle(ids)
+
+    def _home(self, ids: np.ndarray, qpos: np.ndarray) -> None:
+        qpos[:, :NUM_ARM_JOINTS] = HOME_QPOS
+        qpos[:, NUM_ARM_JOINTS:NUM_ROBOT_JOINTS] = (FINGER_OPEN, -FINGER_OPEN)
+        self.gripper_target[ids] = FINGER_OPEN
+        self._restore(ids, qpos)
+
+    def move_arm(self, ids: np.ndarray, arm_qpos: np.ndarray) -> None:
+        """Put the arm at joint positions (k, 6) [rad], gripper as it is; bodies stay where they are."""
+        qpos = self.qpos[ids].copy()
+        qpos[:, :NUM_ARM_JOINTS] = arm_qpos
+        self._restore(ids, qpos)
+
+    def move_body(self, ids: np.ndarray, body: str, poses: np.ndarray) -> None:
+        """Put one body at `poses` (k, 7); all else stays where it is."""
+        qpos = self.qpos[ids].copy()
+        arm_target = self.arm_target[ids].copy()
+        qpos[:, self._qpos_slice[body]] = poses
+        self._restore(ids, qpos)
+        self.arm_target[ids] = arm_target
+        self._ctrl[ids, :NUM_ARM_JOINTS] = arm_target
+
+    def settle(self, ids: np.ndarray) -> None:
+        """Let the bodies of the simulations come to rest, the arm holding still.
+
+        One that diverges is put back to where it began, at rest.
+        """
+        before = self.qpos[ids].copy()
+        for _ in range(SETTLE_MAX_CHUNKS):
+            broken = self._advance(ids, SETTLE_CHUNK)
+            diverged = broken[ids] | self._is_diverged(ids)
+            if diverged.any():
+                self._restore(ids[diverged], before[diverged])
+            moving = np.abs(self.qvel[ids, NUM_ROBOT_JOINTS:]).max(1) > SETTLE_SPEED
+            ids, before = ids[moving], before[moving]
+            if not len(ids):
+                return
+
+    # Readings ---------------------------------------------------------------------------------------------
+
+    def end_effector(self) -> tuple[np.ndarray, np.ndarray]:
+        """Measured pose of the end-effector site: p_we (n, 3) [m] and R_we (n, 3, 3)."""
+        p, R, _ = forward_kinematics(self.qpos[:, :NUM_ARM_JOINTS])
+        return p, R
+
+    def target_position(self) -> np.ndarray:
+        """Position of the end effector's target (n, 3) [m]."""
+        return forward_kinematics(self.arm_target)[0]
+
+    def gripper_opening(self) -> np.ndarray:
+        """Opening of the gripper (n,), 0 closed to 1 open."""
+        left = self.qpos[:, NUM_ARM_JOINTS]
+        return np.clip((left - FINGER_CLOSED) / (FINGER_OPEN - FINGER_CLOSED), 0.0, 1.0)
+
+    def body_pose(self, body: str) -> np.ndarray:
+        """Pose of a body (n, 7): position [m] and quaternion (w, x, y, z)."""
+        return self.qpos[:, self._qpos_slice[body]]
+
+    def body_poses(self) -> np.ndarray:
+        """Poses of all bodies (n, bodies, 7), in the scene's order."""
+        return self.qpos[:, NUM_ROBOT_JOINTS:].reshape(self.num_sims, -1, 7)
+
+    def force(self, sensor: str) -> np.ndarray:
+        """Net contact force (n, 3) of a sensor [N], world frame."""
+        return self.sensordata[:, self._sensor_slice[sensor]]
+
+    def is_grasped(self, obj: str) -> np.ndarray:
+        """Both fingers press on the object (n,): at least 0.5 N each, within 85 degrees of the closing axis."""
+        closing_axis = forward_kinematics(self.qpos[:, :NUM_ARM_JOINTS])[1][:, :, 1]
+        grasped = np.ones(self.num_sims, dtype=bool)
+        for side in ("left", "right"):
+            force = self.force(grasp_sensor(side, obj))
+            strength = np.linalg.norm(force, axis=1)
+            along = np.abs((force * closing_axis).sum(1))
+            grasped &= (strength >= GRASP_MIN_FORCE_N) & (along >= np.cos(GRASP_MAX_ANGLE_RAD) * strength)
+        return grasped
+
+    def is_on(self, obj: str, receptacle: str) -> np.ndarray:
+        """The object rests on the receptacle (n,): centres close in the plane, just above it, in contact."""
+        offset = self.body_pose(obj)[:, :3] - self.body_pose(receptacle)[:, :3]
+        reach = max(BODIES[receptacle].size[:2]) / 2 + SUCCESS_XY_MARGIN_M
+        gap = offset[:, 2] - (self._heights[obj] + self._heights[receptacle]) / 2
+        near = np.linalg.norm(offset[:, :2], axis=1) <= reach
+        above = (offset[:, 2] > 0) & (gap <= SUCCESS_MAX_GAP_M)
+        touching = np.linalg.norm(self.force(support_sensor(obj, receptacle)), axis=1) > SUCCESS_MIN_FORCE_N
+        return near & above & touching
+
+    def is_on_table(self, obj: str) -> np.ndarray:
+        """The object rests on the table within reach, touches no receptacle and is not grasped (n,)."""
+        i = self.scene.bodies.index(obj)
+        speed = np.linalg.norm(self.qvel[:, NUM_ROBOT_JOINTS + 6 * i : NUM_ROBOT_JOINTS + 6 * i + 3], axis=1)
+        xy = self.body_pose(obj)[:, :2]
+        on = ((xy >= EE_LOW[:2]) & (xy <= EE_HIGH[:2])).all(1)
+        on &= np.linalg.norm(self.force(support_sensor(obj, "table")), axis=1) > SUCCESS_MIN_FORCE_N
+        for side in ("left", "right"):
+            on &= np.linalg.norm(self.force(grasp_sensor(side, obj)), axis=1) < GRASP_MIN_FORCE_N
+        for receptacle in self.scene.receptacles:
+            on &= np.linalg.norm(self.force(support_sensor(obj, receptacle)), axis=1) <= SUCCESS_MIN_FORCE_N
+        return on & (speed < SETTLE_SPEED)
+
+    def body_rotations(self) -> np.ndarray:
+        """Rotation matrices of all bodies (n, bodies, 3, 3)."""
+        return quaternion_to_matrix(self.body_poses()[..., 3:])
+
+    # State ------------------------------------------------------------------------------------------------
+
+    _STATE_FIELDS = ("qpos", "qvel", "ctrl", "qacc_warmstart", "time")
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Everything that decides the future, as arrays with a leading dimension n.
+
+        Bodies that MuJoCo put to sleep are woken by this call, exactly as `set_state` wakes them, so that a
+        simulation that goes on and one that was loaded stay bit-identical.
+        """
+        state = {name: self._batch.bind(name).copy() for name in self._STATE_FIELDS}
+        state |= {"arm_target": self.arm_target.copy(), "gripper_target": self.gripper_target.copy()}
+        self.set_state(state)
+        return state
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """Continue from a state taken by `get_state`."""
+        self._batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
+        for name in self._STATE_FIELDS:
+            self._batch.bind(name)[:] = state[name]
+        self.arm_target[:] = state["arm_target"]
+        self.gripper_target[:] = state["gripper_target"]
+        self._batch.forward()
+
+
+GRASP_MIN_FORCE_N, GRASP_MAX_ANGLE_RAD = 0.5, np.deg2rad(85)
+SUCCESS_XY_MARGIN_M, SUCCESS_MAX_GAP_M, SUCCESS_MIN_FORCE_N = 0.01, 0.05, 0.03
+"""Grasp and success of the SimplerEnv Bridge tasks."""

@@ -1,0 +1,57 @@
+"""GAE by hand: gamma = 0.5, lambda = 0.5, so that every number is a short binary fraction."""
+
+import numpy as np
+import pytest
+
+from cronos_lerobot.agents.ppo.gae import compute_gae
+
+
+def gae(rewards, values, boundaries, bootstrap):
+    columns = [np.array(c, dtype)[:, None] for c, dtype in ((rewards, float), (values, float), (boundaries, bool))]
+    advantages, returns = compute_gae(*columns, np.array(bootstrap, float)[:, None], gamma=0.5, gae_lambda=0.5)
+    assert advantages.dtype == returns.dtype == np.float32
+    np.testing.assert_allclose(returns, advantages + columns[1], atol=1e-6)
+    return advantages[:, 0].tolist()
+
+
+def test_only_an_update_boundary_at_the_end():
+    # delta_2 = 1 + .5 * 8 - 2 = 3; delta_1 = 0 + .5 * 2 - 4 = -3; delta_0 = 1 + .5 * 4 - 2 = 1
+    # A_2 = 3; A_1 = -3 + .25 * 3 = -2.25; A_0 = 1 + .25 * -2.25 = .4375
+    assert gae([1, 0, 1], [2, 4, 2], [0, 0, 1], [-9, -9, 8]) == [0.4375, -2.25, 3]
+
+
+@pytest.mark.parametrize("kind", ["task switch", "end-effector reset", "scene reset"])
+def test_a_cut_keeps_the_other_side_out(kind):
+    # Row 1 ends a segment; its bootstrap 6 is the value before the switch or reset, row 2 is another world.
+    # delta_2 = 1 + .5 * 8 - 2 = 3; delta_1 = 0 + .5 * 6 - 4 = -1; delta_0 = 1 + .5 * 4 - 2 = 1
+    # A_1 = -1, without .25 * A_2; A_0 = 1 + .25 * -1 = .75
+    assert gae([1, 0, 1], [2, 4, 2], [0, 1, 1], [-9, 6, 8]) == [0.75, -1, 3]
+
+
+def test_divergence_bootstraps_from_the_value_before_it():
+    # There is no o_2 after row 1: its bootstrap is V(o_1) = 4 itself.
+    # delta_1 = 0 + .5 * 4 - 4 = -2; A_0 = 1 + .25 * -2 = .5
+    assert gae([1, 0, 1], [2, 4, 2], [0, 1, 1], [-9, 4, 8]) == [0.5, -2, 3]
+
+
+def test_what_lies_behind_a_cut_does_not_matter():
+    first = gae([1, 0, 1], [2, 4, 2], [0, 1, 1], [0, 6, 8])
+    other = gae([1, 0, 100], [2, 4, -50], [0, 1, 1], [0, 6, 77])
+    assert first[:2] == other[:2]
+    assert first[2] != other[2]
+
+
+def test_bootstraps_inside_a_trace_are_not_read():
+    assert gae([1, 1], [0, 0], [0, 1], [np.nan, 0]) == [1.25, 1]
+
+
+def test_streams_do_not_mix():
+    rewards, values = np.array([[1.0, 0], [0, 0]]), np.zeros((2, 2))
+    boundaries = np.array([[False, True], [True, True]])
+    advantages, _ = compute_gae(rewards, values, boundaries, np.zeros((2, 2)), 0.5, 0.5)
+    assert advantages.tolist() == [[1, 0], [0, 0]]
+
+
+def test_open_end_is_refused():
+    with pytest.raises(ValueError, match=r"streams \[1\]"):
+        compute_gae(*np.zeros((2, 1, 2)), np.array([[True, False]]), np.zeros((1, 2)), 0.99, 0.95)

@@ -1,0 +1,74 @@
+import numpy as np
+import pytest
+
+from cronos_lerobot.agents.base import ActionSample
+from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
+
+U, N = 5, 3
+
+
+def filled(rows=U):
+    buffer = RolloutBuffer(U, N)
+    for t in range(rows):
+        ids = np.arange(N) + 10 * t
+        columns = {
+            "observation.images.front": np.broadcast_to(ids[:, None, None, None], (N, 2, 2, 3)).astype(np.uint8),
+            "observation.state": ids[:, None].astype(np.float32),
+        }
+        sample = ActionSample(
+            np.zeros((N, 7), np.float32), np.tile(ids[:, None], 7), ids.astype(np.float32), 2.0 * ids
+        )
+        boundary = np.full(N, t == rows - 1)
+        buffer.add(columns, [f"task {i}" for i in ids], sample, ids / 2, boundary, ids + 100.0)
+    return buffer
+
+
+@pytest.mark.parametrize("batch_size", [1, 4, 15, 100])
+def test_every_transition_once_per_epoch(batch_size):
+    buffer = filled()
+    rng = np.random.default_rng(0)
+    epochs = [
+        np.concatenate([minibatch.indices for minibatch in buffer.minibatches(batch_size, rng)]) for _ in range(2)
+    ]
+    for indices in epochs:
+        assert sorted(indices) == list(range(U * N))
+    assert not np.array_equal(*epochs)
+
+
+def test_columns_of_a_minibatch_belong_together():
+    buffer = filled()
+    buffer.compute_advantages(0.99, 0.95)
+    for minibatch in buffer.minibatches(4, np.random.default_rng(1)):
+        row, stream = np.divmod(minibatch.indices, N)
+        ids = 10 * row + stream
+        assert minibatch.observation["observation.images.front"].dtype == np.uint8
+        np.testing.assert_array_equal(minibatch.observation["observation.images.front"][:, 0, 0, 0], ids)
+        np.testing.assert_array_equal(minibatch.observation["observation.state"][:, 0], ids)
+        np.testing.assert_array_equal(minibatch.tokens[:, 3], ids)
+        np.testing.assert_array_equal(minibatch.log_prob, ids)
+        np.testing.assert_array_equal(minibatch.value, 2 * ids)
+        assert minibatch.instructions == [f"task {i}" for i in ids]
+        np.testing.assert_allclose(minibatch.return_, minibatch.advantage + minibatch.value, rtol=1e-6)
+        np.testing.assert_array_equal(minibatch.advantage, buffer.advantages[row, stream])
+
+
+def test_normalised_advantages():
+    buffer = filled(rows=4)
+    buffer.compute_advantages(0.99, 0.95)
+    returns = buffer.returns.copy()
+    advantages = buffer.results()["advantages"]
+    buffer.normalize_advantages(advantages.mean(), advantages.std())
+    assert abs(buffer.advantages[:4].mean()) < 1e-6
+    assert buffer.advantages[:4].std() == pytest.approx(1, abs=1e-5)
+    np.testing.assert_array_equal(buffer.returns, returns)
+
+
+def test_full_and_cleared():
+    buffer = filled()
+    assert len(buffer) == U * N
+    one = ActionSample(*(np.zeros((N, 7), np.float32),) * 2, np.zeros(N), np.zeros(N))
+    with pytest.raises(RuntimeError, match="5 rows"):
+        buffer.add({}, [""] * N, one, np.zeros(N), np.zeros(N, bool), np.zeros(N))
+    buffer.clear()
+    assert len(buffer) == 0
+    assert list(buffer.minibatches(4, np.random.default_rng(0))) == []

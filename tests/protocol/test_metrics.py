@@ -1,0 +1,102 @@
+"""D, C and the statistics over seeds, by hand."""
+
+from math import isnan, sqrt
+
+import pytest
+
+from cronos_lerobot.protocol.metrics import interpolate, performance_gap, success_at, summarise
+
+
+def test_gap_is_the_area_above_the_curve():
+    # Trapezoids: 10 * (0.8 + 0.6) / 2 + 30 * (0.6 + 0.2) / 2 = 7 + 12.
+    gap = performance_gap([0, 10, 40], [0.2, 0.4, 0.8])
+    assert (gap.area, gap.length) == (pytest.approx(19), 40)
+    assert gap.normalised == pytest.approx(19 / 40)
+
+
+def test_gap_of_the_optimum_and_of_nothing():
+    assert performance_gap([0, 5], [1, 1]).normalised == 0
+    assert performance_gap([0, 5], [0, 0]).normalised == 1
+
+
+def test_gap_begins_at_the_first_evaluation():
+    # Nothing is assumed of what came before it.
+    assert performance_gap([10, 20], [0.5, 0.5]).length == 10
+
+
+def test_several_evaluations_at_one_number_of_interventions():
+    # From 0 to 10 the curve goes from the last evaluation at 0 (.4) to the first at 10 (.6), from 10 to 20 from
+    # the last at 10 (.8) to .9: 10 * (.6 + .4) / 2 + 10 * (.2 + .1) / 2.
+    x, y = [0, 0, 10, 10, 20], [0.2, 0.4, 0.6, 0.8, 0.9]
+    assert performance_gap(x, y).area == pytest.approx(5 + 1.5)
+    assert interpolate(x, y, [0, 5, 10, 15, 20]).tolist() == pytest.approx([0.4, 0.5, 0.8, 0.85, 0.9])
+
+
+def test_run_that_was_never_reset_has_no_reset_efficiency():
+    gap = performance_gap([0, 0, 0], [0.2, 0.3, 0.4])
+    assert gap.area == 0
+    assert isnan(gap.normalised)
+    assert success_at([0, 0, 0], [0.2, 0.3, 0.4], 0) == 0.4
+
+
+def test_gap_up_to_a_shared_end():
+    x, y = [0, 10, 20], [0.0, 0.5, 1.0]
+    # Up to 15 it ends at .75: 10 * (1 + .5) / 2 + 5 * (.5 + .25) / 2.
+    gap = performance_gap(x, y, up_to=15)
+    assert (gap.area, gap.length) == (pytest.approx(7.5 + 1.875), 15)
+    assert performance_gap(x, y, up_to=20) == performance_gap(x, y)
+    assert isnan(performance_gap(x, y, up_to=21).normalised)
+    # What follows at the end itself is beyond it.
+    assert performance_gap([0, 10, 10, 20], [0.0, 0.5, 0.9, 1.0], up_to=10).area == pytest.approx(7.5)
+
+
+def test_success_is_never_extrapolated():
+    x, y = [100, 200], [0.2, 0.6]
+    assert success_at(x, y, 125) == pytest.approx(0.3)
+    assert isnan(success_at(x, y, 99))
+    assert isnan(success_at(x, y, 201))
+    assert (success_at(x, y, 100), success_at(x, y, 200)) == (0.2, 0.6)
+
+
+def test_curve_must_be_a_curve():
+    with pytest.raises(ValueError, match="must not fall"):
+        performance_gap([10, 0], [0.1, 0.2])
+    with pytest.raises(ValueError, match="at least one"):
+        success_at([], [], 0)
+    with pytest.raises(ValueError, match="as many x as y"):
+        performance_gap([0, 1], [0.1])
+
+
+def test_summary_over_seeds():
+    summary = summarise([0.2, 0.4, 0.9])
+    assert summary is not None
+    assert (summary.mean, summary.n) == (pytest.approx(0.5), 3)
+    # Squares of the deviations: .09 + .01 + .16, over n - 1 = 2.
+    assert summary.std == pytest.approx(sqrt(0.26 / 2))
+    assert str(summary) == "0.500 ± 0.361"
+
+
+def test_bootstrap_interval_of_two_seeds():
+    # Resamples of (0, 1): mean 0 in a quarter of them, 1 in a quarter. 2.5 % and 97.5 % lie there.
+    summary = summarise([0.0, 1.0])
+    assert summary is not None
+    assert summary.ci95 == (0, 1)
+
+
+def test_bootstrap_interval_is_always_the_same_and_about_right():
+    values = [0.3, 0.4, 0.5, 0.55, 0.6, 0.62, 0.7, 0.71, 0.8, 0.9]
+    summary = summarise(values)
+    assert summary is not None
+    assert summary == summarise(values)
+    # The mean of ten: 1.96 * std (ddof 0) / sqrt(10) to either side.
+    half = 1.96 * 0.1733 / sqrt(10)
+    assert summary.ci95 == (pytest.approx(0.608 - half, abs=0.01), pytest.approx(0.608 + half, abs=0.01))
+    assert summarise(values, seed=1).ci95 != summary.ci95
+
+
+def test_one_seed_has_no_spread_and_a_missing_one_no_summary():
+    summary = summarise([0.5])
+    assert summary is not None
+    assert (summary.mean, summary.std, summary.ci95, str(summary)) == (0.5, None, None, "0.500")
+    assert summarise([]) is None
+    assert summarise([0.5, float("nan")]) is None
