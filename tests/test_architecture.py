@@ -1,4 +1,4 @@
-"""Imports point one way: cronos_lerobot -> lerobot_env_cronos; policy packages stand alone."""
+"""Imports point one way: cronos_lerobot -> lerobot_env_cronos; policy packages stand alone; rooms have floors."""
 
 import ast
 from pathlib import Path
@@ -35,6 +35,47 @@ def test_imports_point_one_way(package):
     forbidden = set(PACKAGES) - MAY_IMPORT.get(package, set()) - {package}
     offenders = {path: names & forbidden for path, names in files.items() if names & forbidden}
     assert not offenders
+
+
+FLOORS = {
+    "cronos_lerobot": (
+        "stopwatch", "processes", "provenance", "locks", "agents", "protocol", "data", "film", "evaluation",
+        "training", "report", "experiments", "hub", "scripts", "studies",
+    ),
+    "lerobot_env_cronos": (
+        "statistics", "scene", "benchmark", "simulation", "vector_env", "episodic", "sequential", "config",
+        "__init__", "expert",
+    ),
+}  # fmt: skip
+"""The rooms of a package from the ground up: what a file imports lies in its own room or below it."""
+
+
+def imported_rooms(folder: Path, package: str) -> set[tuple[str, str, str]]:
+    """(file, its room, room it imports) of a package; a room is a folder or file at its root."""
+    found = set()
+    for path in sorted(folder.rglob("*.py")):
+        relative = path.relative_to(folder)
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                names = [f"{node.module}.{alias.name}" for alias in node.names]
+            else:
+                continue
+            rooms = [name.split(".")[1] for name in names if name.startswith(f"{package}.")]
+            # `from package import Name` takes what the package itself exports.
+            rooms = [room for room in rooms if (folder / room).is_dir() or (folder / f"{room}.py").is_file()]
+            found |= {(str(relative), Path(relative.parts[0]).stem, room) for room in rooms}
+    return found
+
+
+@pytest.mark.parametrize("package", FLOORS)
+def test_no_room_imports_from_a_floor_above(package):
+    floor = {room: number for number, room in enumerate(FLOORS[package])}
+    imports = imported_rooms(PACKAGES[package], package)
+    assert len(imports) > 20
+    upwards = {(path, target) for path, room, target in imports if floor[target] > floor[room]}
+    assert not upwards
 
 
 def test_distribution_names_are_what_lerobot_discovers():

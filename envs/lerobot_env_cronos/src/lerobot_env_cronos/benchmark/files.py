@@ -19,8 +19,8 @@ import pyarrow.parquet as pq
 from lerobot_env_cronos.benchmark.benchmark import SUITES, Benchmark, EpisodeGroup
 from lerobot_env_cronos.benchmark.configurations import SPLITS, VERSION
 from lerobot_env_cronos.benchmark.registry import gymnasium_id
+from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW
 from lerobot_env_cronos.scene.scenes import SCENES, STEPS_PER_TASK, Scene, Task
-from lerobot_env_cronos.simulation.simulation import EE_HIGH, EE_LOW
 
 CONFIGURATIONS = "configurations"
 CONFIGS = (CONFIGURATIONS, *SUITES)

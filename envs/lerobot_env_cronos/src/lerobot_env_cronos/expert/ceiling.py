@@ -19,8 +19,8 @@ import numpy as np
 
 from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS, SPLITS
 from lerobot_env_cronos.expert.expert import ScriptedExpert
+from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW
 from lerobot_env_cronos.scene.scenes import STEPS_PER_TASK, Task
-from lerobot_env_cronos.simulation.simulation import EE_HIGH, EE_LOW
 from lerobot_env_cronos.statistics import wilson_interval
 from lerobot_env_cronos.vector_env import CronosVectorEnv
 

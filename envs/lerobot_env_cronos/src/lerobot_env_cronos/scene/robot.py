@@ -21,6 +21,9 @@ EE_SITE = "end_effector"
 EE_OFFSET = np.array([0.093, 0.0, 0.0])
 """The URDF's ee_gripper_link in the frame of gripper_link: between the finger pads [m]."""
 
+EE_LOW, EE_HIGH = np.array([0.10, -0.30, 0.0]), np.array([0.50, 0.30, 0.35])
+"""The workspace: the box that the end effector's target is clamped to [m]."""
+
 FINGERTIP_REACH = 0.031
 """How far the fingertips extend beyond the end-effector site along the fingers [m]."""
 

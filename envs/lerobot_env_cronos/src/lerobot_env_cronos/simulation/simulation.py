@@ -10,7 +10,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from lerobot_env_cronos.scene.model import SUBSTEPS, build_model, grasp_sensor, support_sensor
-from lerobot_env_cronos.scene.robot import FINGER_CLOSED, FINGER_OPEN, FINGERTIP_REACH, HOME_QPOS
+from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, FINGER_CLOSED, FINGER_OPEN, FINGERTIP_REACH, HOME_QPOS
 from lerobot_env_cronos.scene.scenes import BODIES, Scene
 from lerobot_env_cronos.simulation.kinematics import (
     forward_kinematics,
@@ -23,9 +23,6 @@ ACTION_LOW = np.array([-0.028727253, -0.0417035, -0.026093859, -0.08092105, -0.0
 ACTION_HIGH = np.array([0.028309678, 0.040855255, 0.040161587, 0.0819204776, 0.0779285, 0.203825745, 1.0])
 """q01 and q99 of `bridge_orig`, the range that OpenVLA's action tokens span: m, rad, gripper (1 open)."""
 ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
-
-EE_LOW, EE_HIGH = np.array([0.10, -0.30, 0.0]), np.array([0.50, 0.30, 0.35])
-"""Box that the end effector's target is clamped to; the fingertips stay above the table [m]."""
 
 RAMP_CHUNKS, CHUNK_SUBSTEPS = 8, 4
 """The joint targets move linearly over 8 x 4 of the 40 substeps. Without the ramp, grasped objects slip."""

@@ -10,7 +10,8 @@ import numpy as np
 
 from lerobot_env_cronos.benchmark.configurations import footprint_corners, sample_place
 from lerobot_env_cronos.scene.model import camera_axes
-from lerobot_env_cronos.simulation.simulation import EE_HIGH, EE_LOW, Simulation
+from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW
+from lerobot_env_cronos.simulation.simulation import Simulation
 
 CAMERA = "front"
 """The view that decides whether a body is seen; a square picture, whatever the observation."""
