@@ -15,9 +15,10 @@ import draccus
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs.configs import EnvConfig
 from lerobot_env_cronos import Benchmark, CronosEnvConfig, load_benchmark
-from lerobot_env_cronos.benchmark import configurations, orderings
+from lerobot_env_cronos.benchmark import orderings
 from lerobot_env_cronos.benchmark.benchmark import SUITES
 from lerobot_env_cronos.benchmark.configurations import SPLITS
+from lerobot_env_cronos.benchmark.version import VERSION
 
 from cronos_lerobot.evaluation.policy_env import observations_of, trained_scene
 
@@ -202,7 +203,7 @@ class CronosEvalConfig:
         return own | {
             "policy": EXPERT if self.policy is None else fingerprint(self.policy),
             "env": {name: getattr(env, name) for name in decisive},
-            "versions": {"configurations": configurations.VERSION, "orderings": orderings.VERSION},
+            "versions": {"environment": VERSION, "orderings": orderings.VERSION},
             "n_episodes": self.num_configurations,
             "orderings": self.num_orderings,
             "temperature": self.eval.temperature,

@@ -14,9 +14,9 @@ from lerobot_env_cronos.benchmark.files import BenchmarkError, read_benchmark, w
 STATE = "environment_state_agent_pos"
 # A change of these is another benchmark: a new version of the environment id.
 FINGERPRINTS = {
-    "kitchen_2x2": "d19bf97c6057eea2",
-    "kitchen_3x3": "cb82151da3598957",
-    "playroom_2x2": "7dd8c2c11dfe1c51",
+    "kitchen_2x2": "b479ae3ebc7aa7f0",
+    "kitchen_3x3": "311ac17d78f74c45",
+    "playroom_2x2": "ca43d617cef8d629",
 }
 
 
@@ -107,13 +107,14 @@ ROWS = [
     ("independent/train", 1, {"object": "spoon"}, r"row 1: unknown object 'spoon'; valid ones: \['toy bear', "),
     ("independent/train", 1, {"receptacle": "plate"}, r"row 1: unknown receptacle 'plate'; valid ones: \['newsp"),
     ("independent/train", 1, {"object": "plastic bottle"}, r"row 1: instruction is 'put the toy bear .*'plastic "),
-    ("sequential/train", 5, {"environment": "lerobot_env_cronos/playroom_2x2-v1"},
-     r"sequential/train, row 5: environment .*-v1 is of version 1; this package has version 0"),
-    ("configurations/train", 1, {"environment": "lerobot_env_cronos/attic_9x9-v0"},
+    ("sequential/train", 5, {"environment": "lerobot_env_cronos/playroom_2x2-v0"},
+     r"me/mine@abc, sequential/train, row 5, was made with lerobot_env_cronos/playroom_2x2-v0; this is version 1,"
+     r" whose physics and success test differ: publish it anew, or use it with cronos-lerobot 0.1"),
+    ("configurations/train", 1, {"environment": "lerobot_env_cronos/attic_9x9-v1"},
      r"configurations/train, row 1: unknown scene 'attic_9x9'; valid scenes: \['kitchen_2x2'"),
-    ("configurations/train", 1, {"environment": "lerobot_env_cronos/kitchen_2x2-v0"},
-     r"row 1: environment is lerobot_env_cronos/kitchen_2x2-v0, other rows have .*playroom_2x2-v0"),
-    ("configurations/train", 0, {"environment": "playroom"}, r"row 0: environment must be like .*got 'playroom'"),
+    ("configurations/train", 1, {"environment": "lerobot_env_cronos/kitchen_2x2-v1"},
+     r"row 1: environment is lerobot_env_cronos/kitchen_2x2-v1, other rows have .*playroom_2x2-v1"),
+    ("configurations/train", 0, {"environment": "playroom"}, r"row 0, does not say which version of the environ"),
     ("configurations/train", 2, {"configuration": 7}, r"row 2: configuration must be 2, .*got 7"),
     ("configurations/held_out", 2, {"toy_bear_x_m": 0.9}, r"held_out, row 2: the toy bear at \[0.9, .*out of the"),
     ("configurations/train", 2, {"carpet_z_m": -0.2}, r"row 2: the carpet must be between the table .*z = -0.2 m"),

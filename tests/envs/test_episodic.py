@@ -10,7 +10,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.factory import make_env, make_env_config
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot_env_cronos import SCENES, CronosEnvConfig, IndependentVectorEnv, get_scene
+from lerobot_env_cronos import SCENES, CronosEnvConfig, IndependentVectorEnv, get_scene, gymnasium_id
 from lerobot_env_cronos.benchmark.configurations import load_configurations
 
 STATE = "environment_state_agent_pos"
@@ -20,7 +20,7 @@ TASK = get_scene("kitchen_2x2").tasks[0]
 @pytest.mark.parametrize("obs_type", ["pixels_agent_pos", STATE])
 @pytest.mark.parametrize("scene", SCENES)
 def test_gymnasium_checker_has_no_complaint(scene, obs_type):
-    env = gym.make(f"lerobot_env_cronos/{scene}-v0", obs_type=obs_type, render_mode="rgb_array")
+    env = gym.make(gymnasium_id(scene), obs_type=obs_type, render_mode="rgb_array")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # Actions are in metres and radians, on purpose.

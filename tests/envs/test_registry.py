@@ -53,7 +53,7 @@ def test_a_registered_scene_is_usable_by_name():
     observation, _ = envs[1].reset(seed=[3, 4])
     assert observation["environment_state"].shape == (2, 36)
     assert envs[1].call("task_description") == ("put the ketchup bottle on the blue coaster",) * 2
-    env = gym.make("lerobot_env_cronos/study_2x1-v0", obs_type=STATE, task="put the red block on the blue coaster")
+    env = gym.make("lerobot_env_cronos/study_2x1-v1", obs_type=STATE, task="put the red block on the blue coaster")
     assert env.reset(seed=0)[1]["task"] == "put the red block on the blue coaster"
 
 

@@ -5,7 +5,8 @@ from lerobot_env_cronos.simulation import gl as gl  # isort: skip  # chooses Ope
 from lerobot_env_cronos.benchmark.benchmark import Benchmark, EpisodeGroup
 from lerobot_env_cronos.benchmark.load import load_benchmark
 from lerobot_env_cronos.benchmark.orderings import load_orderings
-from lerobot_env_cronos.benchmark.registry import gymnasium_id, register_gymnasium, register_scene
+from lerobot_env_cronos.benchmark.registry import register_gymnasium, register_scene
+from lerobot_env_cronos.benchmark.version import VERSION, check_environment_id, gymnasium_id
 from lerobot_env_cronos.config import CronosEnvConfig
 from lerobot_env_cronos.episodic import CronosEnv, IndependentVectorEnv
 from lerobot_env_cronos.scene.scenes import CONTROL_HZ, SCENES, STEPS_PER_TASK, Body, Scene, Task, get_scene
@@ -18,6 +19,7 @@ __all__ = [
     "CONTROL_HZ",
     "SCENES",
     "STEPS_PER_TASK",
+    "VERSION",
     "Benchmark",
     "Body",
     "CronosEnv",
@@ -28,6 +30,7 @@ __all__ = [
     "Scene",
     "SequentialVectorEnv",
     "Task",
+    "check_environment_id",
     "get_scene",
     "gymnasium_id",
     "load_benchmark",

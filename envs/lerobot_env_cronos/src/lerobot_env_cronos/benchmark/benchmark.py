@@ -20,6 +20,7 @@ from lerobot_env_cronos.benchmark.configurations import (
     sample_configuration,
 )
 from lerobot_env_cronos.benchmark.orderings import load_orderings
+from lerobot_env_cronos.benchmark.version import gymnasium_id
 from lerobot_env_cronos.scene.scenes import BODIES, STEPS_PER_TASK, Scene, Task, get_scene
 
 SUITES = ("independent", "sequential")
@@ -70,9 +71,9 @@ class Benchmark:
 
     @property
     def fingerprint(self) -> str:
-        """A hash of everything that decides a result here: bodies, poses, tasks, chains; not of `source`."""
+        """A hash of everything that decides a result: version, bodies, poses, tasks, chains; not `source`."""
         content = {
-            "scene": self.scene.name,
+            "environment": gymnasium_id(self.scene.name),
             "bodies": [asdict(BODIES[name]) for name in self.scene.bodies],
             "window_steps": STEPS_PER_TASK,
             "episodes": {

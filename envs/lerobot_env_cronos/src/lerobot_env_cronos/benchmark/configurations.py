@@ -17,8 +17,8 @@ from lerobot_env_cronos.scene.scenes import BODIES, Scene, get_scene
 
 SPLITS = ("train", "held_out")
 NUM_CONFIGURATIONS = 64
-VERSION = 0
-"""Version of the configurations and of the dynamics, as in the environment id `...-v0`."""
+POSES_VERSION = 0
+"""Of the frozen poses. Version 1 of the environments has those of version 0, under other physics."""
 
 CLEARANCE_M = 0.015
 """Smallest gap between the footprints of two bodies [m]."""
@@ -71,9 +71,11 @@ def _load_splits(scene: Scene, path: Path | None) -> dict[str, np.ndarray]:
 
 def _check_content(scene: Scene, content: dict, source: object) -> None:
     version, bodies, splits = (content.get(key) for key in ("version", "bodies", "splits"))
-    if tuple(bodies or ()) != scene.bodies or version != VERSION:
+    if tuple(bodies or ()) != scene.bodies or version != POSES_VERSION:
         found = f"v{version} of bodies {bodies}"
-        raise ValueError(f"{source} is {found}; {scene.name} needs v{VERSION} of bodies {list(scene.bodies)}")
+        raise ValueError(
+            f"{source} is {found}; {scene.name} needs v{POSES_VERSION} of bodies {list(scene.bodies)}"
+        )
     shape = (NUM_CONFIGURATIONS, len(scene.bodies), 7)
     for split in SPLITS:
         if np.shape((splits or {}).get(split, ())) != shape:
@@ -153,7 +155,7 @@ def _generate(scene: Scene, seed: int) -> dict:
         split: [pose.tolist() for pose in drawn[i * NUM_CONFIGURATIONS : (i + 1) * NUM_CONFIGURATIONS]]
         for i, split in enumerate(SPLITS)
     }
-    return {"scene": scene.name, "version": VERSION, "seed": seed, "bodies": scene.bodies, "splits": splits}
+    return {"scene": scene.name, "version": POSES_VERSION, "seed": seed, "bodies": scene.bodies, "splits": splits}
 
 
 def write_configurations(scene_name: str, folder: Path, seed: int = SEED) -> Path:

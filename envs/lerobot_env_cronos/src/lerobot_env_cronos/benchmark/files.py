@@ -7,7 +7,6 @@ sequential/{train,held_out}.parquet       one row for each chain
 Files of several parts (`train-00000-of-00002.parquet`), further columns and further files are fine.
 """
 
-import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_env_cronos.benchmark.benchmark import SUITES, Benchmark, EpisodeGroup
-from lerobot_env_cronos.benchmark.configurations import SPLITS, VERSION
-from lerobot_env_cronos.benchmark.registry import gymnasium_id
+from lerobot_env_cronos.benchmark.configurations import SPLITS
+from lerobot_env_cronos.benchmark.version import check_environment_id, gymnasium_id
 from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW
 from lerobot_env_cronos.scene.scenes import SCENES, STEPS_PER_TASK, Scene, Task
 
@@ -27,8 +26,6 @@ CONFIGS = (CONFIGURATIONS, *SUITES)
 """The dataset's configs, in the Hub's sense of the word."""
 POSE = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 """Suffixes of the columns of a body: position [m] and quaternion."""
-
-ENVIRONMENT_PATTERN = re.compile(r"lerobot_env_cronos/(?P<scene>[a-z0-9_]+)-v(?P<version>\d+)")
 
 _INTEGERS = ("configuration", "window_steps", "episode", "task", "chain", "ordering")
 _STRINGS = ("environment", "instruction", "object", "receptacle")
@@ -215,21 +212,16 @@ def _find_scene(tables: dict[tuple[str, str], _Table]) -> Scene:
     first: str | None = None
     for table in tables.values():
         for i, environment in enumerate(table.column("environment", str)):
-            match = ENVIRONMENT_PATTERN.fullmatch(environment)
-            if match is None:
-                raise table.fail(i, f"environment must be like {gymnasium_id('kitchen_2x2')}, got {environment!r}")
-            if int(match["version"]) != VERSION:
-                why = f"environment {environment} is of version {match['version']}"
-                raise table.fail(i, f"{why}; this package has version {VERSION}")
-            if match["scene"] not in SCENES:
-                raise table.fail(i, f"unknown scene {match['scene']!r}; valid scenes: {sorted(SCENES)}")
+            try:
+                scene = check_environment_id(environment, f"{table.where}, row {i},", "publish it anew")
+            except ValueError as error:
+                raise BenchmarkError(str(error)) from None
+            if scene not in SCENES:
+                raise table.fail(i, f"unknown scene {scene!r}; valid scenes: {sorted(SCENES)}")
             first = first or environment
             if environment != first:
                 raise table.fail(i, f"environment is {environment}, other rows have {first}")
-    assert first is not None
-    match = ENVIRONMENT_PATTERN.fullmatch(first)
-    assert match is not None
-    return SCENES[match["scene"]]
+    return SCENES[scene]
 
 
 def _read_poses(table: _Table, scene: Scene) -> np.ndarray:

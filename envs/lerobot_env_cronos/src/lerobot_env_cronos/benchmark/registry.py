@@ -7,6 +7,7 @@ from pathlib import Path
 import gymnasium as gym
 
 from lerobot_env_cronos.benchmark.configurations import set_configurations_file
+from lerobot_env_cronos.benchmark.version import gymnasium_id
 from lerobot_env_cronos.scene.bodies import SHAPES
 from lerobot_env_cronos.scene.scenes import BODIES, SCENES, Body, Scene
 from lerobot_env_cronos.scene.visuals.objects import LOOKS
@@ -59,11 +60,6 @@ def _check(scene: Scene, new_bodies: dict[str, Body]) -> None:
     for name in scene.bodies:
         if name not in BODIES and name not in new_bodies:
             raise ValueError(f"unknown body {name!r}; valid bodies: {sorted(BODIES | new_bodies)}")
-
-
-def gymnasium_id(scene: str) -> str:
-    """Gymnasium id of a scene's single-environment form."""
-    return f"lerobot_env_cronos/{scene}-v0"
 
 
 def register_gymnasium() -> None:
