@@ -1,0 +1,80 @@
+"""One `error:` line for what a user got wrong, the same in every command."""
+
+from __future__ import annotations
+
+import io
+import sys
+from argparse import ArgumentError
+from collections.abc import Generator
+from contextlib import contextmanager, redirect_stderr
+from typing import Any, NoReturn
+
+from draccus.utils import ParsingError
+from lerobot.configs import parser
+from lerobot.configs.parser import PluginLoadError
+from safetensors import SafetensorError
+
+USER_ERRORS = (ValueError, OSError, ParsingError, ArgumentError, PluginLoadError, SafetensorError)
+"""What a wrong flag, a missing file or a damaged one raises. Any other error is a bug and shows its traceback."""
+
+
+@contextmanager
+def error_line(*more: type[Exception]) -> Generator[None]:
+    """End the program with status 1 and one line, `error: <what is wrong>`, in place of a traceback.
+
+    A context manager and a decorator. It belongs around what reads flags and files, not around the work itself,
+    whose errors are bugs.
+
+    Args:
+        more: errors that are the user's here, beside USER_ERRORS.
+    """
+    try:
+        yield
+    except (*USER_ERRORS, *more) as error:
+        stop(error)
+
+
+def stop(error: Exception | str) -> NoReturn:
+    """End the program with status 1 and `error: <reason>` on one line."""
+    sys.exit(f"error: {reason(error)}")
+
+
+def reason(error: Exception | str) -> str:
+    """What an error says, on one line; draccus hides the reason in the cause."""
+    if isinstance(error, ParsingError) and error.__cause__ is not None:
+        return reason(error.__cause__)  # ty: ignore[invalid-argument-type]
+    text = " ".join(line.strip() for line in str(error).splitlines() if line.strip())
+    return text or type(error).__name__
+
+
+def parse_command_line(config_class: type[Any]) -> Any:
+    """Return the config that the command line describes, read as `lerobot-train` reads it.
+
+    `--<field>.path`, `--config_path` and `--<field>.discover_packages_path` are understood. An unknown flag ends
+    the program with status 2 and one line. Errors are those of USER_ERRORS, so it stands within `error_line`.
+    """
+
+    def keep(config: Any) -> Any:
+        return config
+
+    keep.__annotations__["config"] = config_class
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            config = parser.wrap()(keep)()  # ty: ignore[missing-argument]  (it reads the command line)
+    except ParsingError:
+        # What configs log, because draccus drops the reason of an error, `reason` finds without it.
+        raise
+    except SystemExit as exit_:
+        _, _, wrong = said.getvalue().rpartition(": error: ")
+        if exit_.code != 2 or not wrong:
+            sys.stderr.write(said.getvalue())
+            raise
+        # argparse prints all flags before it.
+        sys.stderr.write(f"error: {reason(wrong)}; --help lists the flags\n")
+        raise
+    except BaseException:
+        sys.stderr.write(said.getvalue())
+        raise
+    sys.stderr.write(said.getvalue())
+    return config

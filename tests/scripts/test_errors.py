@@ -1,0 +1,63 @@
+"""What a user got wrong is one line, whichever library found it."""
+
+import sys
+from dataclasses import dataclass, field
+
+import pytest
+
+from cronos_lerobot.scripts.errors import error_line, parse_command_line, reason
+
+
+@dataclass
+class Inner:
+    size: int = 1
+
+    def __post_init__(self):
+        if self.size < 1:
+            raise ValueError(f"inner.size must be >= 1,\n  got {self.size}.")
+
+
+@dataclass
+class Config:
+    name: str = "a"
+    inner: Inner = field(default_factory=Inner)
+
+
+def parse(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["command", *arguments])
+    with error_line():
+        return parse_command_line(Config)
+
+
+def test_a_right_command_line_is_read(monkeypatch):
+    assert parse(monkeypatch, "--name=b", "--inner.size=3") == Config("b", Inner(3))
+
+
+def test_the_reason_that_draccus_hides_is_the_line(monkeypatch):
+    with pytest.raises(SystemExit, match=r"^error: inner\.size must be >= 1, got 0\.$"):
+        parse(monkeypatch, "--inner.size=0")
+
+
+def test_an_unknown_flag_is_one_line_and_status_2(monkeypatch, capsys):
+    with pytest.raises(SystemExit) as ended:
+        parse(monkeypatch, "--nmae=b")
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == "error: unrecognized arguments: --nmae=b; --help lists the flags\n"
+
+
+def test_a_value_of_another_type_is_one_line(monkeypatch, capsys):
+    with pytest.raises(SystemExit) as ended:
+        parse(monkeypatch, "--inner.size=big")
+    assert ended.value.code == 1
+    assert capsys.readouterr().err == "error: `inner.size`: Couldn't parse 'big' into an int\n"
+
+
+def test_bugs_keep_their_traceback():
+    with pytest.raises(ZeroDivisionError), error_line():
+        1 / 0  # noqa: B018
+    with pytest.raises(SystemExit, match=r"^error: division by zero$"), error_line(ZeroDivisionError):
+        1 / 0  # noqa: B018
+
+
+def test_an_error_that_says_nothing_is_named():
+    assert reason(FileNotFoundError()) == "FileNotFoundError"
