@@ -1,5 +1,5 @@
 # `make demo` and `make test` set everything up by themselves; `make help` lists the rest.
-# They need Python 3.12 with pip, make, and on Debian or Ubuntu root (or sudo) for three OpenGL packages.
+# They need Python 3.12 with pip, make, and on Debian or Ubuntu root (or sudo) for three OpenGL packages and FFmpeg.
 
 ifndef PYTHON
 # The first Python 3.12 that has pip: that of an active virtual environment may have none.
@@ -22,7 +22,7 @@ $(UV):
 setup: system $(UV) ## Install the system packages and the locked Python environment
 	$(UV) sync --frozen --python $(PYTHON)
 
-system: ## Install what headless rendering needs (EGL and software OpenGL)
+system: ## Install EGL, software OpenGL, and FFmpeg to read videos
 	@sh .ci/system-packages
 
 demo: setup ## Record, clone, fine-tune without resets, evaluate, report: 10 minutes on 2 cores

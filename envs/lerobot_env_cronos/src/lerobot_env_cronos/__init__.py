@@ -9,11 +9,13 @@ from lerobot_env_cronos.benchmark.registry import register_gymnasium, register_s
 from lerobot_env_cronos.benchmark.version import VERSION, check_environment_id, gymnasium_id
 from lerobot_env_cronos.config import CronosEnvConfig
 from lerobot_env_cronos.episodic import CronosEnv, IndependentVectorEnv
+from lerobot_env_cronos.lerobot_log import shorten_video_backend_warning
 from lerobot_env_cronos.scene.scenes import CONTROL_HZ, SCENES, STEPS_PER_TASK, Body, Scene, Task, get_scene
 from lerobot_env_cronos.sequential import SequentialVectorEnv
 from lerobot_env_cronos.vector_env import CronosVectorEnv
 
 register_gymnasium()
+shorten_video_backend_warning()
 
 __all__ = [
     "CONTROL_HZ",
