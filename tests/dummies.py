@@ -9,6 +9,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import make_policy_processor_pipelines
+from lerobot_env_cronos import EpisodeGroup, SequentialVectorEnv
 
 NUM_BINS = 3
 
@@ -25,6 +26,7 @@ class DummyTask:
 
 TASKS = (DummyTask(1.0, "a"), DummyTask(-1.0, "a"), DummyTask(2.0, "b"), DummyTask(-2.0, "b"))
 RESET_TASKS = (DummyTask(0.0, "a"), DummyTask(0.5, "b"))
+EPISODES = tuple(EpisodeGroup(i, (task,), tuple(range(64))) for i, task in enumerate(TASKS))
 
 
 class DummyEnv:
@@ -47,6 +49,22 @@ class DummyEnv:
         self.t = 0
         self.diverge_at = diverge_at or set()
         self.calls: list = []
+        self.benchmark = SimpleNamespace(groups=lambda suite, split: EPISODES)
+        self.split, self.advance, self.window, self._sends_arm_home = "train", "window", 80, False
+        self._all, self._orderings = np.arange(num_envs), [TASKS[:1]] * num_envs
+        self.done, self._is_complete = np.ones(num_envs, bool), np.zeros(num_envs, bool)
+        self.chain_length, self.position, self._elapsed = (np.zeros(num_envs, int) for _ in range(3))
+
+    # An evaluation's chains, with the bookkeeping of the real environments.
+    start, apply, _begin_next_task = (
+        SequentialVectorEnv.start,
+        SequentialVectorEnv.apply,
+        SequentialVectorEnv._begin_next_task,
+    )
+
+    @property
+    def instructions(self):
+        return [task.instruction for task in self.tasks]
 
     def step(self, actions):
         self.calls.append("step")
@@ -66,6 +84,10 @@ class DummyEnv:
     @property
     def is_success(self):
         return np.abs(self.x - [task.goal for task in self.tasks]) < 0.3
+
+    @property
+    def is_grasped(self):
+        return np.zeros(self.num_envs, bool)
 
     def observe(self, ids=None):
         self.calls.append("observe")

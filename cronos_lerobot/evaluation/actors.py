@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from contextlib import AbstractContextManager, nullcontext
+from copy import copy
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,7 +15,7 @@ from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 
 from cronos_lerobot.agents.base import TrainablePolicy
-from cronos_lerobot.agents.processing import PolicyProcessors, make_processors, observation_columns
+from cronos_lerobot.agents.processing import PolicyProcessors, observation_columns
 
 
 class Actor(Protocol):
@@ -97,10 +98,9 @@ class SelectingPolicy:
     is_memoryless = False
 
     def __init__(self, policy: Any, processors: PolicyProcessors, env_processors: tuple[Any, Any]) -> None:
-        self._policy, self._processors = policy.eval(), processors
         before, self._after_policy = env_processors
-        policy_preprocessor = processors.preprocessor
-        self._processors.preprocessor = lambda batch: policy_preprocessor(before(batch))
+        self._policy, self._processors = policy.eval(), copy(processors)
+        self._processors.preprocessor = lambda batch: processors.preprocessor(before(batch))
         self._autocast = _autocast(policy, processors)
 
     def seed(self, seed: int) -> None:
@@ -146,13 +146,23 @@ class ExpertActor:
 
 
 def make_actor(
-    policy: Any, processors: tuple[Any, Any], temperature: float, env_processors: tuple[Any, Any]
+    policy: Any, processors: PolicyProcessors, temperature: float, env_processors: tuple[Any, Any] | None = None
 ) -> SamplingPolicy | SelectingPolicy:
-    """Return the actor for a LeRobot policy, with its (pre-, postprocessor) and the environment's."""
-    wrapped = make_processors(policy, *processors)
+    """Return the actor for a LeRobot policy on its device.
+
+    Args:
+        policy: that of the actions.
+        processors: the policy's.
+        temperature: of the sampling, if the policy has one (`sample_actions`).
+        env_processors: LeRobot's processors between environment and policy, (before, after), if any.
+    """
     if isinstance(policy, TrainablePolicy):
-        return SamplingPolicy(policy, wrapped, temperature)
-    return SelectingPolicy(policy, wrapped, env_processors)
+        return SamplingPolicy(policy, processors, temperature)
+    return SelectingPolicy(policy, processors, env_processors or (_as_it_is, _as_it_is))
+
+
+def _as_it_is(batch: Any) -> Any:
+    return batch
 
 
 def _autocast(policy: Any, processors: PolicyProcessors) -> Any:

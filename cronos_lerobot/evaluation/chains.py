@@ -49,7 +49,12 @@ class ChainResult:
     """Tasks completed; the first that failed is the one after them."""
     steps: int
     """Control steps."""
-    trajectory: Trajectory
+    trajectory: Trajectory | None = None
+    """If the runner keeps them."""
+    found_complete: tuple[int, ...] = ()
+    """Positions of completed tasks that were complete when they were given."""
+    never_grasped: tuple[int, ...] = ()
+    """Positions of the other completed tasks whose object was in no grasp from the task's start to its success."""
 
     @property
     def is_success(self) -> bool:
@@ -83,22 +88,37 @@ class _Run:
     index: int
     chain: Chain
     noise: np.ndarray
+    steps: int = 0
     qpos: list[np.ndarray] = field(default_factory=list)
-    position: list[int] = field(default_factory=list)
-    is_complete: list[bool] = field(default_factory=list)
+    position: list[int] = field(default_factory=lambda: [0])
+    is_complete: list[bool] = field(default_factory=lambda: [False])
+    found_complete: list[int] = field(default_factory=list)
+    never_grasped: list[int] = field(default_factory=list)
+    _was_found: bool = False
+    _was_grasped: bool = False
 
-    def record(self, qpos: np.ndarray, position: int, is_complete: bool) -> None:
-        self.qpos.append(qpos.astype(np.float32))
+    def begin_task(self, is_complete: bool, is_grasped: bool) -> None:
+        """Note how the task at hand was found."""
+        self._was_found, self._was_grasped = is_complete, is_grasped
+
+    def record(self, position: int, is_success: bool, is_grasped: bool) -> None:
+        """Note a step of task `position`; `is_success` at most once for each task."""
+        was_complete = self.is_complete[-1] and self.position[-1] == position
+        self.steps += 1
         self.position.append(position)
-        self.is_complete.append(is_complete)
-
-    @property
-    def steps(self) -> int:
-        return len(self.qpos) - 1
+        self.is_complete.append(is_success or was_complete)
+        self._was_grasped |= is_grasped
+        if is_success and self._was_found:
+            self.found_complete.append(position)
+        elif is_success and not self._was_grasped:
+            self.never_grasped.append(position)
 
     def result(self, length: int) -> ChainResult:
-        trajectory = Trajectory(np.stack(self.qpos), np.array(self.position), np.array(self.is_complete))
-        return ChainResult(self.chain, length, self.steps, trajectory)
+        trajectory = None
+        if self.qpos:
+            trajectory = Trajectory(np.stack(self.qpos), np.array(self.position), np.array(self.is_complete))
+        kinds = tuple(self.found_complete), tuple(self.never_grasped)
+        return ChainResult(self.chain, length, self.steps, trajectory, *kinds)
 
 
 class ChainRunner:
@@ -107,10 +127,12 @@ class ChainRunner:
     Args:
         env: the environments; what it decides (window, advance, split, ...) holds for all chains.
         actor: chooses the actions.
+        keeps_states: return trajectories, from which videos can be drawn.
     """
 
-    def __init__(self, env: SequentialVectorEnv, actor: Actor) -> None:
+    def __init__(self, env: SequentialVectorEnv, actor: Actor, *, keeps_states: bool = True) -> None:
         self.env, self.actor = env, actor
+        self._keeps_states = keeps_states
         self._everyone = np.arange(env.num_envs)
         self._runs: dict[int, _Run] = {}
         self._results: dict[int, ChainResult] = {}
@@ -154,8 +176,16 @@ class ChainRunner:
         self.env.start(free, tasks, np.array([chain.configuration for _, chain in started]))
         for i, (index, chain) in zip(free, started, strict=True):
             self._runs[int(i)] = _Run(index, chain, noise(chain))
-            self._runs[int(i)].record(self.env.simulation.qpos[i], 0, False)
+            self._begin_task(int(i))
+            self._keep_state(int(i))
         return free
+
+    def _begin_task(self, i: int) -> None:
+        self._runs[i].begin_task(bool(self.env.is_success[i]), bool(self.env.is_grasped[i]))
+
+    def _keep_state(self, i: int) -> None:
+        if self._keeps_states:
+            self._runs[i].qpos.append(self.env.simulation.qpos[i].astype(np.float32))
 
     def _choose(self, running: np.ndarray) -> np.ndarray:
         """Actions (n, 7), zero for those that are not running."""
@@ -167,7 +197,8 @@ class ChainRunner:
         uniform = np.zeros((len(ids), len(ACTION_NAMES)), np.float32)
         for row, i in enumerate(ids):
             if not env.done[i]:
-                uniform[row] = self._runs[int(i)].noise[self._runs[int(i)].steps]
+                run = self._runs[int(i)]
+                uniform[row] = run.noise[run.steps]
         instructions = env.instructions
         actions = np.zeros((env.num_envs, len(ACTION_NAMES)))
         actions[ids] = self.actor.act(observation, [instructions[i] for i in ids], uniform, ids)
@@ -178,9 +209,10 @@ class ChainRunner:
         ended = []
         for i in map(int, running):
             run = self._runs[i]
-            position = int(step.position[i])
-            was_complete = run.is_complete[-1] and run.position[-1] == position
-            run.record(self.env.simulation.qpos[i], position, bool(step.task_success[i]) or was_complete)
+            run.record(int(step.position[i]), bool(step.task_success[i]), bool(step.is_grasped[i]))
+            self._keep_state(i)
+            if step.switched[i]:
+                self._begin_task(i)
             if self.env.done[i]:
                 self._results[run.index] = self._runs.pop(i).result(int(self.env.chain_length[i]))
                 ended.append(run.index)

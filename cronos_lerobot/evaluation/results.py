@@ -12,17 +12,16 @@ from rich.table import Table
 
 from cronos_lerobot.evaluation.rates import SuccessRate
 
-Record = dict[str, int]
+Record = dict[str, Any]
 """Outcome of a chain, see `store.chain_records`."""
 
 
 def independent_results(records: Sequence[Record], tasks: Sequence[Task]) -> dict[str, Any]:
     """Success of all tasks together and of each, with n and a 95 % Wilson interval."""
     by_task = {
-        task.instruction: SuccessRate.of(r["length"] == 1 for r in records if r["number"] == i)
-        for i, task in enumerate(tasks)
+        task.instruction: SuccessRate.of(r for r in records if r["number"] == i) for i, task in enumerate(tasks)
     }
-    overall = SuccessRate.of(r["length"] == 1 for r in records)
+    overall = SuccessRate.of(records)
     return overall.to_dict() | {"per_task": {text: rate.to_dict() for text, rate in by_task.items()}}
 
 
@@ -48,8 +47,7 @@ def sequential_results(records: Sequence[Record], orderings: Sequence[Ordering])
     rates = np.array([outcomes.mean(axis=0) for outcomes in success])
     positions = []
     for k in range(num_tasks):
-        overall = SuccessRate.of(np.concatenate([outcomes[:, k] for outcomes in success]))
-        positions.append(overall.to_dict() | {"std": _std(rates[:, k])})
+        positions.append(SuccessRate.of(records, k).to_dict() | {"std": _std(rates[:, k])})
     lengths = np.array([r["length"] for r in records])
     return {
         "n": len(records),

@@ -17,10 +17,11 @@ from lerobot.policies.factory import get_policy_class
 from lerobot_env_cronos import CronosEnvConfig, SequentialVectorEnv, get_scene, gymnasium_id
 from tqdm import tqdm
 
+from cronos_lerobot.agents.processing import make_processors
 from cronos_lerobot.evaluation.actors import Actor, ExpertActor, make_actor
 from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
 from cronos_lerobot.evaluation.config import EXPERT, CronosEvalConfig
-from cronos_lerobot.evaluation.film import choose, film_best_and_worst
+from cronos_lerobot.evaluation.film import film_best_and_worst
 from cronos_lerobot.evaluation.plan import Part, make_parts
 from cronos_lerobot.evaluation.results import independent_results, sequential_results
 from cronos_lerobot.evaluation.store import RESULTS, ResultStore, chain_key, chain_records, write_json
@@ -97,9 +98,9 @@ class Evaluation:
         env.split = part.split
         # Every part begins like this, so that it ends the same whether others ran before it or not.
         actor.seed(self.config.seed)
-        results = ChainRunner(env, actor).run(part.chains, part.noise(self.config.seed), show)
+        runner = ChainRunner(env, actor, keeps_states=self.config.eval.videos > 0)
+        results = runner.run(part.chains, part.noise(self.config.seed), show)
         records = chain_records(results)
-        chosen = choose(records, len(part.chains[0].tasks), self.config.eval.videos)
         content = {
             "suite": part.suite,
             "split": part.split,
@@ -107,11 +108,10 @@ class Evaluation:
             "seconds": time.perf_counter() - start,
             "chains": records,
         }
-        to_film = [record for kind in chosen.values() for record in kind]
         kept = {
             chain_key(record): result.trajectory
             for record, result in zip(records, results, strict=True)
-            if record in to_film
+            if result.trajectory is not None
         }
         self.store.write(part.name, content, kept)
         if bar.disable:
@@ -145,7 +145,7 @@ class Evaluation:
             },
         )
         env_processors = make_env_pre_post_processors(env_cfg=config.env, policy_cfg=config.policy)
-        return make_actor(policy, processors, config.eval.temperature, env_processors)
+        return make_actor(policy, make_processors(policy, *processors), config.eval.temperature, env_processors)
 
     def _close(self) -> None:
         if "_env_and_actor" in self.__dict__:

@@ -74,19 +74,25 @@ class ResultStore:
         return self.folder / "parts" / f"{name}.json"
 
 
-def chain_key(record: dict[str, int]) -> str:
+def chain_key(record: dict[str, Any]) -> str:
     """A chain's name within its suite and split."""
     return f"{record['number']}_{record['configuration']}"
 
 
-def chain_records(results: Sequence[ChainResult]) -> list[dict[str, int]]:
-    """Outcomes as JSON values: `number` (ordering or task), `configuration`, `length`, `steps`."""
+def chain_records(results: Sequence[ChainResult]) -> list[dict[str, Any]]:
+    """Outcomes as JSON values.
+
+    `number` (ordering or task), `configuration`, `length`, `steps`, and the positions of the completed tasks that
+    were `found_complete` or whose object was `never_grasped`; see `ChainResult`.
+    """
     return [
         {
             "number": r.chain.number,
             "configuration": r.chain.configuration,
             "length": r.length,
             "steps": r.steps,
+            "found_complete": list(r.found_complete),
+            "never_grasped": list(r.never_grasped),
         }
         for r in results
     ]

@@ -14,11 +14,11 @@ from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import init_logging
-from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos import SequentialVectorEnv
 
 from cronos_lerobot.processes import join_processes
 from cronos_lerobot.training.config import CronosTrainConfig
-from cronos_lerobot.training.factory import make_env, make_policy_and_processors
+from cronos_lerobot.training.factory import make_env, make_eval_env, make_policy_and_processors
 from cronos_lerobot.training.trainer import Trainer
 
 
@@ -42,14 +42,14 @@ def train(config: CronosTrainConfig) -> None:
     if not processes.is_main:
         set_seed(config.seed + processes.rank)
 
-    def make_own_env(num_envs: int) -> CronosVectorEnv:
-        return make_env(config, num_envs, processes.local_count)
+    def make_own_eval_env(num_envs: int) -> SequentialVectorEnv:
+        return make_eval_env(config, num_envs, processes.local_count)
 
     try:
-        env = make_own_env(mine.stop - mine.start)
+        env = make_env(config, mine.stop - mine.start, processes.local_count)
     except ValueError as error:
         sys.exit(f"error: {error}")
-    trainer = Trainer(config, env, make_own_env, policy, preprocessor, postprocessor, processes)
+    trainer = Trainer(config, env, make_own_eval_env, policy, preprocessor, postprocessor, processes)
     try:
         trainer.train()
     finally:

@@ -8,7 +8,7 @@ from typing import Any
 
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE
-from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
+from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, SequentialVectorEnv, get_scene
 
 from cronos_lerobot.agents.base import check_trainable
 from cronos_lerobot.training.config import CronosTrainConfig
@@ -22,13 +22,8 @@ def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1)
     Raises:
         ValueError: the environment is not a CRONOS scene, or has fewer configurations than are asked for.
     """
-    env_config = config.env
-    if not isinstance(env_config, CronosEnvConfig):
-        name = env_config.type if env_config else None
-        raise ValueError(f"Reset-free training needs --env.type=cronos, got {name!r}.")
-    options = env_config.gym_kwargs
-    if options["num_threads"] == 0 and local_processes > 1:
-        options["num_threads"] = max(1, (os.cpu_count() or 1) // local_processes)
+    env_config = _cronos(config)
+    options = _env_options(env_config, local_processes)
     env = CronosVectorEnv(num_envs, scene=env_config.scene, reward=config.protocol.reward, **options)
     wanted = {"protocol.num_configurations": ("train", config.protocol.num_configurations)}
     if config.eval_freq:
@@ -42,6 +37,29 @@ def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1)
                 f" configurations: give --{flag}={available} or fewer."
             )
     return env
+
+
+def make_eval_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1) -> SequentialVectorEnv:
+    """Return `num_envs` environments of the config's scene for the periodic evaluation; see `make_env`."""
+    env_config = _cronos(config)
+    tasks = get_scene(env_config.scene).tasks
+    return SequentialVectorEnv(
+        num_envs, env_config.scene, ordering=tasks, **_env_options(env_config, local_processes)
+    )
+
+
+def _cronos(config: CronosTrainConfig) -> CronosEnvConfig:
+    if not isinstance(config.env, CronosEnvConfig):
+        name = config.env.type if config.env else None
+        raise ValueError(f"Reset-free training needs --env.type=cronos, got {name!r}.")
+    return config.env
+
+
+def _env_options(env_config: CronosEnvConfig, local_processes: int) -> dict[str, Any]:
+    options = env_config.gym_kwargs
+    if options["num_threads"] == 0 and local_processes > 1:
+        options["num_threads"] = max(1, (os.cpu_count() or 1) // local_processes)
+    return options
 
 
 def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any]:

@@ -12,6 +12,7 @@ from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
 from cronos_lerobot.agents.processing import make_processors
+from cronos_lerobot.evaluation.independent import evaluate_independent
 from cronos_lerobot.processes import Processes, bit_sum
 from cronos_lerobot.protocol.loop_state import Event, SegmentEnd, Step, Update
 from cronos_lerobot.protocol.resets import make_resets
@@ -20,7 +21,6 @@ from cronos_lerobot.protocol.task_orders import TaskSet, make_task_order
 from cronos_lerobot.stopwatch import Stopwatch
 from cronos_lerobot.training.checkpoint import RunState, load_checkpoint, save_checkpoint
 from cronos_lerobot.training.config import CronosTrainConfig
-from cronos_lerobot.training.evaluation import evaluate_independent
 from cronos_lerobot.training.logging import RolloutStatistics, RunLogger, SilentLogger, write_manifest
 from cronos_lerobot.training.recording import FilmedEnv, StreamObserver
 from cronos_lerobot.training.seeding import NamedGenerators
@@ -33,7 +33,8 @@ class Trainer:
     Args:
         config: validated; its output folder is made.
         env: the N streams, or those of this process; never reset by anyone but the run.
-        make_eval_env: makes the evaluation's own environments, n of them, when first needed.
+        make_eval_env: makes the evaluation's own environments, n of them (a `SequentialVectorEnv`), when first
+            needed.
         policy: a LeRobot policy that is a TrainablePolicy.
         preprocessor: the policy's LeRobot preprocessor.
         postprocessor: the policy's LeRobot postprocessor.
@@ -194,16 +195,15 @@ class Trainer:
             self._eval_env = self._make_eval_env(min(options.batch_size, num_episodes))
         result = evaluate_independent(
             self._eval_env,
-            self.task_set.tasks,
             self.policy,
             self.processors,
-            configurations=range(options.n_episodes),
+            n_episodes=options.n_episodes,
             split=options.split,
             temperature=options.temperature,
             seed=options.seed,
             processes=self.processes,
         )
-        self.logger.log("evaluation", result.to_dict())
+        self.logger.log("evaluation", result)
         self.stopwatch.lap()
 
     def _save(self, env_state: dict[str, np.ndarray]) -> None:

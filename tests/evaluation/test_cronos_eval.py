@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy, make_pre_post_processors
-from lerobot.policies.factory import make_policy_config
 from lerobot.scripts.lerobot_eval import eval_policy, rollout
-from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig, IndependentVectorEnv, SequentialVectorEnv, get_scene
 from scripted_env import ScriptedEnv
+from tiny_checkpoints import STATE, save_policy
 
+from cronos_lerobot.agents.processing import make_processors
 from cronos_lerobot.evaluation.actors import make_actor
 from cronos_lerobot.evaluation.chains import Chain, ChainRunner, chain_noise
 from cronos_lerobot.evaluation.config import CronosEvalConfig
@@ -24,20 +24,7 @@ from cronos_lerobot.evaluation.runner import Evaluation
 from cronos_lerobot.evaluation.store import RESULTS
 from cronos_lerobot.scripts import eval as script
 
-STATE = {"obs_type": "environment_state_agent_pos"}
 SMALL = ("--eval.n_episodes=2", "--eval.orderings=3", "--eval.splits=held_out", "--eval.batch_size=4")
-
-
-def save_policy(folder: Path, kind: str, env_options: dict, **options) -> Path:
-    """An untrained policy as a checkpoint."""
-    register_third_party_plugins()
-    env_config = CronosEnvConfig(**env_options)
-    config = make_policy_config(kind, device="cpu", push_to_hub=False, **options)
-    policy = make_policy(config, env_cfg=env_config)
-    policy.save_pretrained(folder)
-    for processor in make_pre_post_processors(config):
-        processor.save_pretrained(folder)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +137,7 @@ def test_a_lerobot_policy_does_what_it_does_in_lerobot_eval(tmp_path):
     rollout(theirs, policy, *env_processors, *processors, seeds=[4, 5, 6])
     ours = SequentialVectorEnv(3, ordering=tasks, **STATE)
     chains = [Chain(1, (tasks[1],), configuration) for configuration in (4, 5, 6)]
-    results = ChainRunner(ours, make_actor(policy, processors, 0.6, env_processors)).run(
+    results = ChainRunner(ours, make_actor(policy, make_processors(policy, *processors), 0.6, env_processors)).run(
         chains, chain_noise(80, 0)
     )
     assert [result.steps for result in results] == [80] * 3

@@ -17,9 +17,21 @@ ORDERINGS = load_orderings("kitchen_2x2")
 TASKS = get_scene("kitchen_2x2").tasks
 
 
-def records(lengths_by_number):
+def records(lengths_by_number, found=(), never_grasped=()):
+    """Outcomes of configurations 0, 1, ...; `found` and `never_grasped` are (number, configuration, position)."""
+
+    def positions(which, *chain):
+        return [position for *where, position in which if tuple(where) == chain]
+
     return [
-        {"number": number, "configuration": c, "length": length, "steps": 80}
+        {
+            "number": number,
+            "configuration": c,
+            "length": length,
+            "steps": 80,
+            "found_complete": positions(found, number, c),
+            "never_grasped": positions(never_grasped, number, c),
+        }
         for number, lengths in lengths_by_number.items()
         for c, length in enumerate(lengths)
     ]
@@ -61,8 +73,18 @@ def test_independent_results_by_hand():
     assert results["per_task"][TASKS[2].instruction]["ci95"] == list(wilson_interval(0, 2))
 
 
-def test_success_rate():
-    assert SuccessRate.of([True, False, np.True_]) == SuccessRate(2, 3)
+def test_successes_that_were_found_or_came_without_a_grasp_are_counted_apart_at_their_position():
+    some = records(
+        {0: [4, 2, 0], 1: [1, 1, 0]}, found=[(0, 0, 1), (0, 0, 3)], never_grasped=[(0, 1, 0), (1, 0, 0)]
+    )
+    assert SuccessRate.of(some) == SuccessRate(4, 6, found_complete=0, never_grasped=2)
+    assert SuccessRate.of(some, 1) == SuccessRate(2, 6, found_complete=1, never_grasped=0)
+    positions = sequential_results(some, ORDERINGS)["positions"]
+    assert [p["found_complete"] for p in positions] == [0, 1, 0, 1]
+    assert [p["never_grasped"] for p in positions] == [2, 0, 0, 0]
+    tasks = independent_results(records({i: [1, 0] for i in range(4)}, never_grasped=[(2, 0, 0)]), TASKS)
+    assert tasks["never_grasped"] == tasks["per_task"][TASKS[2].instruction]["never_grasped"] == 1
+    assert sum(rate["never_grasped"] for rate in tasks["per_task"].values()) == 1
 
 
 def test_tables_have_a_row_for_each_position_and_a_column_for_each_split():
@@ -98,13 +120,21 @@ def test_a_store_keeps_parts_and_refuses_another_evaluation(tmp_path):
     folder = tmp_path / "out"
     store = ResultStore(folder, {"seed": 1, "pair": (1, 2)})
     trajectory = Trajectory(np.ones((3, 5), np.float32), np.array([0, 0, 1]), np.array([False, True, False]))
-    result = ChainResult(Chain(2, TASKS, 7), 1, 160, trajectory)
+    result = ChainResult(Chain(2, TASKS, 7), 1, 160, trajectory, never_grasped=(0,))
     content = {"chains": chain_records([result])}
     assert store.read("a") is None
     store.write("a", content, {"2_7": trajectory})
     again = ResultStore(folder, {"seed": 1, "pair": [1, 2]})
     assert again.read("a") == content
-    assert content["chains"] == [{"number": 2, "configuration": 7, "length": 1, "steps": 160}]
+    record = {
+        "number": 2,
+        "configuration": 7,
+        "length": 1,
+        "steps": 160,
+        "found_complete": [],
+        "never_grasped": [0],
+    }
+    assert content["chains"] == [record]
     read = again.read_trajectory("a", "2_7")
     for name in ("qpos", "position", "is_complete"):
         np.testing.assert_array_equal(getattr(read, name), getattr(trajectory, name))

@@ -34,6 +34,8 @@ class ChainStep:
     switched: np.ndarray
     """The next task begins with the next step."""
     diverged: np.ndarray
+    is_grasped: np.ndarray
+    """The object of the task that was acted on is grasped after the step."""
 
 
 class SequentialVectorEnv(EpisodicVectorEnv):
@@ -135,8 +137,9 @@ class SequentialVectorEnv(EpisodicVectorEnv):
         may_switch = window_over if self.advance == "window" else self._is_complete
         switched = running & self._is_complete & may_switch & ~is_last & ~failure
         self.done |= success | failure
+        is_grasped = self.is_grasped.copy()
         self._begin_next_task(self._all[switched])
-        return ChainStep(running, position, task_success, success, failure, switched, diverged)
+        return ChainStep(running, position, task_success, success, failure, switched, diverged, is_grasped)
 
     def _begin_next_task(self, ids: np.ndarray) -> None:
         if not len(ids):

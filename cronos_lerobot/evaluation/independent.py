@@ -1,0 +1,80 @@
+"""The independent suite of a policy that is at hand: what `cronos-train` asks every now and then.
+
+The same chains, random numbers and actors as `cronos-eval`'s.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lerobot.utils.random_utils import get_rng_state, set_rng_state
+from lerobot_env_cronos import SequentialVectorEnv
+
+from cronos_lerobot.agents.processing import PolicyProcessors
+from cronos_lerobot.evaluation.actors import make_actor
+from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
+from cronos_lerobot.evaluation.plan import make_parts
+from cronos_lerobot.evaluation.results import independent_results
+from cronos_lerobot.evaluation.store import chain_records
+from cronos_lerobot.processes import Processes
+
+
+def run_independent(
+    env: SequentialVectorEnv,
+    policy: Any,
+    processors: PolicyProcessors,
+    *,
+    n_episodes: int,
+    split: str,
+    temperature: float,
+    seed: int,
+    processes: Processes | None = None,
+    keeps_states: bool = False,
+) -> list[ChainResult]:
+    """Run every task of the environments' benchmark with a policy, and leave everything else as it was.
+
+    An episode's random numbers are those of the episode and the step. If the policy takes them (`uniform`, see
+    `TrainablePolicy`), its episodes do not depend on the number of environments and processes. One that draws from
+    a generator gives the same result at the same number of both.
+
+    Args:
+        env: environments of the evaluation's own, never those of a training stream.
+        policy: a LeRobot policy on its device.
+        processors: between `env` and `policy`.
+        n_episodes: configurations of every task, the first ones.
+        split: `train` or `held_out`.
+        temperature: of the sampling, 0 for the likeliest action.
+        seed: of the sampling.
+        processes: that share out the episodes; all call this and get the whole result.
+        keeps_states: return the trajectories, too.
+
+    Returns:
+        The episodes, task by task.
+    """
+    processes = processes or Processes()
+    (part,) = make_parts(env.benchmark, ["independent"], [split], n_episodes, 0)
+    env.split = split
+    was_training, rng_state = policy.training, get_rng_state()
+    try:
+        actor = make_actor(policy, processors, temperature)
+        actor.seed(seed + processes.rank)
+        own = part.chains[processes.rank :: processes.count]
+        results = ChainRunner(env, actor, keeps_states=keeps_states).run(own, part.noise(seed))
+    finally:
+        policy.train(was_training)
+        set_rng_state(rng_state)
+    by_chain = {result.chain: result for some in processes.gather(results) for result in some}
+    return [by_chain[chain] for chain in part.chains]
+
+
+def evaluate_independent(env: SequentialVectorEnv, *args: Any, **options: Any) -> dict[str, Any]:
+    """`run_independent` in numbers.
+
+    Returns:
+        `split`, `temperature`, `steps` (control steps of all episodes) and `independent_results`.
+    """
+    records = chain_records(run_independent(env, *args, **options))
+    groups = env.benchmark.groups("independent", options["split"])
+    header = {"split": options["split"], "temperature": options["temperature"]}
+    header |= {"steps": sum(record["steps"] for record in records)}
+    return header | independent_results(records, [group.tasks[0] for group in groups])

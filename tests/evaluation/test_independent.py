@@ -1,0 +1,79 @@
+"""The evaluation while training: every episode once, as long as it lasts, and like `cronos-eval`'s."""
+
+import numpy as np
+import pytest
+import torch
+from dummies import TASKS, DummyEnv, DummyPolicy, identity_processors
+
+from cronos_lerobot.agents.processing import PolicyProcessors
+from cronos_lerobot.evaluation.independent import evaluate_independent
+
+PROCESSORS = PolicyProcessors(*identity_processors())
+OPTIONS = {"n_episodes": 6, "split": "train", "temperature": 0.6, "seed": 1000}
+
+
+class ScriptedPolicy(DummyPolicy):
+    """Walks towards positive goals, never towards negative ones; counts the rows that it is asked for."""
+
+    rows = 0
+
+    def sample_actions(self, batch, *, temperature=1.0, generator=None):
+        self.rows += len(batch["task"])
+        actions = torch.zeros(len(batch["task"]), 7)
+        goals = torch.tensor([float(text.removeprefix("go to ")) for text in batch["task"]])
+        actions[:, 0] = (goals > 0) * torch.sign(goals - batch["observation.state"][:, 0])
+        return {"action": actions}
+
+
+def evaluate(env, policy, **options):
+    return evaluate_independent(env, policy, PROCESSORS, **OPTIONS | options)
+
+
+@pytest.mark.parametrize("num_envs", [1, 5, 16, 64])
+def test_every_task_from_every_configuration_and_not_a_step_more(num_envs):
+    env, policy = DummyEnv(num_envs), ScriptedPolicy()
+    result = evaluate(env, policy)
+    assert {task: rate["success"] for task, rate in result["per_task"].items()} == {
+        "go to 1.0": 1, "go to -1.0": 0, "go to 2.0": 1, "go to -2.0": 0,
+    }  # fmt: skip
+    assert (result["success"], result["n"], result["split"], result["temperature"]) == (0.5, 24, "train", 0.6)
+    # From -0.5, -0.375, ... 0.125 in steps of 0.2 to within 0.3 of 1 and of 2; two tasks for 80 steps.
+    to_one, to_two = [7, 6, 5, 5, 4, 3], [12, 11, 10, 10, 9, 8]
+    assert result["steps"] == sum(to_one) + sum(to_two) + 2 * 6 * 80
+    assert policy.rows == env.moved == result["steps"]
+
+
+def test_the_split_reaches_the_environment_and_only_configurations_that_are_asked_for():
+    seen = []
+
+    class Env(DummyEnv):
+        def scene_reset(self, ids, configurations, split="train"):
+            seen.append((np.asarray(configurations).tolist(), split))
+            super().scene_reset(ids, configurations, split)
+
+    evaluate(Env(8), ScriptedPolicy(), n_episodes=2, split="held_out")
+    assert seen == [([0, 1] * 4, "held_out")]
+
+
+def test_it_leaves_the_global_generators_and_the_policys_mode_alone():
+    policy = DummyPolicy(seed=1).train()
+    torch.manual_seed(0)
+    np.random.seed(0)
+    torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()[1].copy()
+    first = evaluate(DummyEnv(8), policy, seed=3)
+    assert torch.equal(torch_state, torch.get_rng_state())
+    assert np.array_equal(numpy_state, np.random.get_state()[1])
+    assert policy.training
+    torch.rand(5)
+    assert evaluate(DummyEnv(8), policy, seed=3) == first
+    assert evaluate(DummyEnv(8), policy, seed=4)["steps"] != first["steps"]
+
+
+def test_a_broken_simulation_ends_its_episode_and_is_no_success():
+    whole, broken = (
+        evaluate(DummyEnv(8, diverge_at=diverge_at), ScriptedPolicy(), n_episodes=2)
+        for diverge_at in (set(), {(0, 1)})
+    )
+    first = TASKS[0].instruction
+    assert (whole["per_task"][first]["success"], broken["per_task"][first]["success"]) == (1, 0.5)
+    assert broken["steps"] == whole["steps"] - 5

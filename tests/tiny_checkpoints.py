@@ -1,0 +1,22 @@
+"""Untrained policies on disk."""
+
+from pathlib import Path
+
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.policies.factory import make_policy_config
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot_env_cronos import CronosEnvConfig
+
+STATE = {"obs_type": "environment_state_agent_pos"}
+
+
+def save_policy(folder: Path, kind: str, env_options: dict, **options) -> Path:
+    """An untrained policy as a checkpoint."""
+    register_third_party_plugins()
+    env_config = CronosEnvConfig(**env_options)
+    config = make_policy_config(kind, device="cpu", push_to_hub=False, **options)
+    policy = make_policy(config, env_cfg=env_config)
+    policy.save_pretrained(folder)
+    for processor in make_pre_post_processors(config):
+        processor.save_pretrained(folder)
+    return folder
