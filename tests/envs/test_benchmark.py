@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, load_benchmark
+from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, get_scene, load_benchmark
 from lerobot_env_cronos.benchmark.benchmark import draw_benchmark, packaged_benchmark
 from lerobot_env_cronos.benchmark.configurations import load_configurations
 from lerobot_env_cronos.benchmark.files import BenchmarkError, read_benchmark, write_benchmark
@@ -14,9 +14,9 @@ from lerobot_env_cronos.benchmark.files import BenchmarkError, read_benchmark, w
 STATE = "environment_state_agent_pos"
 # A change of these is another benchmark: a new version of the environment id.
 FINGERPRINTS = {
-    "kitchen_2x2": "b479ae3ebc7aa7f0",
-    "kitchen_3x3": "311ac17d78f74c45",
-    "playroom_2x2": "ca43d617cef8d629",
+    "kitchen_2x2": "b6d16e60c5a22994",
+    "kitchen_3x3": "2d9849b1ee7b468c",
+    "playroom_2x2": "202ac0fadb48980b",
 }
 
 
@@ -74,6 +74,20 @@ def test_what_cannot_be_drawn():
         draw_benchmark("kitchen_2x2", 0, 1, num_orderings=13, chain_length=2)
     with pytest.raises(ValueError, match=r"chain_length must be 1 to 4, .*got 5"):
         draw_benchmark("kitchen_2x2", 0, 1, chain_length=5)
+
+
+def test_drawn_chains_are_balanced_and_no_part_of_the_training_cycle():
+    chains = draw_benchmark("kitchen_2x2", 3, 1, num_orderings=8, chain_length=2).sequential["train"]
+    tasks = get_scene("kitchen_2x2").tasks
+    for position in (0, 1):
+        at = [group.tasks[position] for group in chains]
+        assert [at.count(task) for task in tasks] == [2, 2, 2, 2]
+    # 4 of the 12 chains of two tasks are a part of the cycle: (0, 1), (1, 2), (2, 3), (3, 0).
+    for group in chains:
+        assert tasks.index(group.tasks[1]) != (tasks.index(group.tasks[0]) + 1) % 4
+        assert not group.is_training_cycle
+    every = draw_benchmark("kitchen_2x2", 3, 1, num_orderings=12, chain_length=2).sequential["train"]
+    assert [group.is_training_cycle for group in every] == [False] * 8 + [True] * 4
 
 
 def test_several_files_and_further_columns(mine, tmp_path):
@@ -145,11 +159,50 @@ def test_chains_of_different_lengths(mine, tmp_path):
         read_benchmark(tmp_path, "it")
 
 
-def test_held_out_configurations_are_held_out(mine, tmp_path):
+@pytest.mark.parametrize(
+    ("moved_m", "turned_rad", "sign", "is_same"),
+    [
+        (0, 0, 1, True),
+        (1e-9, 0, 1, True),
+        (0, 0, -1, True),
+        (0.004, 0.08, -1, True),
+        (0.006, 0, 1, False),
+        (0, 0.1, 1, False),
+    ],
+)
+def test_held_out_configurations_are_held_out(moved_m, turned_rad, sign, is_same, mine, tmp_path):
     write_benchmark(mine[0], tmp_path)
     same = pq.read_table(tmp_path / "configurations/train.parquet").to_pylist()[2]
-    change(tmp_path, "configurations/held_out", 1, **same | {"configuration": 1})
-    with pytest.raises(BenchmarkError, match="held_out, row 1: the same as training configuration 2"):
+    same |= {"configuration": 1, "toy_bear_x_m": same["toy_bear_x_m"] + moved_m}
+    quaternion = np.array([same[f"carpet_q{axis}"] for axis in "wxyz"])
+    turned = sign * np.array([np.cos(turned_rad / 2), 0, 0, np.sin(turned_rad / 2)])
+    # A turn about z after `quaternion`, which is one about z, too.
+    w, z = (
+        quaternion[0] * turned[0] - quaternion[3] * turned[3],
+        quaternion[0] * turned[3] + quaternion[3] * turned[0],
+    )
+    change(tmp_path, "configurations/held_out", 1, **same | {"carpet_qw": w, "carpet_qz": z})
+    if is_same:
+        with pytest.raises(BenchmarkError, match="held_out, row 1: the same as training configuration 2"):
+            read_benchmark(tmp_path, "it")
+    else:
+        read_benchmark(tmp_path, "it")
+
+
+def test_bodies_that_stand_in_one_another_are_refused(mine, tmp_path):
+    write_benchmark(mine[0], tmp_path)
+    row = pq.read_table(tmp_path / "configurations/train.parquet").to_pylist()[2]
+    bear = {f"toy_bear_{axis}_m": row[f"carpet_{axis}_m"] for axis in "xy"}
+    # On the carpet, 3.7 mm thick and standing on the table, as an author may want it.
+    on_top = {"toy_bear_z_m": row["toy_bear_z_m"] + 0.0037}
+    change(tmp_path, "configurations/train", 2, **bear | on_top)
+    read_benchmark(tmp_path, "it")
+    change(tmp_path, "configurations/train", 2, **bear | {"toy_bear_z_m": row["toy_bear_z_m"]})
+    message = r"configurations/train, row 2: the toy bear stands 3\.7 mm deep in the carpet"
+    with pytest.raises(BenchmarkError, match=message):
+        read_benchmark(tmp_path, "it")
+    change(tmp_path, "configurations/train", 2, toy_bear_z_m=row["toy_bear_z_m"] + 0.0037, carpet_z_m=0.00005)
+    with pytest.raises(BenchmarkError, match=r"row 2: the carpet stands 1\.8 mm deep in the table"):
         read_benchmark(tmp_path, "it")
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from lerobot.envs.factory import make_env, make_env_config
 from lerobot_env_cronos import SCENES, CronosEnvConfig, SequentialVectorEnv, get_scene, load_orderings
+from lerobot_env_cronos.benchmark.benchmark import packaged_benchmark
 from lerobot_env_cronos.benchmark.configurations import load_configurations
 from lerobot_env_cronos.benchmark.orderings import draw_orderings
 from lerobot_env_cronos.expert.expert import ScriptedExpert
@@ -19,9 +20,9 @@ STILL = np.array([0, 0, 0, 0, 0, 0, 1.0])
 
 # A change of these is a new version of the orderings.
 GOLDEN_SHA256 = {
-    "kitchen_2x2": "ca42f94973b2c6cb616802c96cb6b0a39deb623103efc2c34da032ece37689cb",
-    "kitchen_3x3": "017f4ee5e9a787630f0d1615891db3094e969eacdc3d3e7de3098d4413406063",
-    "playroom_2x2": "275f143e0006e1cdc30084cff5a4887fb9a6af3c487a77ac0dcf0e7b4d370aae",
+    "kitchen_2x2": "06a3e87da36760965e8c1c80d5a616334e541085ee78e3bd5468928c6ed7a629",
+    "kitchen_3x3": "d0fe9b82e947f530b5c26bcf8cbb3082cd4c251aefe23136ca69ab2cda4dada7",
+    "playroom_2x2": "1c4b510f492344c8f116a3868adc7d3a84682e9ff48ef619e494a1c05db9fd8e",
 }
 
 
@@ -29,7 +30,7 @@ GOLDEN_SHA256 = {
 def test_orderings_are_frozen_and_are_what_the_seed_draws(scene):
     data = resources.files("lerobot_env_cronos").joinpath(f"data/orderings/{scene}.json").read_bytes()
     assert hashlib.sha256(data).hexdigest() == GOLDEN_SHA256[scene]
-    assert json.loads(data)["orderings"] == draw_orderings(len(get_scene(scene).tasks))
+    assert list(map(tuple, json.loads(data)["orderings"])) == draw_orderings(len(get_scene(scene).tasks))
 
 
 @pytest.mark.parametrize("scene", GOLDEN_SHA256)
@@ -40,8 +41,36 @@ def test_ten_distinct_permutations_the_first_one_is_the_training_cycle(scene):
     assert all(sorted(map(tasks.index, ordering)) == list(range(len(tasks))) for ordering in orderings)
 
 
-def test_a_scene_of_two_tasks_has_all_two_orderings():
-    assert draw_orderings(2) == [[0, 1], [1, 0]]
+@pytest.mark.parametrize("scene", GOLDEN_SHA256)
+def test_the_other_nine_are_no_rotation_of_the_training_cycle(scene):
+    tasks, (_, *others) = get_scene(scene).tasks, load_orderings(scene)
+    for ordering in others:
+        start = tasks.index(ordering[0])
+        assert ordering != tasks[start:] + tasks[:start]
+    number_seen = [group.is_training_cycle for group in packaged_benchmark(scene).sequential["train"]]
+    assert number_seen == [True] + [False] * 9
+
+
+@pytest.mark.parametrize(
+    ("scene", "counts"), [("kitchen_2x2", {2, 3}), ("playroom_2x2", {2, 3}), ("kitchen_3x3", {1, 2})]
+)
+def test_every_task_stands_at_every_position_as_often_as_ten_orderings_allow(scene, counts):
+    """10 = 2 x 3 + 2 x 2 = 8 x 1 + 2; and the first k, as `--eval.orderings=k` takes them, are as even."""
+    tasks, orderings = get_scene(scene).tasks, load_orderings(scene)
+    for position in range(len(tasks)):
+        at = [ordering[position] for ordering in orderings]
+        assert {at.count(task) for task in tasks} == counts
+        for k in range(1, 10):
+            first = [at[:k].count(task) for task in tasks]
+            assert max(first) - min(first) <= 1
+
+
+def test_small_scenes_have_fewer_orderings():
+    # The other permutation of two tasks is a rotation of the cycle; of three, the three odd ones are none.
+    assert draw_orderings(1) == [(0,)]
+    assert draw_orderings(2) == [(0, 1)]
+    assert draw_orderings(3)[0] == (0, 1, 2)
+    assert sorted(draw_orderings(3)[1:]) == [(0, 2, 1), (1, 0, 2), (2, 1, 0)]
 
 
 def play(env):

@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from math import factorial
+from math import perm
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from lerobot_env_cronos.benchmark.configurations import (
     load_configurations,
     sample_configuration,
 )
-from lerobot_env_cronos.benchmark.orderings import load_orderings
+from lerobot_env_cronos.benchmark.orderings import draw_balanced, is_training_cycle, load_orderings
 from lerobot_env_cronos.benchmark.version import gymnasium_id
 from lerobot_env_cronos.scene.scenes import BODIES, STEPS_PER_TASK, Scene, Task, get_scene
 
@@ -36,6 +36,9 @@ class EpisodeGroup:
     """One after the other; a single one if independent."""
     configurations: tuple[int, ...]
     """Where the episodes start: indices into the split."""
+    is_training_cycle: bool = False
+    """Whether the tasks of a chain follow one another as in the training cycle, from wherever they start: streams
+    of the heuristic task order have seen such chains."""
 
     @property
     def instructions(self) -> list[str]:
@@ -111,7 +114,8 @@ def draw_benchmark(
         scene_name: of a scene.
         seed: decides configurations and orderings.
         num_configurations: of each split.
-        num_orderings: of each split, the same in both; all different.
+        num_orderings: of each split, the same in both; all different, every task as often as any other at every
+            position, none a part of the training cycle while there are others.
         chain_length: tasks of a chain, all different; null for all of the scene.
 
     Raises:
@@ -121,7 +125,7 @@ def draw_benchmark(
     length = len(scene.tasks) if chain_length is None else chain_length
     if not 1 <= length <= len(scene.tasks):
         raise ValueError(f"chain_length must be 1 to {len(scene.tasks)}, the tasks of {scene_name}, got {length}")
-    most = factorial(len(scene.tasks)) // factorial(len(scene.tasks) - length)
+    most = perm(len(scene.tasks), length)
     if not 1 <= num_orderings <= most:
         raise ValueError(f"num_orderings must be 1 to {most}, all of {length} tasks, got {num_orderings}")
     if num_configurations < 1 or seed < 0:
@@ -131,12 +135,9 @@ def draw_benchmark(
         split: np.stack([sample_configuration(scene, rng).round(6) for _ in range(num_configurations)])
         for split in SPLITS
     }
-    drawn: list[tuple[Task, ...]] = []
-    while len(drawn) < num_orderings:
-        ordering = tuple(scene.tasks[i] for i in rng.permutation(len(scene.tasks))[:length])
-        if ordering not in drawn:
-            drawn.append(ordering)
-    return _cross(scene, poses, drawn, f"drawn with seed {seed}")
+    drawn = draw_balanced(len(scene.tasks), length, num_orderings, rng)
+    orderings = [tuple(scene.tasks[i] for i in ordering) for ordering in drawn]
+    return _cross(scene, poses, orderings, f"drawn with seed {seed}")
 
 
 def _cross(
@@ -147,7 +148,12 @@ def _cross(
     chains = {"independent": [(task,) for task in scene.tasks], "sequential": orderings}
     groups = {
         suite: {
-            split: tuple(EpisodeGroup(i, tuple(tasks), everywhere[split]) for i, tasks in enumerate(chains[suite]))
+            split: tuple(
+                EpisodeGroup(
+                    i, tuple(tasks), everywhere[split], suite == "sequential" and is_training_cycle(tasks, scene)
+                )
+                for i, tasks in enumerate(chains[suite])
+            )
             for split in SPLITS
         }
         for suite in SUITES

@@ -17,8 +17,9 @@ import pyarrow.parquet as pq
 
 from lerobot_env_cronos.benchmark.benchmark import SUITES, Benchmark, EpisodeGroup
 from lerobot_env_cronos.benchmark.configurations import SPLITS
+from lerobot_env_cronos.benchmark.orderings import is_training_cycle
+from lerobot_env_cronos.benchmark.poses import are_same, find_fault, find_overlaps
 from lerobot_env_cronos.benchmark.version import check_environment_id, gymnasium_id
-from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW
 from lerobot_env_cronos.scene.scenes import SCENES, STEPS_PER_TASK, Scene, Task
 
 CONFIGURATIONS = "configurations"
@@ -241,30 +242,19 @@ def _read_poses(table: _Table, scene: Scene) -> np.ndarray:
     poses = values.reshape(-1, len(scene.bodies), len(POSE))
     for i, of_row in enumerate(poses):
         for body, pose in zip(scene.bodies, of_row, strict=True):
-            if why := _fault(pose):
+            if why := find_fault(pose):
                 raise table.fail(i, f"the {body} {why}")
+    for i, why in enumerate(find_overlaps(scene, poses)):
+        if why is not None:
+            raise table.fail(i, why)
     poses.flags.writeable = False
     return poses
 
 
-def _fault(pose: np.ndarray) -> str | None:
-    """What is wrong with the pose (7,) of a body, if anything."""
-    if not np.isfinite(pose).all():
-        return f"has a pose that is not finite: {pose.tolist()}"
-    if (pose[:2] < EE_LOW[:2]).any() or (pose[:2] > EE_HIGH[:2]).any():
-        valid = f"x {EE_LOW[0]} to {EE_HIGH[0]}, y {EE_LOW[1]} to {EE_HIGH[1]}"
-        return f"at {pose[:2].tolist()} m is out of the arm's reach ({valid} m)"
-    if not 0 <= pose[2] <= EE_HIGH[2]:
-        return f"must be between the table and the top of the workspace, 0 to {EE_HIGH[2]} m, got z = {pose[2]} m"
-    norm = np.linalg.norm(pose[3:])
-    return None if abs(norm - 1) < 1e-3 else f"has a quaternion of length {norm:.4f}, not 1"
-
-
 def _check_disjoint(poses: dict[str, np.ndarray], held_out: _Table) -> None:
-    for i, pose in enumerate(poses["held_out"]):
-        same = np.flatnonzero((poses["train"] == pose).all(axis=(1, 2)))
-        if len(same):
-            raise held_out.fail(i, f"the same as training configuration {same[0]}: it is not held out")
+    for i, same in enumerate(are_same(poses["held_out"], poses["train"])):
+        if same.any():
+            raise held_out.fail(i, f"the same as training configuration {np.argmax(same)}: it is not held out")
 
 
 def _read_groups(table: _Table, scene: Scene, suite: str, num_configurations: int) -> tuple[EpisodeGroup, ...]:
@@ -299,7 +289,13 @@ def _read_groups(table: _Table, scene: Scene, suite: str, num_configurations: in
         raise table.fail(None, f"{key} must be numbered 0 to {len(tasks) - 1}, got {sorted(tasks)}")
     if suite == "independent":
         _check_bodies(table, scene)
-    return tuple(EpisodeGroup(number, tasks[number], tuple(starts[number])) for number in sorted(tasks))
+    return tuple(
+        EpisodeGroup(
+            number, tasks[number], tuple(starts[number]),
+            suite == "sequential" and is_training_cycle(tasks[number], scene),
+        )
+        for number in sorted(tasks)
+    )  # fmt: skip
 
 
 def _instructions(table: _Table, suite: str) -> Iterable[tuple[str, ...]]:
