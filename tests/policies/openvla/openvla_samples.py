@@ -3,6 +3,8 @@
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot_policy_openvla import OpenVLAConfig, OpenVLAPolicy
+from lerobot_policy_openvla.images import prepare_images
+from published_checkpoint import reference_logits
 
 CAMERA = "observation.images.front"
 TASKS = ("put the ketchup bottle on the yellow plate", "put the kitchen shovel on the cloth please")
@@ -14,9 +16,8 @@ OUTPUTS = {"action": PolicyFeature(FeatureType.ACTION, (7,))}
 
 
 def make_config(checkpoint, **kwargs) -> OpenVLAConfig:
-    return OpenVLAConfig(
-        checkpoint=str(checkpoint), input_features=INPUTS, output_features=OUTPUTS, device="cpu", **kwargs
-    )
+    fields = {"unnorm_key": "bridge_orig", "input_features": INPUTS, "output_features": OUTPUTS, "device": "cpu"}
+    return OpenVLAConfig(checkpoint=str(checkpoint), **fields | kwargs)
 
 
 def make_policy(checkpoint, *, stir: bool = True, **kwargs) -> OpenVLAPolicy:
@@ -40,3 +41,20 @@ def make_batch(n: int, seed: int = 0) -> dict:
 
 def take(batch: dict, rows: list[int]) -> dict:
     return {key: [v[i] for i in rows] if isinstance(v, list) else v[rows] for key, v in batch.items()}
+
+
+def log_probs_and_values(policy, seed: int = 2) -> torch.Tensor:
+    """Of the tokens 400 .. 413 for two observations, (2, 2)."""
+    batch = make_batch(2, seed)
+    tokens = torch.arange(400, 414).reshape(2, 7)
+    with torch.no_grad():
+        result = policy.eval().evaluate_actions(batch, tokens)
+    return torch.stack([result["log_prob"], result["value"]])
+
+
+def reference_of(policy, parts, batch: dict, tokens: torch.Tensor) -> torch.Tensor:
+    """Logits (B, 7, V) one observation at a time, with the published modules."""
+    pixels = prepare_images(batch[CAMERA], policy.architecture, crop=False)
+    prompts = [list(policy.prompt_tokenizer(text)) for text in batch["task"]]
+    rows = zip(pixels, prompts, tokens.tolist(), strict=True)
+    return torch.stack([reference_logits(parts, x, prompt, row[:-1]) for x, prompt, row in rows])

@@ -111,7 +111,10 @@ def write_checkpoint(folder: Path, parts: Parts, shards: int = 2, **changes) -> 
         "norm_stats": {"bridge_orig": {"action": BRIDGE, "num_trajectories": 1}, "other": {"action": OTHER}},
     } | changes  # fmt: skip
     (folder / "config.json").write_text(json.dumps(config))
-    preprocessor = {"image_resize_strategy": "resize-naive", "means": MEANS, "stds": STDS}
+    preprocessor = {
+        "image_resize_strategy": "resize-naive", "interpolations": ["bicubic"] * 2, "means": MEANS, "stds": STDS,
+        "tvf_do_letterbox": False, "tvf_letterbox_fill": None,
+    }  # fmt: skip
     (folder / "preprocessor_config.json").write_text(json.dumps(preprocessor))
     make_tokenizer().save(str(folder / "tokenizer.json"))
     tensors = parts.published_tensors()

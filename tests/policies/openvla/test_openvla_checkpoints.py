@@ -9,26 +9,15 @@ import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot_policy_openvla import OpenVLAConfig, OpenVLAPolicy, make_openvla_pre_post_processors
-from lerobot_policy_openvla.adapters import ADAPTER_WEIGHTS
-from openvla_samples import CAMERA, INPUTS, OUTPUTS, make_batch, make_config, make_policy
-from peft import LoraConfig, get_peft_model
+from openvla_samples import CAMERA, INPUTS, OUTPUTS, log_probs_and_values, make_batch, make_config, make_policy
 from published_checkpoint import MEANS, write_checkpoint
 from safetensors.torch import load_file, save_file
 from torch import nn
 
 
-def log_probs_and_values(policy, seed=2):
-    batch = make_batch(2, seed)
-    tokens = torch.arange(400, 414).reshape(2, 7)
-    with torch.no_grad():
-        result = policy.eval().evaluate_actions(batch, tokens)
-    return torch.stack([result["log_prob"], result["value"]])
-
-
 def test_published_config_is_read(published):
     config = make_config(published)
     config.resolve()
-    assert config.unnorm_key == "bridge_orig"
     assert config.architecture["image_means"] == tuple(map(tuple, MEANS))
     policy = make_policy(published)
     assert policy.action_tokenizer.token_range == slice(384, 640)
@@ -40,6 +29,54 @@ def test_published_config_is_read(published):
     action = processors[1](policy.select_action(batch))
     assert action.shape == (2, 7)
     assert (action[:, :6].abs() < 0.21).all()
+
+
+MY_ROBOT = {
+    "q01": [-0.5] * 6 + [0.0], "q99": [0.1] * 6 + [1.0], "mask": [True] * 6 + [False],
+    "mean": [0.0] * 7, "std": [1.0] * 7, "min": [-1.0] * 7, "max": [1.0] * 7,
+}  # fmt: skip
+
+
+def write_statistics(folder: Path) -> None:
+    """As the published fine-tuning script leaves them beside what it trained."""
+    contents = {"my_robot": {"action": MY_ROBOT, "num_transitions": 10, "num_trajectories": 1}}
+    (folder / "dataset_statistics.json").write_text(json.dumps(contents))
+
+
+@pytest.mark.parametrize("beside", ["checkpoint", "adapter"])
+def test_statistics_of_a_fine_tuning_run_replace_the_others(beside, published, tmp_path):
+    folder = shutil.copytree(published, tmp_path / "merged")
+    adapter = None
+    if beside == "adapter":
+        make_policy(published, lora_rank=2).save_adapter(tmp_path / "adapter")
+        adapter = str(tmp_path / "adapter")
+    write_statistics(tmp_path / "adapter" if adapter else folder)
+    for key in ("my_robot", None):
+        config = make_config(folder, adapter=adapter, unnorm_key=key)
+        _, postprocessor = make_openvla_pre_post_processors(config)
+        assert config.unnorm_key == "my_robot"
+        # 0.5 (0.5 + 1) (0.1 + 0.5) - 0.5
+        assert postprocessor(torch.full((1, 7), 0.5))[0].tolist() == pytest.approx([-0.05] * 6 + [0.5])
+    with pytest.raises(ValueError, match=r"'bridge_orig' is not one of \['my_robot'\]"):
+        make_config(folder, adapter=adapter).resolve()
+
+
+def test_several_statistics_are_not_guessed_between(published):
+    with pytest.raises(ValueError, match=r"unnorm_key is not given.*\['bridge_orig', 'other'\]"):
+        make_config(published, unnorm_key=None).resolve()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"image_resize_strategy": "letterbox"}, {"tvf_do_letterbox": True}, {"interpolations": ["lanczos"] * 2}],
+)
+def test_other_preprocessing_is_refused(changes, published, tmp_path):
+    folder = shutil.copytree(published, tmp_path / "other")
+    path = folder / "preprocessor_config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    (name,) = changes
+    with pytest.raises(ValueError, match=f"preprocessor_config.json has {name}.*supported"):
+        make_config(folder).resolve()
 
 
 def test_one_file_or_many_shards(parts, tmp_path, published):
@@ -138,90 +175,6 @@ def test_a_whole_policy_needs_no_checkpoint(published, tmp_path):
     loaded = OpenVLAPolicy.from_pretrained(tmp_path / "adapted")
     assert torch.equal(log_probs_and_values(loaded), log_probs_and_values(adapted))
     assert not torch.equal(log_probs_and_values(loaded), expected)
-
-
-class PublishedModel(nn.Module):
-    """The published model class as PEFT sees it: the same modules under the same names."""
-
-    def __init__(self, parts):
-        super().__init__()
-        self.vision_backbone = nn.Module()
-        self.vision_backbone.featurizer = parts.featurizer
-        self.vision_backbone.fused_featurizer = parts.fused_featurizer
-        self.projector = parts.projector
-        self.language_model = parts.language_model
-
-
-@pytest.fixture(scope="module")
-def published_adapter(published, tmp_path_factory) -> Path:
-    """A LoRA adapter made by PEFT on the published model, with the layer names that OpenVLA's users give."""
-    from published_checkpoint import make_parts
-
-    torch.manual_seed(3)
-    targets = ["proj", "qkv", "fc1", "fc2", "q", "kv", "fc3", "q_proj", "k_proj", "v_proj", "o_proj",
-               "gate_proj", "up_proj", "down_proj", "lm_head"]  # fmt: skip
-    config = LoraConfig(r=4, lora_alpha=4, target_modules=targets, init_lora_weights="gaussian")
-    model = get_peft_model(PublishedModel(make_parts()), config)
-    for name, parameter in model.named_parameters():
-        if "lora_B" in name:
-            nn.init.normal_(parameter, std=0.05)
-    folder = tmp_path_factory.mktemp("openvla") / "adapter"
-    model.save_pretrained(folder)
-    return folder
-
-
-def test_published_adapters(published, published_adapter, tmp_path):
-    """Merged or apart they are the same; apart, they are what is trained and saved."""
-    base = log_probs_and_values(make_policy(published, stir=False))
-    apart = make_policy(published, stir=False, adapter=str(published_adapter))
-    merged = make_policy(published, stir=False, adapter=str(published_adapter), merge_adapter=True)
-    assert (log_probs_and_values(apart)[0] - base[0]).abs().min() > 1e-2
-    torch.testing.assert_close(log_probs_and_values(merged), log_probs_and_values(apart), atol=1e-3, rtol=1e-4)
-    assert apart.config.lora_rank == 4
-    assert all(p.requires_grad == (".lora_" in n) for n, p in apart.network.named_parameters())
-    assert all(p.requires_grad for p in merged.network.parameters())
-    # The towers' last blocks, which nothing looks at, are not there to be adapted; the patch embedding is.
-    assert "vision_backbone.featurizer.patch_embed.proj" in apart.config.lora_targets
-    assert not any("blocks.7" in name for name in apart.config.lora_targets if ".featurizer" in name)
-    apart.save_pretrained(tmp_path / "saved")
-    again = OpenVLAPolicy.from_pretrained(tmp_path / "saved")
-    assert torch.equal(log_probs_and_values(again), log_probs_and_values(apart))
-
-
-def test_fresh_adapters_on_top_of_a_merged_one(published, published_adapter, tmp_path):
-    policy = make_policy(published, adapter=str(published_adapter), merge_adapter=True, lora_rank=2)
-    policy.save_pretrained(tmp_path)
-    again = OpenVLAPolicy.from_pretrained(tmp_path)
-    assert torch.equal(log_probs_and_values(again), log_probs_and_values(policy))
-
-
-def test_adapters_are_written_for_peft(published, parts, tmp_path):
-    """What is written goes onto the published model, by PEFT alone, and does there what it did here."""
-    policy = make_policy(published, lora_rank=4, lora_modules=["language"])
-    policy.save_adapter(tmp_path / "adapter")
-    reloaded = make_policy(published, stir=False, adapter=str(tmp_path / "adapter"))
-    assert torch.equal(log_probs_and_values(reloaded)[0], log_probs_and_values(policy)[0])
-    from peft import PeftModel
-    from published_checkpoint import make_parts
-
-    model = PeftModel.from_pretrained(PublishedModel(make_parts()), str(tmp_path / "adapter"))
-    tokens = torch.arange(1, 9)[None]
-    with torch.no_grad():
-        expected = policy.network.language_model(input_ids=tokens).logits
-        torch.testing.assert_close(model.base_model.model.language_model(input_ids=tokens).logits, expected)
-        plain = parts.language_model(input_ids=tokens).logits
-    assert (plain - expected).abs().max() > 1e-2
-    with pytest.raises(ValueError, match="lora_rank"):
-        make_policy(published).save_adapter(tmp_path / "none")
-
-
-def test_adapters_of_another_network_are_refused(published, published_adapter, tmp_path):
-    folder = shutil.copytree(published_adapter, tmp_path / "other")
-    state = load_file(folder / ADAPTER_WEIGHTS)
-    renamed = {key.replace("language_model", "llm"): value for key, value in state.items()}
-    save_file(renamed, folder / ADAPTER_WEIGHTS, metadata={"format": "pt"})
-    with pytest.raises(ValueError, match="llm"):
-        make_policy(published, adapter=str(folder))
 
 
 def test_settings_that_a_saved_policy_cannot_change(published, tmp_path):

@@ -9,7 +9,7 @@ from lerobot_policy_openvla.action_statistics import ActionStatisticsProcessorSt
 from lerobot_policy_openvla.action_tokens import ActionTokenizer
 from lerobot_policy_openvla.architecture import Architecture
 from lerobot_policy_openvla.distribution import TokenDistribution
-from lerobot_policy_openvla.images import prepare_images
+from lerobot_policy_openvla.images import centre_crop, prepare_images
 from lerobot_policy_openvla.prompt import PromptTokenizer
 from openvla_samples import TASKS
 from PIL import Image
@@ -51,15 +51,39 @@ def test_physical_actions():
 
 def test_choice_of_statistics():
     published = {"bridge_orig": BRIDGE, "other": OTHER}
-    assert choose_statistics(None, published, None)["key"] == "bridge_orig"
-    assert choose_statistics(None, {"other": OTHER}, None) == {"key": "other"} | OTHER
+    unused = {"unused": [False] * 7}
+    assert choose_statistics(None, {"other": OTHER}, None) == {"key": "other"} | OTHER | unused
     stats = {"action": {"min": np.array([0.0, 2.0]), "max": np.array([1.0, 3.0])}}
     expected = {"key": "dataset", "q01": [0.0, 2.0], "q99": [1.0, 3.0], "mask": [True, False]}
+    expected["unused"] = [False, False]
     assert choose_statistics("dataset", {}, stats) == expected
     with pytest.raises(ValueError, match=r"'fractal'.*bridge_orig.*dataset"):
         choose_statistics("fractal", published, None)
     with pytest.raises(ValueError, match="lerobot-train"):
         choose_statistics("dataset", published, None)
+    with pytest.raises(ValueError, match=r"not given.*\['bridge_orig', 'other'\]"):
+        choose_statistics(None, published, None)
+
+
+def test_dimensions_that_never_change():
+    """Of four: one that moves, one that never does, one that rarely does (only q01 = q99), a still gripper."""
+    stats = {
+        "q01": [-2.0, 0.25, 0.0, 1.0], "q99": [2.0, 0.25, 0.0, 1.0], "mask": [True, True, True, False],
+        "min": [-2.0, 0.25, -1.0, 1.0], "max": [2.0, 0.25, 1.0, 1.0],
+    }  # fmt: skip
+    chosen = choose_statistics("mine", {"mine": stats}, None)
+    assert chosen["unused"] == [False, True, False, True]
+    fields = {name: chosen[name] for name in ("q01", "q99", "mask", "unused")}
+    physical = ActionStatisticsProcessorStep(**fields, inverse=True).convert(torch.tensor([[0.5, 0.5, -1.0, 0.9]]))
+    np.testing.assert_allclose(physical, [[1.0, 0.25, 0.0, 0.9]], atol=1e-6)
+    step = ActionStatisticsProcessorStep(**fields)
+    actions = torch.tensor([[1.0, 0.25, 0.0, 1.0], [1.0, 0.3, 0.5, 1.0]])
+    np.testing.assert_allclose(step.convert(actions), [[0.5, 0.0, -1.0, 0.0], [0.5, 0.0, 1.0, 0.0]], atol=1e-6)
+    # Recorded with LeRobot: what the arm did not do is 0, what the gripper did not do stays as it was.
+    same = {"action": {side: np.array([0.25, 1.0]) for side in ("min", "max", "q01", "q99")}}
+    assert choose_statistics("dataset", {}, same)["unused"] == [True, False]
+    with pytest.raises(ValueError, match=r"dimension 0: q01 1\.0 must not be above q99 0\.5"):
+        ActionStatisticsProcessorStep(q01=[1.0], q99=[0.5], mask=[True])
 
 
 def test_prompt(published):
@@ -82,26 +106,46 @@ def test_prompt_needs_the_tokenizer(tmp_path):
 
 
 @pytest.mark.parametrize(("height", "width"), [(128, 128), (480, 640)])
-@pytest.mark.parametrize("crop", [False, True])
-def test_images_are_what_pil_makes_of_them(height, width, crop):
+def test_images_are_what_pil_makes_of_them(height, width):
     rng = np.random.default_rng(0)
     coarse = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
     image = Image.fromarray(coarse).resize((width, height), Image.Resampling.BILINEAR)
     architecture = Architecture(("", ""), (None, None), 224, tuple(MEANS), tuple(STDS), {}, 256, 64)
     tensor = torch.from_numpy(np.array(image)).permute(2, 0, 1)[None]
-    pixels = prepare_images(tensor, architecture, crop)
-    if crop:
-        rows, columns = round(height * 0.9**0.5), round(width * 0.9**0.5)
-        top, left = (height - rows) // 2, (width - columns) // 2
-        image = image.crop((left, top, left + columns, top + rows))
+    pixels = prepare_images(tensor, architecture, crop=False)
     levels = np.array(image.resize((224, 224), Image.Resampling.BICUBIC)).astype(np.float64) / 255
     for half, mean, std in zip(pixels[0].chunk(2), MEANS, STDS, strict=True):
         back = half.permute(1, 2, 0).double().numpy() * np.array(std) + np.array(mean)
         # PIL computes with integers; torch's own uint8 kernel is no closer to it.
         assert np.abs(back - levels).max() < 2.01 / 255
         assert np.abs(back - levels).mean() < 0.05 / 255
-    from_floats = prepare_images(tensor.float() / 255, architecture, crop)
+    from_floats = prepare_images(tensor.float() / 255, architecture, crop=False)
     assert torch.equal(from_floats, pixels)
+
+
+@pytest.mark.parametrize(("height", "width"), [(5, 5), (48, 64), (224, 224)])
+def test_centre_crop_is_the_published_one(height, width):
+    """Bilinear at points from (H - 1) (1 - sqrt(0.9)) / 2 to (H - 1) (1 + sqrt(0.9)) / 2, no antialiasing."""
+    image = np.random.default_rng(0).integers(0, 256, (height, width), dtype=np.uint8)
+    edges = [(side - 1) * (1 + sign * math.sqrt(0.9)) / 2 for side in (height, width) for sign in (-1, 1)]
+    rows, columns = np.linspace(edges[0], edges[1], 224), np.linspace(edges[2], edges[3], 224)
+    across = np.stack([np.interp(columns, np.arange(width), line) for line in image / 255])
+    expected = np.stack([np.interp(rows, np.arange(height), line) for line in across.T], axis=1)
+    tensor = torch.from_numpy(image).expand(2, 3, -1, -1)
+    for images in (tensor, tensor.float() / 255):
+        cropped = centre_crop(images if images.dtype == torch.uint8 else images * 255, 224)
+        assert cropped.shape == (2, 3, 224, 224)
+        assert np.abs(cropped[1, 2].numpy() - np.floor(255.5 * expected)).max() <= 1
+    architecture = Architecture(("", ""), (None, None), 224, tuple(MEANS), tuple(STDS), {}, 256, 64)
+    whole = prepare_images(tensor, architecture, crop=True)
+    np.testing.assert_allclose(whole[0, 3], (cropped[0, 0] / 255 - 0.5) / 0.5, atol=2.01 / 255)
+
+
+def test_centre_crop_by_hand():
+    """Of a ramp of 20 levels a pixel, five wide: from 40 - 40 sqrt(0.9) = 2.053 to 77.947, in steps of 37.947."""
+    ramp = (torch.arange(5, dtype=torch.uint8) * 20).expand(1, 3, 5, 5)
+    # Times 255.5 / 255: 2.057, 40.078, 78.100; at the middle 40.078.
+    assert centre_crop(ramp, 3)[0, 0, 0].tolist() == [2.0, 40.0, 78.0]
 
 
 def test_images_must_have_three_channels():

@@ -5,7 +5,7 @@ import pytest
 import torch
 from lerobot_policy_openvla.images import prepare_images
 from lerobot_policy_openvla.modeling_openvla import FEATURES
-from openvla_samples import CAMERA, make_batch, make_policy, take
+from openvla_samples import CAMERA, make_batch, make_policy, reference_of, take
 from published_checkpoint import BINS, VOCABULARY, reference_logits
 
 
@@ -17,14 +17,6 @@ def base(published):
 @pytest.fixture(scope="module")
 def lora(published):
     return make_policy(published, lora_rank=4)
-
-
-def reference_of(policy, parts, batch, tokens):
-    """Logits (B, 7, V) one observation at a time, with the published modules."""
-    pixels = prepare_images(batch[CAMERA], policy.architecture, crop=False)
-    prompts = [list(policy.prompt_tokenizer(text)) for text in batch["task"]]
-    rows = zip(pixels, prompts, tokens.tolist(), strict=True)
-    return torch.stack([reference_logits(parts, x, prompt, row[:-1]) for x, prompt, row in rows])
 
 
 def test_log_probabilities_are_those_of_the_published_modules(base, parts):

@@ -49,7 +49,13 @@ def cloned(published, demonstrations, tmp_path_factory) -> Path:
     output = tmp_path_factory.mktemp("openvla") / "clone"
     command = [
         *(sys.executable, "-m", "lerobot.scripts.lerobot_train", "--policy.type=openvla"),
-        *(f"--policy.checkpoint={published}", "--peft.r=4", "--peft.method_type=LORA", "--policy.device=cpu"),
+        *(
+            f"--policy.checkpoint={published}",
+            "--policy.unnorm_key=bridge_orig",
+            "--peft.r=4",
+            "--peft.method_type=LORA",
+            "--policy.device=cpu",
+        ),
         *("--dataset.repo_id=local/openvla", f"--dataset.root={demonstrations}", f"--output_dir={output}"),
         *("--policy.push_to_hub=false", "--num_workers=0", "--batch_size=4", "--steps=3", "--log_freq=1"),
         *("--save_checkpoint=true", "--wandb.enable=false", "--env_eval_freq=0"),
@@ -141,7 +147,12 @@ def test_ppo_makes_rewarded_tokens_likelier(published):
     """The trainer's own agent and update, without an environment: actions with a high first dimension pay."""
     torch.manual_seed(0)
     config = PreTrainedConfig.get_choice_class("openvla")(
-        checkpoint=str(published), device="cpu", lora_rank=8, lora_modules=["language"], dtype="float32"
+        checkpoint=str(published),
+        unnorm_key="bridge_orig",
+        device="cpu",
+        lora_rank=8,
+        lora_modules=["language"],
+        dtype="float32",
     )
     policy = make_policy(config, env_cfg=CronosEnvConfig(observation_height=64, observation_width=64)).eval()
     processors = make_processors(policy, *make_pre_post_processors(config))

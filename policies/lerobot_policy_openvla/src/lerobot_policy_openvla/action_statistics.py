@@ -12,32 +12,48 @@ from torch import Tensor
 
 DATASET = "dataset"
 """Key of the statistics of a LeRobotDataset."""
-DEFAULT_KEY = "bridge_orig"
-"""Key of the statistics that are used unless others are asked for."""
+SMALLEST_RANGE = 1e-8
+"""Added to q99 - q01 where actions are normalised, as in the published training code."""
 
 
 def choose_statistics(
     key: str | None, published: dict[str, dict[str, Any]], dataset_stats: dict[str, dict[str, Any]] | None
 ) -> dict[str, Any]:
-    """Return the key, q01, q99 and mask (lists with an entry a dimension) of the statistics to use.
+    """Return the key, q01, q99, mask and unused (lists with an entry a dimension) of the statistics to use.
 
     Args:
-        key: one of `published`, `dataset`, or None for `bridge_orig` or the only one there is.
+        key: one of `published`, `dataset`, or None for the only one there is.
         published: by data set, of the checkpoint.
         dataset_stats: LeRobot's, with quantiles or at least minimum and maximum of `action`.
 
     Raises:
-        ValueError: there are none of that name.
+        ValueError: there are none of that name, or no name is given and there are several.
     """
     if key == DATASET:
         return _of_dataset(dataset_stats)
     if key is None:
-        key = DEFAULT_KEY if DEFAULT_KEY in published or len(published) != 1 else next(iter(published))
+        if len(published) != 1:
+            raise ValueError(
+                f"unnorm_key is not given, and there is not one set of action statistics but {len(published)}: "
+                f"choose one of {sorted(published)}, or {DATASET!r}"
+            )
+        key = next(iter(published))
     if key not in published:
         raise ValueError(f"unnorm_key={key!r} is not one of {sorted(published)}, nor is it {DATASET!r}")
     entry = published[key]
+    if missing := [side for side in ("q01", "q99") if side not in entry]:
+        raise ValueError(f"the action statistics {key!r} lack {missing}; they have {sorted(entry)}")
     mask = entry.get("mask", [True] * len(entry["q01"]))
-    return {"key": key, "q01": list(entry["q01"]), "q99": list(entry["q99"]), "mask": [bool(m) for m in mask]}
+    return _statistics(key, entry, ("q01", "q99"), [bool(m) for m in mask])
+
+
+def _statistics(key: str, entry: dict[str, Any], sides: tuple[str, str], mask: list[bool]) -> dict[str, Any]:
+    q01, q99 = ([float(v) for v in entry[side]] for side in sides)
+    unused = entry.get("unused")
+    if unused is None:
+        least, most = (entry.get(side, bound) for side, bound in (("min", q01), ("max", q99)))
+        unused = [bool(low == high) for low, high in zip(least, most, strict=True)]
+    return {"key": key, "q01": q01, "q99": q99, "mask": mask, "unused": unused}
 
 
 def _of_dataset(stats: dict[str, dict[str, Any]] | None) -> dict[str, Any]:
@@ -46,9 +62,12 @@ def _of_dataset(stats: dict[str, dict[str, Any]] | None) -> dict[str, Any]:
             f"unnorm_key={DATASET!r} needs a data set's statistics of 'action': use lerobot-train first"
         )
     sides = ("q01", "q99") if {"q01", "q99"} <= set(stats["action"]) else ("min", "max")
-    q01, q99 = ([float(v) for v in stats["action"][side]] for side in sides)
     # As the published checkpoints have it: the last dimension, the gripper, is 0 to 1 already.
-    return {"key": DATASET, "q01": q01, "q99": q99, "mask": [True] * (len(q01) - 1) + [False]}
+    mask = [True] * (len(stats["action"]["min"]) - 1) + [False]
+    chosen = _statistics(DATASET, stats["action"], sides, mask)
+    # A gripper that never moved stays where it was: without the mask nothing would bring 0 back to that.
+    chosen["unused"] = [unused and mapped for unused, mapped in zip(chosen["unused"], mask, strict=True)]
+    return chosen
 
 
 @dataclass
@@ -60,7 +79,7 @@ class ActionStatisticsProcessorStep(ProcessorStep):
     new data set's, and the bins would come to mean other actions.
 
     Raises:
-        ValueError: the statistics differ in length, q01 is not below q99, or an action has another width.
+        ValueError: the statistics differ in length, q01 is above q99, or an action has another width.
     """
 
     q01: list[float] = field(default_factory=list)
@@ -69,6 +88,8 @@ class ActionStatisticsProcessorStep(ProcessorStep):
     """Physical action that 1 stands for."""
     mask: list[bool] = field(default_factory=list)
     """Which dimensions are mapped."""
+    unused: list[bool] = field(default_factory=list)
+    """Which dimensions never change in the data (minimum = maximum): normalised they are 0. Empty: none."""
     inverse: bool = False
     """False: physical to normalised (preprocessor). True: normalised to physical (postprocessor)."""
 
@@ -79,9 +100,13 @@ class ActionStatisticsProcessorStep(ProcessorStep):
                 "q01, q99 and mask need one entry a dimension, got "
                 f"{len(self.q01)}, {len(self.q99)} and {len(self.mask)}"
             )
+        if not self.unused:
+            self.unused = [False] * len(self.q01)
+        if len(self.unused) != len(self.q01):
+            raise ValueError(f"unused needs {len(self.q01)} entries, one a dimension, got {len(self.unused)}")
         for dim, (low, high, mapped) in enumerate(zip(self.q01, self.q99, self.mask, strict=True)):
-            if mapped and not low < high:
-                raise ValueError(f"action dimension {dim}: q01 {low} must be below q99 {high}")
+            if mapped and not low <= high:
+                raise ValueError(f"action dimension {dim}: q01 {low} must not be above q99 {high}")
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Convert the transition's action, if it has one."""
@@ -93,21 +118,26 @@ class ActionStatisticsProcessorStep(ProcessorStep):
         return converted
 
     def convert(self, action: Tensor) -> Tensor:
-        """Convert actions (..., D) in the direction that `inverse` tells."""
+        """Convert actions (..., D) in the direction that `inverse` tells.
+
+        A dimension with q01 = q99 comes back as that constant, whatever its token.
+        """
         if action.shape[-1] != len(self.q01):
             raise ValueError(f"action has {action.shape[-1]} dimensions, the statistics have {len(self.q01)}")
         action = action.float()
         low, high = (
             torch.tensor(side, dtype=torch.float32, device=action.device) for side in (self.q01, self.q99)
         )
-        mask = torch.tensor(self.mask, device=action.device)
+        mask, unused = (torch.tensor(which, device=action.device) for which in (self.mask, self.unused))
         if self.inverse:
             return torch.where(mask, 0.5 * (action + 1) * (high - low) + low, action)
-        return torch.where(mask, 2 * (action - low) / (high - low) - 1, action).clamp(-1.0, 1.0)
+        normalised = torch.where(mask, 2 * (action - low) / (high - low + SMALLEST_RANGE) - 1, action)
+        return normalised.clamp(-1.0, 1.0).masked_fill(unused, 0.0)
 
     def get_config(self) -> dict[str, Any]:
         """Return what is written to the processor's JSON."""
-        return {"q01": self.q01, "q99": self.q99, "mask": self.mask, "inverse": self.inverse}
+        names = ("q01", "q99", "mask", "unused", "inverse")
+        return {name: getattr(self, name) for name in names}
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]

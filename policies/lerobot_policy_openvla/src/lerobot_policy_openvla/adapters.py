@@ -28,6 +28,8 @@ PEFT_PREFIXES = ("base_model.model.", "network.")
 """What PEFT puts before a name, and where LeRobot's policies have the network."""
 PARTS = {"vision": "vision_backbone", "projector": "projector", "language": "language_model"}
 """What LoRA may be asked to adapt."""
+BASE_LAYER = ".base_layer."
+"""In the name of an adapted layer's own weights, which PEFT saves too where that is the output layer."""
 
 
 def linear_names(network: nn.Module, parts: Sequence[str]) -> list[str]:
@@ -57,13 +59,14 @@ def load_adapter(network: OpenVLANetwork, name: str, *, merge: bool) -> LoraConf
         merge: add it to the weights instead of keeping it apart and trainable.
 
     Raises:
-        ValueError: it is no LoRA adapter, or its tensors are not this network's.
+        ValueError: it is no LoRA adapter, its tensors are not this network's, or it was made on other weights.
     """
     folder = fetch(name)
     config = PeftConfig.from_pretrained(str(folder))
     if not isinstance(config, LoraConfig):
         raise ValueError(f"{name} is an adapter of type {config.peft_type}; only LoRA can be loaded.")
     state = {_network_name(key): value for key, value in load_file(folder / ADAPTER_WEIGHTS).items()}
+    _check_base(network, {key: state.pop(key) for key in list(state) if BASE_LAYER in key}, name)
     modules = dict(network.named_modules())
     kept = {key: value for key, value in state.items() if _module_name(key) in modules}
     unknown = sorted(key for key in state.keys() - kept.keys() if not key.startswith("vision_backbone."))
@@ -82,14 +85,22 @@ def load_adapter(network: OpenVLANetwork, name: str, *, merge: bool) -> LoraConf
 
 
 def save_adapter(network: OpenVLANetwork, folder: Path, base: str | None) -> None:
-    """Write the network's adapter to `folder` in PEFT's format, for PEFT or `load_adapter`."""
+    """Write the network's adapter to `folder` in PEFT's format, for PEFT or `load_adapter`.
+
+    Fields at their defaults are left out: an older PEFT, such as OpenVLA's, refuses those it does not know.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     configs: Any = network.peft_config
     config = configs[ADAPTER]
-    fields = config.to_dict() | {"base_model_name_or_path": base, "inference_mode": True}
-    fields["target_modules"] = sorted(fields["target_modules"])
+    defaults = LoraConfig().to_dict()
+    fields = {k: v for k, v in config.to_dict().items() if k not in defaults or v != defaults[k]}
+    fields.pop("peft_version", None)
+    fields |= {"peft_type": config.peft_type, "base_model_name_or_path": base, "inference_mode": True}
+    fields |= {"r": config.r, "lora_alpha": config.lora_alpha, "target_modules": sorted(config.target_modules)}
     (folder / ADAPTER_CONFIG).write_text(json.dumps(fields, indent=2, sort_keys=True, default=str))
-    state: dict[str, Tensor] = get_peft_model_state_dict(network, adapter_name=ADAPTER)
+    state: dict[str, Tensor] = get_peft_model_state_dict(
+        network, adapter_name=ADAPTER, save_embedding_layers=False
+    )
     tensors = {f"base_model.model.{key}": value.contiguous() for key, value in state.items()}
     save_file(tensors, folder / ADAPTER_WEIGHTS, metadata={"format": "pt"})
 
@@ -112,6 +123,27 @@ def has_adapter(network: OpenVLANetwork) -> bool:
 def is_adapter_tensor(name: str) -> bool:
     """Whether a parameter of that name belongs to an adapter."""
     return ".lora_" in name
+
+
+def _check_base(network: OpenVLANetwork, saved: dict[str, Tensor], name: str) -> None:
+    """Compare weights that lie beside an adapter with the network's, in the less precise format of the two.
+
+    Raises:
+        ValueError: they are of a layer that the network has not, or differ.
+    """
+    own = network.state_dict()
+    for key, value in saved.items():
+        weight = own.get(key.replace(BASE_LAYER, "."))
+        if weight is None:
+            raise ValueError(f"The adapter {name} has tensors that the network has not: {[key]}.")
+        if not (value.is_floating_point() and weight.is_floating_point()):
+            continue  # Quantised, each in a way of its own.
+        dtype = min(value.dtype, weight.dtype, key=lambda kind: kind.itemsize)
+        if not torch.equal(value.to(weight.device, dtype), weight.to(dtype)):
+            raise ValueError(
+                f"The adapter {name} was made on other weights than these: its {key} is not the network's. "
+                "Choose the checkpoint that it was trained on (an adapter that was merged before belongs to it)."
+            )
 
 
 def _inject(network: OpenVLANetwork, config: LoraConfig) -> None:

@@ -15,6 +15,12 @@ SUPPORTED = {
     "image_resize_strategy": "resize-naive",
 }
 """The fields of config.json that decide what the network is, and the only values that are implemented."""
+SUPPORTED_PREPROCESSING = {
+    "image_resize_strategy": "resize-naive",
+    "tvf_do_letterbox": False,
+    "interpolations": ["bicubic", "bicubic"],
+}
+"""The same of preprocessor_config.json: how an image comes to the towers' size."""
 
 Triple = tuple[float, float, float]
 
@@ -58,6 +64,12 @@ class Architecture:
         for name, value in SUPPORTED.items():
             if config.get(name, value) != value or "model_type" not in config:
                 raise ValueError(f"config.json has {name}={config.get(name)!r}; only {value!r} is supported.")
+        for name, value in SUPPORTED_PREPROCESSING.items():
+            if preprocessor and preprocessor.get(name, value) not in (value, None):
+                raise ValueError(
+                    f"preprocessor_config.json has {name}={preprocessor[name]!r}; only {value!r} is supported: "
+                    "images would not be what the network was trained with."
+                )
         needed = ("timm_model_ids", "image_sizes", "text_config", "n_action_bins", "pad_to_multiple_of")
         if missing := [name for name in needed if name not in config]:
             raise ValueError(f"config.json of the checkpoint lacks {missing}.")

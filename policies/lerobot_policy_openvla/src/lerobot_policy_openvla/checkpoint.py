@@ -20,6 +20,8 @@ from lerobot_policy_openvla.architecture import Architecture
 from lerobot_policy_openvla.network import OpenVLANetwork, depth_of
 
 CONFIG, PREPROCESSOR = "config.json", "preprocessor_config.json"
+STATISTICS = "dataset_statistics.json"
+"""Action statistics of a fine-tuning run, beside what it trained."""
 WEIGHTS, WEIGHTS_INDEX = "model.safetensors", "model.safetensors.index.json"
 NETWORK_PREFIX = "network."
 """Where the network is in a policy's model.safetensors."""
@@ -70,8 +72,27 @@ def read_checkpoint(name: str, revision: str | None = None) -> Checkpoint:
         return Checkpoint(folder, Architecture.from_dict(config["architecture"]), statistics, NETWORK_PREFIX)
     preprocessor = _read_json(folder / PREPROCESSOR) if (folder / PREPROCESSOR).is_file() else None
     architecture = Architecture.from_published(config, preprocessor)
-    statistics = {key: value["action"] for key, value in config.get("norm_stats", {}).items()}
+    statistics = tuned_statistics(folder) or _actions(config.get("norm_stats", {}))
     return Checkpoint(folder, architecture, statistics, "")
+
+
+def tuned_statistics(folder: Path) -> dict[str, dict[str, Any]] | None:
+    """Return the action statistics in the folder's dataset_statistics.json, None without that file.
+
+    They take the place of all that the checkpoint below has, as the published loader does it.
+
+    Raises:
+        ValueError: the file has other contents.
+    """
+    path = folder / STATISTICS
+    return _actions(_read_json(path), str(path)) if path.is_file() else None
+
+
+def _actions(published: dict[str, Any], source: str = "norm_stats in config.json") -> dict[str, dict[str, Any]]:
+    strange = [key for key, value in published.items() if not isinstance(value, dict) or "action" not in value]
+    if strange:
+        raise ValueError(f"{source} has no 'action' under {strange}.")
+    return {key: value["action"] for key, value in published.items()}
 
 
 def holds_network(folder: Path) -> bool:

@@ -9,7 +9,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 
 from lerobot_policy_openvla.action_statistics import choose_statistics
-from lerobot_policy_openvla.checkpoint import read_checkpoint
+from lerobot_policy_openvla.checkpoint import fetch, read_checkpoint, tuned_statistics
 from lerobot_policy_openvla.network import ATTENTION
 
 Dtype = Literal["auto", "bfloat16", "float32"]
@@ -32,8 +32,9 @@ class OpenVLAConfig(PreTrainedConfig):
     merge_adapter: bool = False
     """Add `adapter` to the weights. False keeps it apart, and training goes on with it."""
     unnorm_key: str | None = None
-    """Data set of the checkpoint whose action quantiles the bins span. null: `bridge_orig`, or the only one.
-    `dataset`: the quantiles of the LeRobotDataset that training begins with."""
+    """Data set whose action quantiles the bins span: of dataset_statistics.json beside the adapter or the
+    checkpoint, or else of the checkpoint's config.json. null: the only one. `dataset`: the quantiles of the
+    LeRobotDataset that training begins with."""
 
     lora_rank: int = 0
     """Rank of fresh LoRA adapters, the only weights that are then trained and saved (32 in the paper). 0: none,
@@ -137,7 +138,10 @@ class OpenVLAConfig(PreTrainedConfig):
             raise ValueError("choose the weights to build on: --policy.checkpoint=openvla/openvla-7b")
         checkpoint = read_checkpoint(self.checkpoint, self.checkpoint_revision)
         self.architecture = checkpoint.architecture.to_dict()
-        self.action_statistics = choose_statistics(self.unnorm_key, checkpoint.action_statistics, dataset_stats)
+        published = (
+            tuned_statistics(fetch(self.adapter)) if self.adapter else None
+        ) or checkpoint.action_statistics
+        self.action_statistics = choose_statistics(self.unnorm_key, published, dataset_stats)
         self.unnorm_key = self.action_statistics["key"]
 
     @property

@@ -6,7 +6,7 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import grid_sample, interpolate
 
 from lerobot_policy_openvla.architecture import Architecture
 
@@ -14,19 +14,28 @@ CROP_AREA = 0.9
 """Part of the image that the centre crop keeps: checkpoints trained on random crops of it are evaluated so."""
 
 
-def centre_crop(images: Tensor, area: float = CROP_AREA) -> Tensor:
-    """Cut the middle out of images (..., H, W): `area` of the whole, with the same aspect ratio."""
-    height, width = images.shape[-2:]
-    rows, columns = (round(side * math.sqrt(area)) for side in (height, width))
-    top, left = (height - rows) // 2, (width - columns) // 2
-    return images[..., top : top + rows, left : left + columns]
+def centre_crop(images: Tensor, size: int, area: float = CROP_AREA) -> Tensor:
+    """Cut the middle out of images (B, 3, H, W) in 0..255 and resize it to (B, 3, size, size).
+
+    Both in one, as in the published evaluation (TensorFlow's `crop_and_resize`): bilinear without antialiasing,
+    the outermost pixels of the result on the edges of the crop, whose sides are sqrt(area) of the image's as
+    distances between the centres of its outermost pixels.
+    """
+    edge = math.sqrt(area)
+    points = torch.linspace(-edge, edge, size, device=images.device)
+    grid = torch.stack(torch.meshgrid(points, points, indexing="xy"), dim=-1)
+    grid = grid.expand(len(images), -1, -1, -1)
+    cropped = grid_sample(images.float() / 255, grid, mode="bilinear", align_corners=True)
+    # How TensorFlow makes levels of floats in [0, 1].
+    return (cropped.clamp(0, 1) * 255.5).floor()
 
 
 def resize(images: Tensor, size: int) -> Tensor:
     """Bicubic resize of images (B, 3, H, W) in 0..255 to (B, 3, size, size), without regard to the aspect ratio.
 
-    The levels are what PIL makes of them, with which the published checkpoints were trained: along rows first,
-    then along columns, and each time rounded to whole levels.
+    The levels are what PIL makes of them in the checkpoints' own processor: along rows first, then along columns,
+    and each time rounded to whole levels. In training the published checkpoints saw images that TensorFlow's
+    lanczos3 had resized.
     """
     for shape in ((images.shape[-2], size), (size, size)):
         images = interpolate(images.float(), size=shape, mode="bicubic", antialias=True)
@@ -41,7 +50,7 @@ def prepare_images(images: Tensor, architecture: Architecture, crop: bool) -> Te
     Args:
         images: uint8, or floats in [0, 1].
         architecture: tells the size and the normalisation of each tower.
-        crop: keep the middle only, see `centre_crop`.
+        crop: keep the middle only, see `centre_crop`; otherwise see `resize`.
 
     Raises:
         ValueError: the shape is another one.
@@ -49,7 +58,7 @@ def prepare_images(images: Tensor, architecture: Architecture, crop: bool) -> Te
     if images.ndim != 4 or images.shape[1] != 3:
         raise ValueError(f"Images must be (B, 3, height, width), got {tuple(images.shape)}.")
     levels = images if images.dtype == torch.uint8 else images.float() * 255
-    pixels = resize(centre_crop(levels) if crop else levels, architecture.image_size) / 255
+    pixels = (centre_crop if crop else resize)(levels, architecture.image_size) / 255
     towers = []
     for mean, std in zip(architecture.image_means, architecture.image_stds, strict=True):
         shift, scale = (torch.tensor(v, device=pixels.device).view(3, 1, 1) for v in (mean, std))

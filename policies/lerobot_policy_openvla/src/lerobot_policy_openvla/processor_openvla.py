@@ -31,7 +31,7 @@ def make_openvla_pre_post_processors(
     """
     config.resolve(dataset_stats)
     assert config.action_statistics is not None
-    statistics = {name: config.action_statistics[name] for name in ("q01", "q99", "mask")}
+    statistics = {name: values for name, values in config.action_statistics.items() if name != "key"}
     steps = make_default_policy_processor_steps(config, dataset_stats, normalizer_device=config.device)
     return make_policy_processor_pipelines(
         input_steps=[
