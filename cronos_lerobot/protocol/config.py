@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
+from lerobot_env_cronos.vector_env import REWARDS
+
 from cronos_lerobot.protocol.interventions import Intervention
-
-REWARDS = ("difference", "level")
-
-NUM_TRAIN_CONFIGURATIONS = 64
-"""Benchmark configurations of the training split (paper, Section 5)."""
 
 COUNTED_INTERVENTIONS = (Intervention.SCENE_RESET, Intervention.HEURISTIC_RESET, Intervention.DIVERGENCE)
 """What spends the budget B. Task switches, end-effector resets and the first placement are free."""
@@ -42,7 +40,7 @@ class ProtocolConfig:
     task_order: str = "heuristic"
     """How the next task is chosen: `heuristic` (the fixed cycle of Appendix E), `random` (uniform) or the name of
     a registered order."""
-    num_configurations: int = 64
+    num_configurations: int = NUM_CONFIGURATIONS
     """Scene resets draw from the first so many configurations of the training split, 1 to 64."""
     reward: str = "difference"
     """`difference` pays the change of the reward level (0.1 grasped, 1.0 success) between two steps, `level`
@@ -59,10 +57,9 @@ class ProtocolConfig:
             raise ValueError(f"protocol.reset_budget must be >= 1 or null, got {self.reset_budget}.")
         if self.reward not in REWARDS:
             raise ValueError(f"protocol.reward must be one of {REWARDS}, got {self.reward!r}.")
-        if not 1 <= self.num_configurations <= NUM_TRAIN_CONFIGURATIONS:
+        if not 1 <= self.num_configurations <= NUM_CONFIGURATIONS:
             raise ValueError(
-                f"protocol.num_configurations must be 1 to {NUM_TRAIN_CONFIGURATIONS}, "
-                f"got {self.num_configurations}."
+                f"protocol.num_configurations must be 1 to {NUM_CONFIGURATIONS}, got {self.num_configurations}."
             )
 
     def scene_reset_interval_at(self, interaction_step: int) -> int | None:

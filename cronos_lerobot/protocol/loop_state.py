@@ -38,14 +38,18 @@ class LoopState:
     """Policy updates so far: the version of the policy that acts."""
     task: np.ndarray = field(init=False)
     """(N,) index of the current task in the task set."""
-    segment: np.ndarray = field(init=False)
+    piece: np.ndarray = field(init=False)
     """(N,) index of the current uncut piece of the stream: task switches and divergences both end one."""
-    position: np.ndarray = field(init=False)
-    """(N,) task switches since the last scene reset: 0 for the first segment after it."""
+    segments_since_reset: np.ndarray = field(init=False)
+    """(N,) finished segments since the last scene reset: 0 during the first one after it."""
     succeeded: np.ndarray = field(init=False)
     """(N,) whether the current task has been complete at any step of its segment."""
+    grasped: np.ndarray = field(init=False)
+    """(N,) whether the current task's object has been grasped at any step of its segment."""
     found_complete: np.ndarray = field(init=False)
     """(N,) whether the task was complete after the segment's first step: an earlier task left it so."""
+    diverged: np.ndarray = field(init=False)
+    """(N,) whether the simulation broke down in the last step and waits to be put back."""
     preceded_by: np.ndarray = field(init=False)
     """(N,) Intervention between the last step and the next one."""
     attempts: np.ndarray = field(init=False)
@@ -62,10 +66,12 @@ class LoopState:
     def __post_init__(self) -> None:
         n = self.num_streams
         self.task = np.zeros(n, np.int64)
-        self.segment = np.zeros(n, np.int64)
-        self.position = np.zeros(n, np.int64)
+        self.piece = np.zeros(n, np.int64)
+        self.segments_since_reset = np.zeros(n, np.int64)
         self.succeeded = np.zeros(n, np.bool_)
+        self.grasped = np.zeros(n, np.bool_)
         self.found_complete = np.zeros(n, np.bool_)
+        self.diverged = np.zeros(n, np.bool_)
         self.preceded_by = np.full(n, Intervention.NONE, np.int64)
         self.attempts = np.zeros((n, self.num_tasks + self.num_reset_tasks), np.int64)
         self.successes = np.zeros_like(self.attempts)
@@ -108,13 +114,21 @@ class LoopState:
         self.interventions[:, Intervention.TASK_SWITCH] += 1
         self.preceded_by = np.maximum(self.preceded_by, Intervention.TASK_SWITCH)
 
-    def count_step(self, success: np.ndarray, cut: np.ndarray) -> None:
-        """Count one control step of every stream; `cut` is (N,) bool, where the stream's piece ends here."""
+    def count_step(self, info: dict[str, Any], cut: np.ndarray) -> None:
+        """Count one control step of every stream.
+
+        Args:
+            info: the environment's `is_success`, `is_grasped` and `diverged` after the step, (N,) bool each.
+            cut: (N,) bool, where the stream's piece ends here.
+        """
         self.t += 1
-        self.succeeded |= success
+        self.succeeded |= info["is_success"]
+        self.grasped |= info["is_grasped"]
+        self.diverged = info["diverged"].copy()
         # No task can be done in one step.
-        self.found_complete = np.where(self.preceded_by != Intervention.NONE, success, self.found_complete)
-        self.segment += cut
+        begins = self.preceded_by != Intervention.NONE
+        self.found_complete = np.where(begins, info["is_success"], self.found_complete)
+        self.piece += cut
         self.preceded_by = np.full(self.num_streams, Intervention.NONE, np.int64)
 
     def count_intervention(self, ids: np.ndarray, kind: Intervention) -> None:
@@ -122,18 +136,27 @@ class LoopState:
         self.interventions[ids, kind] += 1
         self.preceded_by[ids] = np.maximum(self.preceded_by[ids], kind)
         if kind in (Intervention.SCENE_RESET, Intervention.DIVERGENCE):
-            self.position[ids] = 0
+            self.segments_since_reset[ids] = 0
+        if kind is Intervention.DIVERGENCE:
+            self.diverged[ids] = False
 
     def end_segment(self) -> SegmentEnd:
         """Close the segment of every stream and return what it came to."""
-        end = SegmentEnd(self.task, self.position.copy(), self.succeeded, self.found_complete)
+        end = SegmentEnd(
+            self.task,
+            self.segments_since_reset.copy(),
+            success=self.succeeded,
+            found_complete=self.found_complete,
+            never_grasped=self.succeeded & ~self.found_complete & ~self.grasped,
+        )
         streams = np.arange(self.num_streams)
         self.attempts[streams, self.task] += 1
         self.successes[streams, self.task] += self.succeeded
         self.recent_task = np.column_stack([self.recent_task[:, 1:], self.task])
         self.recent_success = np.column_stack([self.recent_success[:, 1:], self.succeeded])
         self.succeeded = np.zeros(self.num_streams, np.bool_)
-        self.position += 1
+        self.grasped = np.zeros(self.num_streams, np.bool_)
+        self.segments_since_reset += 1
         return end
 
     def state_dict(self) -> dict[str, Any]:
@@ -170,7 +193,8 @@ class Step:
     """(N,) bool, the simulation broke down in this step."""
     cut: np.ndarray
     """(N,) bool, this is the last frame of its uncut piece."""
-    segment: np.ndarray
+    piece: np.ndarray
+    """(N,) index of that piece within its stream."""
     preceded_by: np.ndarray
     """(N,) Intervention between the step before and this one."""
     interventions: np.ndarray
@@ -192,12 +216,14 @@ class SegmentEnd:
 
     task: np.ndarray
     """(N,) index of the task of the segment."""
-    position: np.ndarray
+    segments_since_reset: np.ndarray
     """(N,) how many segments came before it since the last scene reset."""
     success: np.ndarray
     """(N,) bool, complete at any step of the segment."""
     found_complete: np.ndarray
     """(N,) bool, a success for which nothing had to be done: an earlier task had left it complete."""
+    never_grasped: np.ndarray
+    """(N,) bool, another success whose object was grasped at no step of the segment: pushed or dropped."""
 
 
 Event = Step | Update | SegmentEnd

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
 
-from cronos_lerobot.protocol.config import NUM_TRAIN_CONFIGURATIONS, ProtocolConfig
+from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import LoopState
 
@@ -104,7 +105,7 @@ class SceneReset(ResetStrategy):
         num_configurations: draws only from the first so many of the split's 64.
     """
 
-    def __init__(self, rng: np.random.Generator, num_configurations: int = NUM_TRAIN_CONFIGURATIONS) -> None:
+    def __init__(self, rng: np.random.Generator, num_configurations: int = NUM_CONFIGURATIONS) -> None:
         self.rng = rng
         self.num_configurations = num_configurations
 
@@ -144,18 +145,9 @@ class DivergenceReset(SceneReset):
 
     kind = Intervention.DIVERGENCE
 
-    def __init__(self, rng: np.random.Generator, num_configurations: int = NUM_TRAIN_CONFIGURATIONS) -> None:
-        super().__init__(rng, num_configurations)
-        self.diverged: np.ndarray = np.empty(0, np.bool_)
-
     def due(self, env: Any, loop: LoopState) -> np.ndarray:
-        """Streams marked in the last step's info["diverged"]."""
-        return np.flatnonzero(self.diverged)
-
-    def put_back(self, env: Any, loop: LoopState, diverged: np.ndarray) -> bool:
-        """Reset the streams where `diverged`, (N,) bool; returns whether there was any."""
-        self.diverged = diverged
-        return self.apply_if_due(env, loop)
+        """Streams that the last step broke down."""
+        return np.flatnonzero(loop.diverged)
 
 
 @dataclass(frozen=True)
@@ -163,7 +155,7 @@ class Resets:
     """The strategies of one run, in the order of Algorithm 1."""
 
     initial: ResetStrategy
-    divergence: DivergenceReset
+    divergence: ResetStrategy
     end_effector: ResetStrategy
     heuristic: ResetStrategy
     extra: tuple[ResetStrategy, ...]
@@ -179,8 +171,7 @@ EXTRA_RESETS: dict[str, ResetFactory] = {}
 def register_reset(name: str) -> Callable[[ResetFactory], ResetFactory]:
     """Make a strategy selectable as `--protocol.extra_resets='[name]'`.
 
-    It decorates a class whose constructor, or a function that, takes the generator of the run's resets and the
-    protocol.
+    It decorates a class whose constructor, or a function that, takes a generator of its own and the protocol.
 
     Raises:
         ValueError: the name is taken.
@@ -206,18 +197,23 @@ def check_extra_resets(names: Sequence[str]) -> None:
         )
 
 
-def make_resets(protocol: ProtocolConfig, rng: np.random.Generator) -> Resets:
-    """Return the strategies that `protocol` enables; `rng` draws every configuration and place of the run.
+def make_resets(protocol: ProtocolConfig, rng: Callable[[str], np.random.Generator]) -> Resets:
+    """Return the strategies that `protocol` enables.
+
+    Args:
+        protocol: of the run.
+        rng: returns the generator of a name. Each strategy draws from one of its own, so that none changes what
+            another one draws.
 
     Raises:
         ValueError: an extra reset is not registered.
     """
     check_extra_resets(protocol.extra_resets)
     return Resets(
-        initial=InitialPlacement(rng, protocol.num_configurations),
-        divergence=DivergenceReset(rng, protocol.num_configurations),
+        initial=InitialPlacement(rng("resets/initial"), protocol.num_configurations),
+        divergence=DivergenceReset(rng("resets/divergence"), protocol.num_configurations),
         end_effector=EndEffectorReset() if protocol.end_effector_reset else NoReset(),
-        heuristic=HeuristicReset(rng) if protocol.heuristic_reset else NoReset(),
-        extra=tuple(EXTRA_RESETS[name](rng, protocol) for name in protocol.extra_resets),
-        scene=PeriodicSceneReset(rng, protocol),
+        heuristic=HeuristicReset(rng("resets/heuristic")) if protocol.heuristic_reset else NoReset(),
+        extra=tuple(EXTRA_RESETS[name](rng(f"resets/extra/{name}"), protocol) for name in protocol.extra_resets),
+        scene=PeriodicSceneReset(rng("resets/scene"), protocol),
     )

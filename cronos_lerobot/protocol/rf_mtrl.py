@@ -50,18 +50,18 @@ def rf_mtrl(
             cut_t = info["diverged"] | (k == K)
             agent.store(o_t, tau, a_t, r_t, o_tp1, cut_t, info["diverged"])  # 13
             step_t = _describe(loop, o_t, tau, a_t, r_t, cut_t, info)
-            loop.count_step(info["is_success"], cut_t)  # 14
+            loop.count_step(info, cut_t)  # 14
             yield step_t
             if loop.t % U == 0:  # 15
                 metrics = agent.update()  # 16, 17, 18
                 loop.updates += 1
                 yield Update(metrics)
-            if k < K and resets.divergence.put_back(env, loop, info["diverged"]):
+            if k < K and resets.divergence.apply_if_due(env, loop):
                 o_tp1 = env.observe()
             o_t = o_tp1
         segment = loop.end_segment()
         # Only now: what diverged in the last step belongs to the scene that it was in.
-        resets.divergence.put_back(env, loop, info["diverged"])
+        resets.divergence.apply_if_due(env, loop)
         resets.end_effector.apply_if_due(env, loop)  # 21, 22
         resets.heuristic.apply_if_due(env, loop)  # 23, 24
         for strategy in resets.extra:
@@ -82,7 +82,7 @@ def _describe(
         success=info["is_success"],
         diverged=info["diverged"],
         cut=cut_t,
-        segment=loop.segment.copy(),
+        piece=loop.piece.copy(),
         preceded_by=loop.preceded_by,
         interventions=loop.stream_interventions,
         policy_version=loop.updates,

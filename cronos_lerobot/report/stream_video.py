@@ -35,6 +35,7 @@ from cronos_lerobot.protocol.loop_state import SegmentEnd, Step
 from cronos_lerobot.protocol.resets import make_resets
 from cronos_lerobot.protocol.rf_mtrl import rf_mtrl
 from cronos_lerobot.protocol.task_orders import TaskSet, make_task_order
+from cronos_lerobot.training.seeding import NamedGenerators
 
 EXPERT = "expert"
 NOTICE_STEPS = 8
@@ -118,12 +119,13 @@ def film_stream(
         num_segments: how long.
         seed: draws the first configuration, those of scene resets, and a random task order.
     """
-    rng = np.random.default_rng(seed)
+    rng = NamedGenerators(seed).for_numpy
     task_set = TaskSet.of(env.scene, protocol)
     loop = task_set.new_loop(env.num_envs)
     total_steps = num_segments * protocol.task_switch_interval * env.num_envs
     events = rf_mtrl(
-        env, task_set.all, agent, make_task_order(protocol.task_order, rng, task_set), make_resets(protocol, rng),
+        env, task_set.all, agent, make_task_order(protocol.task_order, rng("task_order"), task_set),
+        make_resets(protocol, rng),
         protocol, loop, total_steps,
     )  # fmt: skip
     status = Status("", 0, num_segments, succeeded=False, interventions=0)

@@ -33,6 +33,7 @@ from cronos_lerobot.protocol.resets import make_resets
 from cronos_lerobot.protocol.rf_mtrl import rf_mtrl
 from cronos_lerobot.protocol.task_orders import TaskSet, make_task_order
 from cronos_lerobot.report.stream_video import Spectator, make_spectator
+from cronos_lerobot.training.seeding import NamedGenerators
 
 PICTURED_STREAMS, PICTURED_SEGMENTS = 4, 4
 """Rows and columns of `--picture`."""
@@ -120,7 +121,7 @@ def run_streams(
         num_segments: length of every stream.
         seed: draws the first configurations, those of scene resets, and a random task order.
     """
-    rng = np.random.default_rng(seed)
+    rng = NamedGenerators(seed).for_numpy
     task_set = TaskSet.of(env.scene, protocol)
     loop = task_set.new_loop(env.num_envs)
     total_steps = num_segments * protocol.task_switch_interval * env.num_envs
@@ -129,7 +130,8 @@ def run_streams(
     with tqdm(total=total_steps, unit="step", unit_scale=True, disable=None) as bar:
         agent.begin_segment()
         for event in rf_mtrl(
-            env, task_set.all, agent, make_task_order(protocol.task_order, rng, task_set),
+            env, task_set.all, agent,
+            make_task_order(protocol.task_order, rng("task_order"), task_set),
             make_resets(protocol, rng), protocol, loop, total_steps,
         ):  # fmt: skip
             if isinstance(event, Step):

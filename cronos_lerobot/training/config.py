@@ -17,15 +17,13 @@ from lerobot.datasets.utils import INFO_PATH
 from lerobot.envs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
 
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.data.writer import FLUSH_INTERVAL_S
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.resets import check_extra_resets
 from cronos_lerobot.protocol.task_orders import check_task_order
-
-NUM_CONFIGURATIONS = 64
-"""Benchmark configurations of each split."""
 
 
 @dataclass
@@ -97,7 +95,7 @@ class RecordConfig:
 class PeriodicEvaluationConfig:
     """Independent evaluation on environments of its own: every task from every configuration."""
 
-    n_episodes: int = 64
+    n_episodes: int = NUM_CONFIGURATIONS
     """Configurations for each task, 1 to 64: the first ones of the split."""
     split: str = "train"
     """Configurations to evaluate on: `train` or `held_out`."""

@@ -7,85 +7,19 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from cronos_lerobot.protocol.loop_state import Event, LoopState, SegmentEnd, Step
+from cronos_lerobot.protocol.loop_state import LoopState
 from cronos_lerobot.provenance import git_commit, package_versions
 from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.rollout import Count
 
 METRICS = "metrics.jsonl"
 MANIFEST = "manifest.json"
-
-
-class RolloutStatistics:
-    """Success and reward of the streams between two policy updates.
-
-    Args:
-        instructions: of the task set, in the order of its indices.
-        num_tasks: how many of them are evaluated, the first ones; the rest are reset tasks. None is all.
-    """
-
-    def __init__(self, instructions: Sequence[str], num_tasks: int | None = None) -> None:
-        self.instructions = list(instructions)
-        self.num_tasks = len(self.instructions) if num_tasks is None else num_tasks
-        self._clear()
-
-    def on_event(self, event: Event) -> None:
-        """Take in a Step or the end of a segment."""
-        if isinstance(event, Step):
-            self._reward += float(event.reward.sum())
-            self._transitions += len(event.reward)
-            self._diverged += int(event.diverged.sum())
-        elif isinstance(event, SegmentEnd):
-            segments = zip(event.task, event.position, event.success, event.found_complete, strict=True)
-            for task, position, success, found in segments:
-                self._count(self._by_task, self.instructions[task], success)
-                if task < self.num_tasks:
-                    self._count(self._by_position, str(position), success)
-                    self._count(self._found_by_position, str(position), found)
-
-    def pop(self) -> dict[str, Any]:
-        """Return the statistics since the last `pop`, and begin anew.
-
-        `success_by_segment` has one [successes, n] for each number of task switches since the scene reset,
-        `success_by_task` one for each instruction. Learned reset tasks are in the latter only.
-        `found_complete_by_segment` has [successes for which nothing had to be done, n].
-        """
-        segments = np.array(list(self._by_position.values()) or [[0, 0]]).sum(axis=0)
-        all_segments = sum(n for _, n in self._by_task.values())
-        positions = sorted(self._by_position.items(), key=lambda item: int(item[0]))
-        statistics = {
-            "success": float(segments[0] / segments[1]) if segments[1] else None,
-            "segments": int(segments[1]),
-            "success_by_segment": dict(positions),
-            "found_complete_by_segment": {
-                position: self._found_by_position[position] for position, _ in positions
-            },
-            "success_by_task": {task: self._by_task[task] for task in self.instructions if task in self._by_task},
-            "reward_per_segment": self._reward / all_segments if all_segments else None,
-            "diverged": self._diverged,
-        }
-        self._clear()
-        return statistics
-
-    def _clear(self) -> None:
-        self._reward = 0.0
-        self._transitions = 0
-        self._diverged = 0
-        self._by_task: dict[str, list[int]] = {}
-        self._by_position: dict[str, list[int]] = {}
-        self._found_by_position: dict[str, list[int]] = {}
-
-    @staticmethod
-    def _count(table: dict[str, list[int]], key: str, success: bool) -> None:
-        counts = table.setdefault(key, [0, 0])
-        counts[0] += int(success)
-        counts[1] += 1
 
 
 class MetricsFile:
@@ -159,10 +93,9 @@ class RunLogger:
             self._wandb.log_dict(scalars, step=self.loop.n, mode=mode)
 
     def progress(self, values: dict[str, Any]) -> None:
-        """Move the bar; `values` has `success` and `steps_per_s`. Without a terminal, print a line."""
-        success = values.get("success")
-        text = {
-            "success": "-" if success is None else f"{success:.2f}",
+        """Move the bar, or print a line; `values` has `steps_per_s` and rates, None where unknown."""
+        rates = {name.replace("_", " "): rate for name, rate in values.items() if name != "steps_per_s"}
+        text = {name: "-" if rate is None else f"{rate:.2f}" for name, rate in rates.items()} | {
             "interventions": self.loop.b,
             "steps/s": f"{values['steps_per_s']:.0f}",
         }
@@ -257,14 +190,14 @@ def _jsonable(value: Any) -> Any:
 
 
 def _scalars(values: dict[str, Any], prefix: str = "") -> dict[str, float]:
-    """Flatten nested records to the finite numbers in them; [successes, n] becomes a rate."""
+    """Flatten nested records to the finite numbers in them; a Count becomes its rate."""
     scalars: dict[str, float] = {}
     for name, value in values.items():
         key = f"{prefix}{name}"
         if isinstance(value, dict):
             scalars |= _scalars(value, f"{key}/")
-        elif isinstance(value, list) and "_by_" in prefix and value[1]:
-            scalars[key] = value[0] / value[1]
+        elif isinstance(value, Count):
+            scalars |= _scalars({name: value.rate}, prefix)
         elif isinstance(value, int | float | np.number) and np.isfinite(value):
             scalars[key] = float(value)
     return scalars

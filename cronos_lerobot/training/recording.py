@@ -152,7 +152,7 @@ class StreamObserver:
             stream_interventions=step.interventions,
             total_interventions=int(step.interventions.sum()),
             steps=np.full(len(step.reward), step.t),
-            segments=step.segment,
+            segments=step.piece,
             segment_ends=step.cut,
         )
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from cronos_lerobot.agents.base import ActionSample, Agent
+from cronos_lerobot.agents.base import ActionSample
 from cronos_lerobot.processes import Processes
 from cronos_lerobot.protocol.loop_state import Step
 from cronos_lerobot.training.recording import FILM
@@ -129,41 +129,6 @@ class ShardedEnv:
     def _concatenate(self, array: np.ndarray) -> np.ndarray:
         with self.timer("wait"):
             return self._processes.concatenate(array)
-
-
-class ShardedAgent:
-    """Acts for the streams of this process and learns with the other processes.
-
-    Args:
-        agent: of the streams of this process; its `update` learns together with the others'.
-        mine: those streams among all N.
-    """
-
-    def __init__(self, agent: Agent, mine: slice) -> None:
-        self._agent = agent
-        self._mine = mine
-
-    def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
-        """Sample an action for each stream of this process; `tau` has all N instructions."""
-        return self._agent.act(o_t, tau[self._mine])
-
-    def store(
-        self,
-        o_t: dict[str, Any],
-        tau: list[str],
-        a_t: ActionSample,
-        r_t: np.ndarray,
-        o_tp1: dict[str, Any],
-        cut_t: np.ndarray,
-        diverged_t: np.ndarray,
-    ) -> None:
-        """Keep one transition of every stream of this process."""
-        mine = self._mine
-        self._agent.store(o_t, tau[mine], a_t, r_t[mine], o_tp1, cut_t[mine], diverged_t[mine])
-
-    def update(self) -> dict[str, float]:
-        """Learn from what all processes have stored."""
-        return self._agent.update()
 
 
 def whole_step(step: Step, processes: Processes) -> Step:

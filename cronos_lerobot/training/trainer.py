@@ -21,10 +21,11 @@ from cronos_lerobot.protocol.task_orders import TaskSet, make_task_order
 from cronos_lerobot.stopwatch import Stopwatch
 from cronos_lerobot.training.checkpoint import RunState, load_checkpoint, save_checkpoint
 from cronos_lerobot.training.config import CronosTrainConfig
-from cronos_lerobot.training.logging import RolloutStatistics, RunLogger, SilentLogger, write_manifest
+from cronos_lerobot.training.logging import RunLogger, SilentLogger, write_manifest
 from cronos_lerobot.training.recording import FilmedEnv, StreamObserver
+from cronos_lerobot.training.rollout import RolloutStatistics, SmoothedSuccess
 from cronos_lerobot.training.seeding import NamedGenerators
-from cronos_lerobot.training.sharding import ShardedAgent, ShardedEnv, whole_step
+from cronos_lerobot.training.sharding import ShardedEnv, whole_step
 
 
 class Trainer:
@@ -72,18 +73,18 @@ class Trainer:
         actions = self.generators.for_torch(self.processes.own("actions"))
         ppo = PPO(policy, self.processors, config.algorithm, minibatches, self.processes)
         buffer = RolloutBuffer(config.protocol.update_interval, env.num_envs)
-        self.env, self.agent = env, PPOAgent(ppo, buffer, actions, self.stopwatch)
-        if self.processes.count > 1:
-            self.env = ShardedEnv(env, self.processes)
-            self.agent = ShardedAgent(self.agent, self.env.mine)
+        self.env = env if self.processes.count == 1 else ShardedEnv(env, self.processes)
+        mine = self.processes.share_of(config.num_envs)
+        self.agent = PPOAgent(ppo, buffer, actions, self.stopwatch, mine)
         self.loop = self.task_set.new_loop(config.num_envs)
         self._last_evaluation = 0
         self.run_state = RunState(
             ppo, self.loop, self.generators, self.env, preprocessor, postprocessor, self.processes
         )
         self.statistics = RolloutStatistics([t.instruction for t in self.task_set.all], len(self.task_set.tasks))
+        self._smoothed = SmoothedSuccess(config.protocol, len(self.task_set.tasks))
         # Every named generator exists before a checkpoint is loaded into them.
-        self._resets = make_resets(config.protocol, self.generators.for_numpy("configurations"))
+        self._resets = make_resets(config.protocol, self.generators.for_numpy)
         task_rng = self.generators.for_numpy("task_order")
         self._task_order = make_task_order(config.protocol.task_order, task_rng, self.task_set)
 
@@ -182,8 +183,9 @@ class Trainer:
         rollout = self.statistics.pop()
         record = {"rollout": rollout, "ppo": self._update_metrics, "steps_per_s": steps_per_s}
         self.logger.log("update", record | {"time_share": shares})
+        rates = self._smoothed.add(rollout, self.loop.n)
         if self.loop.updates % self.config.log_freq == 0:
-            self.logger.progress({"success": rollout["success"], "steps_per_s": steps_per_s})
+            self.logger.progress(rates | {"steps_per_s": steps_per_s})
 
     def _evaluate(self) -> None:
         self._last_evaluation = self.loop.n

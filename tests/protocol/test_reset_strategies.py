@@ -120,6 +120,31 @@ def test_one_heuristic_reset_for_a_stream_however_many_bodies():
     assert third.preceded_by.tolist() == [Intervention.HEURISTIC_RESET, Intervention.END_EFFECTOR_RESET]
 
 
+def test_another_strategys_draws_leave_the_scene_resets_as_they_are():
+    """Two runs at one seed; in one of them a body is lost, and a simulation breaks down."""
+    drawn = {}
+    for name, clumsy in (("calm", False), ("clumsy", True)):
+        placed = drawn[name] = []
+
+        class Watched(DummyEnv):
+            def put_back(self, stream, body, rng):
+                rng.uniform(size=5)
+                super().put_back(stream, body, rng)
+
+            def scene_reset(self, ids, configurations, split="train"):
+                self.placed.append(np.asarray(configurations).tolist())
+                super().scene_reset(ids, configurations, split)
+
+        env = Watched(2, diverge_at={(2, 1)} if clumsy else None)
+        env.placed = placed
+        env.lost = {(1, 1)} if clumsy else set()
+        _, _, loop, _ = run(protocol(heuristic_reset=True), 24, env=env)
+        assert loop.interventions[:, Intervention.HEURISTIC_RESET].sum() == clumsy
+    broken = [configurations for configurations in drawn["clumsy"] if len(configurations) == 1]
+    assert len(broken) == 1
+    assert [configurations for configurations in drawn["clumsy"] if len(configurations) == 2] == drawn["calm"]
+
+
 def test_heuristic_resets_spend_the_budget():
     class Clumsy(DummyEnv):
         def step(self, actions):
@@ -162,7 +187,9 @@ def test_own_strategy_and_own_order_by_name():
             self.rng = rng
 
         def due(self, env, loop):
-            return np.flatnonzero((loop.recent_success[:, -2:] == 0).all(axis=1) & (loop.position >= 2))
+            return np.flatnonzero(
+                (loop.recent_success[:, -2:] == 0).all(axis=1) & (loop.segments_since_reset >= 2)
+            )
 
         def apply(self, env, ids):
             env.scene_reset(ids, self.rng.integers(64, size=len(ids)))

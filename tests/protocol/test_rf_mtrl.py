@@ -11,6 +11,7 @@ from cronos_lerobot.protocol.loop_state import LoopState, SegmentEnd, Step, Upda
 from cronos_lerobot.protocol.resets import make_resets
 from cronos_lerobot.protocol.rf_mtrl import rf_mtrl
 from cronos_lerobot.protocol.task_orders import TaskSet, make_task_order
+from cronos_lerobot.training.seeding import NamedGenerators
 
 
 class DummyAgent:
@@ -36,7 +37,13 @@ class FastEnv(DummyEnv):
 
     def step(self, actions):
         never = np.zeros(self.num_envs, bool)
-        return {}, never.astype(np.float32), never, never, {"is_success": never, "diverged": never}
+        return (
+            {},
+            never.astype(np.float32),
+            never,
+            never,
+            {"is_success": never, "is_grasped": never, "diverged": never},
+        )
 
     def observe(self):
         return {}
@@ -47,8 +54,8 @@ def run(protocol, steps, num_streams=2, env=None, loop=None, seed=0):
     task_set = TaskSet.of(env.scene, protocol)
     loop = loop or task_set.new_loop(num_streams)
     agent = DummyAgent(num_streams, env.calls)
-    rng = np.random.default_rng(seed)
-    order = make_task_order(protocol.task_order, np.random.default_rng(seed + 1), task_set)
+    rng = NamedGenerators(seed).for_numpy
+    order = make_task_order(protocol.task_order, rng("task_order"), task_set)
     events = list(rf_mtrl(env, task_set.all, agent, order, make_resets(protocol, rng), protocol, loop, steps))
     return env, agent, loop, events
 
@@ -85,7 +92,7 @@ def test_diverged_stream_is_reset_at_once_and_alone():
     assert env.calls[after_first_store : after_first_store + 3] == [("scene_reset", [1]), "observe", "act"]
     assert agent.stored[0][3].tolist() == [False, True]
     assert loop.interventions[:, Intervention.DIVERGENCE].tolist() == [0, 1]
-    assert loop.segment.tolist() == [2, 3]
+    assert loop.piece.tolist() == [2, 3]
     assert loop.b == 3
 
 
@@ -94,7 +101,7 @@ def test_a_stream_that_diverges_in_its_last_step_begins_the_next_segment_in_a_fr
     second_store = [i for i, call in enumerate(env.calls) if call == "store"][1]
     tape = env.calls[second_store + 1 : second_store + 5]
     assert tape == [("scene_reset", [1]), "set_task", "observe", "act"]
-    assert [end.position.tolist() for end in events if isinstance(end, SegmentEnd)] == [[0, 0], [1, 0]]
+    assert [end.segments_since_reset.tolist() for end in events if isinstance(end, SegmentEnd)] == [[0, 0], [1, 0]]
     assert loop.interventions[:, Intervention.DIVERGENCE].tolist() == [0, 1]
     assert [int(event.preceded_by[1]) for event in events if isinstance(event, Step)][2] == Intervention.DIVERGENCE
 
@@ -115,9 +122,12 @@ def test_events_and_what_preceded_each_frame():
         Intervention.NONE,
     ]
     assert [step.policy_version for step in steps] == [0, 0, 0, 0, 1, 1, 1, 1]
-    assert [int(step.segment[0]) for step in steps] == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert [int(step.piece[0]) for step in steps] == [0, 0, 1, 1, 2, 2, 3, 3]
     assert [int(step.interventions[0]) for step in steps] == [0, 0, 0, 0, 1, 1, 1, 1]
-    assert [event.position.tolist() for event in events if isinstance(event, SegmentEnd)] == [[0, 0], [1, 1]] * 2
+    assert [event.segments_since_reset.tolist() for event in events if isinstance(event, SegmentEnd)] == [
+        [0, 0],
+        [1, 1],
+    ] * 2
 
 
 def test_last_transition_of_a_segment_is_seen_under_the_old_task_before_the_reset():
@@ -182,6 +192,26 @@ def test_without_periodic_resets_no_intervention_is_counted():
     _, _, loop, _ = run(protocol(scene_reset_interval=None), steps=80)
     assert loop.b == 0
     assert loop.interventions_by_kind()["initial"] == 2
+
+
+def test_successes_are_told_apart_by_what_was_done_for_them():
+    """Streams: grasped and put down; complete from the start; complete without a grasp; grasped in vain."""
+    success = np.array([[0, 1, 0, 0], [0, 1, 1, 0], [1, 1, 1, 0]], bool)
+    grasped = np.array([[1, 0, 0, 1], [1, 0, 0, 1], [0, 0, 0, 0]], bool)
+
+    class Scripted(DummyEnv):
+        def step(self, actions):
+            observation, reward, terminated, truncated, info = super().step(actions)
+            now = (self.t - 1) % 3
+            info = info | {"is_success": success[now], "is_grasped": grasped[now]}
+            return observation, reward, terminated, truncated, info
+
+    config = protocol(task_switch_interval=3, update_interval=3, scene_reset_interval=3)
+    _, _, _, events = run(config, 24, env=Scripted(4), num_streams=4)
+    for end in (event for event in events if isinstance(event, SegmentEnd)):
+        assert end.success.tolist() == [True, True, True, False]
+        assert end.found_complete.tolist() == [False, True, False, False]
+        assert end.never_grasped.tolist() == [False, False, True, False]
 
 
 def test_history_counts_segments_by_stream_and_task():

@@ -22,22 +22,30 @@ class PPOAgent:
         buffer: holds the transitions since the last update.
         generator: draws the actions.
         stopwatch: told the time spent in `act` ("infer") and `update` ("update").
+        streams: of all N, those that this agent acts in; observations are of these, all else is of all N.
     """
 
     def __init__(
-        self, ppo: PPO, buffer: RolloutBuffer, generator: torch.Generator, stopwatch: Stopwatch | None = None
+        self,
+        ppo: PPO,
+        buffer: RolloutBuffer,
+        generator: torch.Generator,
+        stopwatch: Stopwatch | None = None,
+        streams: slice = slice(None),
     ) -> None:
         self.ppo = ppo
         self.buffer = buffer
         self.generator = generator
         self.stopwatch = stopwatch or Stopwatch()
+        self.streams = streams
         self._encoded: Columns = {}
         # Dropout and the like stay off in the update too, or the ratio would not be 1 before its first step.
         ppo.policy.eval()
 
     @torch.inference_mode()
     def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
-        """Sample an action for each of the N streams."""
+        """Sample an action for each of its streams."""
+        tau = tau[self.streams]
         with self.stopwatch("infer"):
             self._encoded = self.ppo.processors.encode(observation_columns(o_t), tau)
             batch = self.ppo.processors.encoded_batch(self._encoded, tau)
@@ -61,10 +69,12 @@ class PPOAgent:
         cut_t: np.ndarray,
         diverged_t: np.ndarray,
     ) -> None:
-        """Keep one transition of every stream, with the value to bootstrap from where the trace is cut.
+        """Keep one transition of each of its streams, with the value to bootstrap from where the trace is cut.
 
         `o_t` is kept as `act` encoded it.
         """
+        mine = self.streams
+        tau, r_t, cut_t, diverged_t = tau[mine], r_t[mine], cut_t[mine], diverged_t[mine]
         bootstrap = a_t.value
         if (cut_t & ~diverged_t).any():
             bootstrap = np.where(diverged_t, a_t.value, self._values(o_tp1, tau))
