@@ -13,7 +13,7 @@ Columns = dict[str, np.ndarray]
 """Observations by LeRobot's names, as the environment made them: images uint8 (B, H, W, 3), vectors float32."""
 Batch = dict[str, Any]
 """A batch by LeRobot's names, after the policy's preprocessor: `observation.*` (B, ...), `task`: B strings.
-Images are (B, 3, H, W), floats in [0, 1] or, if the policy does not normalise images, uint8 in 0..255."""
+Images are (B, 3, H, W), floats in [0, 1] or, for a policy with `takes_uint8_images`, uint8 in 0..255."""
 
 POLICY_METHODS = ("sample_actions", "evaluate_actions", "predict_values", "rl_parameter_groups")
 
@@ -26,6 +26,13 @@ class TrainablePolicy(Protocol):
     which replaces inputs by what those layers make of them. It is called once for each observation; what it
     returns is kept until the update and handed to the other methods in place of the batch.
 
+    A policy whose attribute `takes_uint8_images` is true gets camera frames as they are, uint8 in 0..255, and
+    scales them itself. Without it, or if its preprocessor normalises images, they are floats in [0, 1].
+
+    A policy may have `value_inputs(batch) -> Batch` (or None there): all that the value depends on, up to the
+    first parameter of the group `value`. It is called once for each observation in an update, after the policy's
+    training; the passes that train the value alone then call `predict_values` with what it returned.
+
     `sample_actions` may also take `uniform`, numbers (B, A) in [0, 1) that are its randomness in place of a
     generator. An evaluation then draws them for each episode and step, and an episode's actions do not depend on
     which others share its batch.
@@ -34,7 +41,10 @@ class TrainablePolicy(Protocol):
     def sample_actions(
         self, batch: Batch, *, temperature: float = 1.0, generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
-        """Return `action` (B, A) normalised, `tokens` (B, A) int64, `log_prob` (B,) [nats], `value` (B,)."""
+        """Return `action` (B, A) normalised, `tokens` (B, ...), `log_prob` (B,) [nats], `value` (B,).
+
+        `tokens` is whatever `evaluate_actions` needs to know which action it was; it keeps its type and shape.
+        """
         ...
 
     def evaluate_actions(self, batch: Batch, tokens: Tensor, *, temperature: float = 1.0) -> dict[str, Tensor]:
@@ -46,7 +56,10 @@ class TrainablePolicy(Protocol):
         ...
 
     def rl_parameter_groups(self) -> list[dict[str, Any]]:
-        """Return two groups, {"name": "policy" or "value", "params": [...]}, without a parameter in common."""
+        """Return two groups, {"name": "policy" or "value", "params": [...]}, without a parameter in common.
+
+        What is in neither of them is frozen while training.
+        """
         ...
 
 
@@ -71,7 +84,7 @@ class ActionSample:
     action: np.ndarray
     """(N, A) float32 in physical units, as the environment takes them."""
     tokens: np.ndarray
-    """(N, A) int64, the action as the policy drew it."""
+    """(N, ...), the action as the policy drew it, in its own type."""
     log_prob: np.ndarray
     """(N,) float32 [nats], under the policy that drew it."""
     value: np.ndarray

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.configs import FeatureType, NormalizationMode
+from lerobot.processor import TokenizerProcessorStep
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from cronos_lerobot.agents.base import Batch, Columns, TrainablePolicy
+from cronos_lerobot.agents.base import Batch, Columns
 
 VECTOR_KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
 """Vector observations by LeRobot's names."""
@@ -38,8 +39,8 @@ class PolicyProcessors:
         preprocessor: a LeRobot batch -> what the policy takes (normalised, on its device).
         postprocessor: a normalised action (B, A) -> physical units.
         device: the policy's.
-        uint8_images: leave images in 0..255 for the policy to scale; only where its preprocessor does not
-            normalise images. A third of the inference time of a small network on a CPU.
+        uint8_images: leave images in 0..255 for the policy to scale; else they are floats in [0, 1]. A third of
+            the inference time of a small network on a CPU.
         encoder: the policy's `encode_observation`, if it has one.
     """
 
@@ -73,13 +74,25 @@ class PolicyProcessors:
         """Return the columns that a rollout keeps: the policy's encodings, or the raw observations."""
         if self._encoder is None:
             return columns
-        encoded = self._encoder(self.batch(columns, instructions))
-        return {name: value.cpu().numpy() for name, value in encoded.items() if isinstance(value, torch.Tensor)}
+        return _to_columns(self._encoder(self.batch(columns, instructions)))
 
     def encoded_batch(self, columns: Columns, instructions: list[str]) -> Batch:
         """Return the policy's batch of columns that `encode` returned."""
         if self._encoder is None:
             return self.batch(columns, instructions)
+        return self.made_batch(columns, instructions)
+
+    def making(self, function: Callable[[Batch], Batch]) -> Callable[[Columns, list[str]], Columns]:
+        """Return `function` of the policy's batches as one of columns that `encode` returned, to columns."""
+
+        @torch.no_grad()
+        def make(columns: Columns, instructions: list[str]) -> Columns:
+            return _to_columns(function(self.encoded_batch(columns, instructions)))
+
+        return make
+
+    def made_batch(self, columns: Columns, instructions: list[str]) -> Batch:
+        """Return the batch of columns that the policy itself made: `encode`'s, or those of `making`."""
         tensors = {name: torch.from_numpy(column).to(self.device) for name, column in columns.items()}
         return {"task": list(instructions)} | tensors
 
@@ -92,11 +105,35 @@ class PolicyProcessors:
         return images if self.uint8_images else images.float().div_(255)
 
 
+class OncePerText:
+    """A tokenizer that reads each different text of a batch once: of thousands few are different.
+
+    Args:
+        tokenizer: texts and options -> tensors by name, a row for each text, as Hugging Face's do.
+    """
+
+    def __init__(self, tokenizer: Any) -> None:
+        self.tokenizer = tokenizer
+
+    def __call__(self, texts: list[str], **options: Any) -> dict[str, torch.Tensor]:
+        """Tokenize B texts: tensors (B, ...)."""
+        index: dict[str, int] = {}
+        rows = torch.tensor([index.setdefault(text, len(index)) for text in texts])
+        return {name: value[rows] for name, value in self.tokenizer(list(index), **options).items()}
+
+
 def make_processors(policy: Any, preprocessor: Any, postprocessor: Any) -> PolicyProcessors:
     """Return the processors of a LeRobot policy that is on its device."""
+    for step in getattr(preprocessor, "steps", ()):
+        if isinstance(step, TokenizerProcessorStep) and not isinstance(step.input_tokenizer, OncePerText):
+            step.input_tokenizer = OncePerText(step.input_tokenizer)
     device = next(policy.parameters()).device
     mode = getattr(policy.config, "normalization_mapping", {}).get(FeatureType.VISUAL.value)
-    # Other LeRobot policies that do not normalise images scale them themselves, from [0, 1].
-    is_untouched = mode == NormalizationMode.IDENTITY and isinstance(policy, TrainablePolicy)
+    # A preprocessor that normalises images does so from [0, 1].
+    uint8_images = getattr(policy, "takes_uint8_images", False) and mode == NormalizationMode.IDENTITY
     encoder = getattr(policy, "encode_observation", None)
-    return PolicyProcessors(preprocessor, postprocessor, device, uint8_images=is_untouched, encoder=encoder)
+    return PolicyProcessors(preprocessor, postprocessor, device, uint8_images=uint8_images, encoder=encoder)
+
+
+def _to_columns(batch: Batch) -> Columns:
+    return {name: value.cpu().numpy() for name, value in batch.items() if isinstance(value, torch.Tensor)}

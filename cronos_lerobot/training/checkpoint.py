@@ -33,7 +33,7 @@ from lerobot.utils.constants import (
 )
 from lerobot.utils.random_utils import deserialize_rng_state, load_rng_state, save_rng_state, serialize_rng_state
 from lerobot.utils.utils import flatten_dict, unflatten_dict
-from safetensors.torch import load_file, load_model, save_file, save_model
+from safetensors.torch import load_file, load_model, save_file
 
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.processes import Processes
@@ -129,7 +129,7 @@ def load_checkpoint(run: RunState, folder: Path) -> dict[str, Any]:
     load_model(run.ppo.policy, str(folder / PRETRAINED_MODEL_DIR / "model.safetensors"))
     load_optimizer_state(run.ppo.optimizer, state_dir)
     if run.ppo.base_policy is not None:
-        load_model(run.ppo.base_policy, str(state_dir / BASE_POLICY))
+        run.ppo.base_policy.load(load_file(state_dir / BASE_POLICY))
     run.ppo.num_updates = state["num_updates"]
     run.loop.__dict__.update(vars(LoopState.from_state_dict(state["loop"])))
     run.generators.load_state_dict(state["generators"])
@@ -163,7 +163,7 @@ def _write_training_state(
     save_rng_state(folder)
     save_training_step(run.loop.n, folder, num_processes=run.processes.count)
     if run.ppo.base_policy is not None:
-        save_model(run.ppo.base_policy, str(folder / BASE_POLICY))
+        save_file(run.ppo.base_policy.parameters, folder / BASE_POLICY)
     np.savez(folder / ENV_STATE, allow_pickle=False, **env_state)
     # As tensors, which torch reads back without executing anything.
     torch.save(_map_leaves(observers, np.ndarray, torch.from_numpy), folder / OBSERVERS)

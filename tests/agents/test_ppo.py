@@ -1,99 +1,15 @@
+import dataclasses
+import math
+
 import numpy as np
 import pytest
 import torch
 from dummies import TASKS, DummyPolicy, identity_processors
+from ppo_samples import flat, make_ppo, reward_for_up, rollout
 
-from cronos_lerobot.agents.base import ActionSample
-from cronos_lerobot.agents.ppo.config import PaperPPOConfig, PPOConfig
-from cronos_lerobot.agents.ppo.ppo import (
-    PPO,
-    adapted_lr,
-    approximate_kl,
-    clipped_objective,
-    explained_variance,
-    value_error,
-)
-from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
+from cronos_lerobot.agents.ppo.config import RANGES, PaperPPOConfig, PPOConfig
+from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.processing import PolicyProcessors
-
-
-def make_ppo(seed=0, **options):
-    options = {"minibatch_size": 64, "value_warmup_updates": 0} | options
-    processors = PolicyProcessors(*identity_processors())
-    return PPO(DummyPolicy(seed=seed), processors, PPOConfig(**options), np.random.default_rng(seed))
-
-
-def rollout(ppo, reward, rows=16, streams=8):
-    """Rows that each end their own trace, so that the return is the reward plus nothing."""
-    rng = np.random.default_rng(3)
-    buffer = RolloutBuffer(rows, streams)
-    for _ in range(rows):
-        columns = {"observation.state": rng.normal(size=(streams, 2)).astype(np.float32)}
-        instructions = [TASKS[i].instruction for i in rng.integers(4, size=streams)]
-        with torch.no_grad():
-            sample = ppo.policy.sample_actions(
-                ppo.processors.batch(columns, instructions), generator=torch.Generator().manual_seed(7)
-            )
-        sample = ActionSample(*(sample[k].numpy() for k in ("action", "tokens", "log_prob", "value")))
-        buffer.add(columns, instructions, sample, reward(sample), np.full(streams, True), np.zeros(streams))
-    return buffer
-
-
-def reward_for_up(sample):
-    return (sample.tokens[:, 0] == 2).astype(np.float32)
-
-
-def flat(params):
-    return torch.cat([p.detach().flatten() for p in params])
-
-
-@pytest.mark.parametrize(
-    ("ratio", "advantage", "objective"),
-    [(1.0, 2.0, 2.0), (1.5, 2.0, 2.4), (0.5, 2.0, 1.0), (1.5, -2.0, -3.0), (0.5, -2.0, -1.6)],
-)
-def test_clipped_objective_by_hand(ratio, advantage, objective):
-    result = clipped_objective(torch.tensor([ratio]).log(), torch.tensor([advantage]), clip=0.2)
-    assert result.item() == pytest.approx(objective)
-
-
-def test_no_gradient_beyond_the_clip():
-    log_ratio = torch.tensor([0.5, 0.1], requires_grad=True)
-    clipped_objective(log_ratio, torch.ones(2), clip=0.2).sum().backward()
-    assert log_ratio.grad[0] == 0
-    assert log_ratio.grad[1] > 0
-
-
-def test_kl_estimate_matches_the_exact_divergence():
-    old, new = torch.tensor([0.5, 0.3, 0.2]), torch.tensor([0.4, 0.4, 0.2])
-    estimate = (old * approximate_kl((new / old).log())).sum()
-    exact = (old * (old / new).log()).sum()
-    assert estimate.item() == pytest.approx(exact.item(), abs=1e-6)
-
-
-def test_value_loss_by_hand():
-    value, old, return_ = torch.tensor([3.0]), torch.tensor([1.0]), torch.tensor([4.0])
-    assert value_error(value, old, return_, PPOConfig(value_loss="mse")).item() == pytest.approx(0.5)
-    # Clipped to 1.2, the error is 2.8, which is the worse one: 2.8 ** 2 / 2.
-    clipped = value_error(value, old, return_, PPOConfig(value_loss="mse", value_clip=0.2))
-    assert clipped.item() == pytest.approx(3.92)
-    # Huber beyond delta: delta * (|error| - delta / 2).
-    far = value_error(value, old, torch.tensor([33.0]), PPOConfig(huber_delta=10.0))
-    assert far.item() == pytest.approx(10 * (30 - 5))
-
-
-def test_adaptive_learning_rate():
-    config = PPOConfig(target_kl=0.04, lr_factor=2.0, policy_lr_min=3e-5, policy_lr_max=3e-4)
-    assert adapted_lr(1e-4, 0.09, config) == pytest.approx(5e-5)
-    assert adapted_lr(1e-4, 0.05, config) == 1e-4
-    assert adapted_lr(1e-4, 0.01, config) == pytest.approx(2e-4)
-    assert adapted_lr(4e-5, 0.09, config) == 3e-5
-    assert adapted_lr(2e-4, 0.01, config) == 3e-4
-
-
-def test_explained_variance():
-    returns = np.array([1.0, 2.0, 3.0])
-    assert explained_variance(returns, returns) == 1
-    assert explained_variance(np.full(3, 2.0), returns) == 0
 
 
 def test_ratio_is_one_before_the_first_step():
@@ -140,16 +56,11 @@ def test_policy_stops_early_when_it_has_moved_too_far():
     assert ppo.policy_lr == pytest.approx(0.5 / 1.5)
 
 
-def test_lr_rises_while_the_policy_hardly_moves():
-    ppo = make_ppo(epochs=1, policy_lr=1e-6)
-    ppo.update(rollout(ppo, reward_for_up))
-    assert ppo.policy_lr == pytest.approx(1.5e-6)
-
-
 def test_accumulated_minibatches_make_the_step_of_a_large_one():
     params = []
     for options in ({"minibatch_size": 128}, {"minibatch_size": 48, "grad_accumulation": 3}):
-        ppo = make_ppo(epochs=1, value_epochs=0, lr_schedule="fixed", max_grad_norm=1e9, **options)
+        free = {"lr_schedule": "fixed", "max_grad_norm": 1e9, "value_max_grad_norm": 1e9}
+        ppo = make_ppo(epochs=1, value_epochs=0, **free, **options)
         ppo.update(rollout(ppo, reward_for_up))
         params.append(flat(ppo.policy.parameters()))
     torch.testing.assert_close(*params, atol=2e-6, rtol=1e-4)
@@ -179,6 +90,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_before_it_spoils_the_policy():
 
 def test_paper_settings():
     config = PaperPPOConfig()
+    assert config.value_max_grad_norm == 10.0
     assert (config.epochs, config.clip, config.gamma, config.gae_lambda) == (1, 0.2, 0.99, 0.95)
     assert (config.minibatch_size, config.grad_accumulation, config.entropy_coef) == (8, 20, 0.0)
     assert (config.policy_lr, config.value_lr, config.beta1, config.beta2) == (1e-4, 3e-3, 0.9, 0.999)
@@ -198,9 +110,146 @@ def test_untrainable_policy_is_named():
         ({"lr_schedule": "cosine"}, "kl_update"),
         ({"value_loss": "l1"}, "huber"),
         ({"target_kl": None}, "needs algorithm.target_kl"),
-        ({"temperature": 0.0}, "temperature"),
+        ({"policy_lr_min": 1e-2}, "at most policy_lr_max=0.001, got 0.01"),
+        ({"temperature": 0.0}, "temperature must be > 0, got 0.0"),
+        ({"policy_lr": -1.0}, "policy_lr must be >= 0, got -1.0"),
+        ({"value_lr": math.nan}, "value_lr must be >= 0, got nan"),
+        ({"value_lr": math.inf}, "value_lr must be >= 0, got inf"),
+        ({"gamma": 1.5}, "gamma must be >= 0 and <= 1, got 1.5"),
+        ({"gae_lambda": -0.1}, "gae_lambda must be >= 0 and <= 1, got -0.1"),
+        ({"clip": 0.0}, "clip must be > 0 and <= 1, got 0.0"),
+        ({"huber_delta": 0.0}, "huber_delta must be > 0, got 0.0"),
+        ({"lr_factor": 0.5}, "lr_factor must be >= 1, got 0.5"),
+        ({"beta1": 1.0}, "beta1 must be >= 0 and < 1, got 1.0"),
+        ({"beta2": -0.1}, "beta2 must be >= 0 and < 1, got -0.1"),
+        ({"max_grad_norm": 0.0}, "max_grad_norm must be > 0, got 0.0"),
+        ({"value_clip": -0.2}, "value_clip must be > 0, got -0.2"),
     ],
 )
 def test_bad_settings_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         PPOConfig(**options)
+
+
+def test_every_number_has_a_range_that_its_defaults_keep():
+    numbers = {f.name for f in dataclasses.fields(PPOConfig) if f.type not in ("str", "bool")}
+    assert numbers == set(RANGES)
+    assert PPOConfig().value_clip is None
+    assert PaperPPOConfig().target_kl is None
+
+
+def test_gradients_are_clipped_by_group():
+    norms = []
+    for limit in (1e9, 0.5):
+        ppo = make_ppo(
+            epochs=1, value_epochs=0, minibatch_size=128, max_grad_norm=1e9, value_max_grad_norm=limit,
+            normalize_advantage=False, lr_schedule="fixed",
+        )  # fmt: skip
+        metrics = ppo.update(rollout(ppo, lambda sample: 20 * reward_for_up(sample)))
+        norms.append([metrics["policy_grad_norm"], metrics["value_grad_norm"]])
+        norms[-1] += [
+            flat(p.grad for p in net.parameters()).norm() for net in (ppo.policy.actor, ppo.policy.critic)
+        ]
+    free, clipped = norms
+    assert free[1] > 1
+    # What is told is the norm before; a critic that is far off does not shorten the policy's step.
+    assert clipped == pytest.approx([free[0], free[1], free[0], 0.5], rel=1e-4)
+
+
+def test_the_passes_for_the_value_alone_respect_its_weight():
+    ppo = make_ppo(value_warmup_updates=1, value_coef=0.0)
+    value = flat(ppo.policy.critic.parameters())
+    ppo.update(rollout(ppo, reward_for_up))
+    assert torch.equal(value, flat(ppo.policy.critic.parameters()))
+
+
+def test_what_is_in_no_group_is_frozen():
+    policy = DummyPolicy()
+    policy.rl_parameter_groups = lambda: [
+        {"name": "policy", "params": [policy.actor.bias]},
+        {"name": "value", "params": [*policy.critic.parameters()]},
+    ]
+    ppo = make_ppo(policy=policy)
+    weight = policy.actor.weight.detach().clone()
+    ppo.update(rollout(ppo, reward_for_up))
+    assert not policy.actor.weight.requires_grad
+    assert policy.actor.weight.grad is None
+    assert torch.equal(policy.actor.weight, weight)
+
+
+def test_a_policy_that_leaps_is_stopped_before_another_backward_pass():
+    # After a step of 100 the ratios overflow: exp(100) is beyond float32.
+    ppo = make_ppo(epochs=3, policy_lr=100.0, value_epochs=0)
+    backward = []
+    ppo.policy.actor.weight.register_hook(lambda gradient: backward.append(gradient.norm()))
+    metrics = ppo.update(rollout(ppo, reward_for_up))
+    assert metrics["policy_epochs"] == 0.5
+    assert len(backward) == 1
+    assert all(p.grad is None for p in ppo.policy.parameters())
+
+
+def test_a_stop_does_not_wait_for_the_rest_of_an_accumulated_step():
+    ppo = make_ppo(epochs=3, policy_lr=100.0, value_epochs=0, minibatch_size=16, grad_accumulation=4)
+    evaluated = []
+    evaluate = ppo.policy.evaluate_actions
+    ppo.policy.evaluate_actions = lambda *args, **kwargs: evaluated.append(1) or evaluate(*args, **kwargs)
+    assert ppo.update(rollout(ppo, reward_for_up))["policy_epochs"] == 0.5
+    assert len(evaluated) == 5
+
+
+def test_rounding_before_the_first_step_stops_nothing():
+    policy = DummyPolicy()
+    evaluate = policy.evaluate_actions
+    noise = torch.Generator().manual_seed(0)
+
+    def rounded(batch, tokens, *, temperature=1.0):
+        # bfloat16 has 8 bits: a sum of 7 logits' log-probabilities is off by as much.
+        result = evaluate(batch, tokens, temperature=temperature)
+        result["log_prob"] = result["log_prob"] + 0.3 * torch.randn(len(tokens), generator=noise)
+        return result
+
+    policy.evaluate_actions = rounded
+    ppo = make_ppo(policy=policy, target_kl=0.01, minibatch_size=128, epochs=1)
+    start = flat(policy.actor.parameters())
+    metrics = ppo.update(rollout(ppo, reward_for_up))
+    assert metrics["approx_kl"] > 0.02
+    assert metrics["policy_epochs"] == 1
+    assert not torch.equal(start, flat(policy.actor.parameters()))
+
+
+def test_the_base_policy_keeps_what_is_trained_and_nothing_else():
+    ppo = make_ppo(kl_base_coef=0.1, policy_lr=1e-2)
+    assert set(ppo.base_policy.parameters) == {"actor.weight", "actor.bias"}
+    batch = {"observation.state": torch.randn(5, 2), "task": [TASKS[0].instruction] * 5}
+    tokens = torch.zeros(5, 7, dtype=torch.int64)
+    before = ppo.policy.evaluate_actions(batch, tokens, temperature=0.7)["log_prob"].detach()
+    ppo.update(rollout(ppo, reward_for_up))
+    after = ppo.policy.evaluate_actions(batch, tokens, temperature=0.7)["log_prob"].detach()
+    assert not torch.equal(before, after)
+    torch.testing.assert_close(ppo.base_policy.log_prob(batch, tokens, 0.7), before)
+    with pytest.raises(ValueError, match=r"actor\.bias"):
+        ppo.base_policy.load({"actor.weight": torch.zeros(21, 3)})
+
+
+def test_the_values_inputs_are_made_once_an_update():
+    params, made = [], []
+    for has_inputs in (False, True):
+        policy = DummyPolicy()
+        if has_inputs:
+            policy.value_inputs = lambda batch: made.append(len(batch["task"])) or batch
+        ppo = make_ppo(policy=policy, value_epochs=5, epochs=1)
+        ppo.update(rollout(ppo, reward_for_up))
+        params.append(flat(policy.parameters()))
+    assert sum(made) == 16 * 8
+    torch.testing.assert_close(*params)
+
+
+def test_an_update_changes_the_buffers_advantages_and_returns_alone():
+    ppo = make_ppo()
+    buffer = rollout(ppo, reward_for_up)
+    kept = {
+        name: getattr(buffer, name).copy() for name in ("rewards", "values", "log_probs", "tokens", "boundaries")
+    }
+    ppo.update(buffer)
+    assert all(np.array_equal(getattr(buffer, name), array) for name, array in kept.items())
+    assert buffer.advantages.mean() == pytest.approx(0, abs=1e-6)

@@ -1,9 +1,12 @@
 import numpy as np
+import pytest
 import torch
-from dummies import identity_processors
+from dummies import DummyPolicy, DummyPolicyConfig, identity_processors
+from lerobot.configs import NormalizationMode
 from lerobot.envs.utils import preprocess_observation
+from lerobot.processor import PolicyProcessorPipeline, TokenizerProcessorStep
 
-from cronos_lerobot.agents.processing import PolicyProcessors, observation_columns
+from cronos_lerobot.agents.processing import PolicyProcessors, make_processors, observation_columns
 
 
 def observation():
@@ -27,3 +30,47 @@ def test_uint8_images_are_the_same_ones():
     key = "observation.images.front"
     assert integers[key].dtype == torch.uint8
     assert torch.equal(integers[key].float() / 255, floats[key])
+
+
+@pytest.mark.parametrize(
+    ("takes_uint8", "mode", "expected"),
+    [
+        # pi0, pi05 and SmolVLA leave images alone and expect [0, 1].
+        (False, NormalizationMode.IDENTITY, torch.float32),
+        (True, NormalizationMode.IDENTITY, torch.uint8),
+        (True, NormalizationMode.MEAN_STD, torch.float32),
+    ],
+)
+def test_only_a_policy_that_says_so_gets_uint8_images(takes_uint8, mode, expected):
+    config = DummyPolicyConfig()
+    config.normalization_mapping = {"VISUAL": mode}
+    policy = DummyPolicy(config)
+    policy.takes_uint8_images = takes_uint8
+    batch = make_processors(policy, *identity_processors()).batch(observation_columns(observation()), ["a", "b"])
+    images = batch["observation.images.front"]
+    assert images.dtype == expected
+    assert images.max() > 200 if takes_uint8 and expected == torch.uint8 else images.max() <= 1
+
+
+class CountingTokenizer:
+    """A token for each letter, padded to the longest text, as Hugging Face's tokenizers return them."""
+
+    def __init__(self):
+        self.texts = []
+
+    def __call__(self, texts, **options):
+        self.texts += texts
+        longest = max(map(len, texts))
+        ids = [[ord(letter) for letter in text] + [0] * (longest - len(text)) for text in texts]
+        return {"input_ids": torch.tensor(ids), "attention_mask": (torch.tensor(ids) > 0).long()}
+
+
+def test_each_instruction_of_a_batch_is_tokenized_once():
+    tokenizer = CountingTokenizer()
+    pipeline = PolicyProcessorPipeline(steps=[TokenizerProcessorStep(tokenizer=tokenizer)])
+    columns = {"observation.state": np.zeros((5, 2), np.float32)}
+    batch = make_processors(DummyPolicy(), pipeline, identity_processors()[1]).batch(columns, [*"aba", "cc", "b"])
+    assert tokenizer.texts == ["a", "b", "cc"]
+    expected = [[97, 0], [98, 0], [97, 0], [99, 99], [98, 0]]
+    assert batch["observation.language.tokens"].tolist() == expected
+    assert batch["observation.language.attention_mask"].tolist() == [[bool(i) for i in row] for row in expected]

@@ -72,3 +72,34 @@ def test_full_and_cleared():
     buffer.clear()
     assert len(buffer) == 0
     assert list(buffer.minibatches(4, np.random.default_rng(0))) == []
+
+
+def test_actions_keep_their_type_and_shape():
+    buffer = RolloutBuffer(2, N)
+    drawn = np.linspace(-1, 1, 2 * N * 8, dtype=np.float32).reshape(2, N, 4, 2)
+    for t in range(2):
+        sample = ActionSample(np.zeros((N, 7), np.float32), drawn[t], np.zeros(N), np.zeros(N))
+        buffer.add({}, ["a"] * N, sample, np.zeros(N), np.full(N, True), np.zeros(N))
+    (minibatch,) = buffer.minibatches(100, np.random.default_rng(0))
+    assert minibatch.tokens.dtype == np.float32
+    np.testing.assert_array_equal(minibatch.tokens, drawn.reshape(2 * N, 4, 2)[minibatch.indices])
+
+
+@pytest.mark.parametrize("batch_size", [1, 2 * N, 100])
+def test_observations_are_mapped_once_and_may_stand_in_for_the_stored_ones(batch_size):
+    buffer = filled(rows=4)
+    seen = []
+
+    def number(columns, instructions):
+        ids = columns["observation.state"][:, 0]
+        assert instructions == [f"task {int(i)}" for i in ids]
+        seen.extend(ids)
+        return {"negative": -ids}
+
+    mapped = buffer.map_observations(batch_size, number)
+    expected = [10 * row + stream for row in range(4) for stream in range(N)]
+    assert seen == expected
+    assert mapped["negative"].shape == (4, N)
+    for minibatch in buffer.minibatches(5, np.random.default_rng(1), mapped):
+        assert list(minibatch.observation) == ["negative"]
+        np.testing.assert_array_equal(minibatch.observation["negative"], -np.array(expected)[minibatch.indices])

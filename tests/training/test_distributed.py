@@ -173,7 +173,7 @@ def gradients(processes, options):
     ppo = PPO(
         DummyPolicy(), PolicyProcessors(*identity_processors()),
         PPOConfig(epochs=1, value_epochs=0, value_warmup_updates=0, lr_schedule="fixed", target_kl=None,
-                  max_grad_norm=1e9, **options),
+                  max_grad_norm=1e9, value_max_grad_norm=1e9, **options),
         np.random.default_rng(processes.rank), processes,
     )  # fmt: skip
     mine = processes.share_of(6)
@@ -187,8 +187,16 @@ def test_gradients_are_those_of_one_process_on_all_transitions(options):
     expected, expected_metrics = gradients(Processes(), {"minibatch_size": 48})
     for gradient, result in together(gradients, options):
         assert gradient == pytest.approx(expected, abs=1e-6, rel=1e-5)
-        names = ["grad_norm", "policy_loss", "value_loss", "approx_kl", "advantage_std", "explained_variance"]
-        names += ["reward_mean", "ratio_max"] if len(options) == 1 else ["reward_mean"]
+        names = [
+            "policy_grad_norm",
+            "value_grad_norm",
+            "policy_loss",
+            "value_loss",
+            "approx_kl",
+            "advantage_std",
+            "explained_variance",
+        ]
+        names += ["explained_variance"] + (["reward_mean", "ratio_max"] if len(options) == 1 else ["reward_mean"])
         assert {k: result[k] for k in names} == pytest.approx({k: expected_metrics[k] for k in names}, rel=1e-4)
 
 

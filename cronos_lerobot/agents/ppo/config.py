@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +10,61 @@ from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
 LR_SCHEDULES = ("fixed", "kl_step", "kl_update")
 VALUE_LOSSES = ("huber", "mse")
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Where a setting has to lie. NaN lies nowhere."""
+
+    low: float
+    high: float = math.inf
+    with_low: bool = True
+    with_high: bool = True
+
+    def __contains__(self, value: float) -> bool:
+        above = value >= self.low if self.with_low else value > self.low
+        below = value <= self.high if self.with_high else value < self.high
+        return above and below and not math.isinf(value)
+
+    def __str__(self) -> str:
+        low = f"{'>=' if self.with_low else '>'} {self.low:g}"
+        return low if math.isinf(self.high) else f"{low} and {'<=' if self.with_high else '<'} {self.high:g}"
+
+
+COUNT = Interval(1)
+FROM_0 = Interval(0)
+ABOVE_0 = Interval(0, with_low=False)
+SHARE = Interval(0, 1)
+DECAY = Interval(0, 1, with_high=False)
+RANGES = {
+    "epochs": COUNT,
+    "value_epochs": FROM_0,
+    "value_warmup_updates": FROM_0,
+    "minibatch_size": COUNT,
+    "grad_accumulation": COUNT,
+    "clip": Interval(0, 1, with_low=False),
+    "gamma": SHARE,
+    "gae_lambda": SHARE,
+    "entropy_coef": FROM_0,
+    "value_coef": FROM_0,
+    "huber_delta": ABOVE_0,
+    "value_clip": ABOVE_0,
+    "policy_lr": FROM_0,
+    "value_lr": FROM_0,
+    "target_kl": ABOVE_0,
+    "kl_stop_factor": ABOVE_0,
+    "lr_factor": Interval(1),
+    "policy_lr_min": FROM_0,
+    "policy_lr_max": FROM_0,
+    "kl_base_coef": FROM_0,
+    "max_grad_norm": ABOVE_0,
+    "value_max_grad_norm": ABOVE_0,
+    "beta1": DECAY,
+    "beta2": DECAY,
+    "weight_decay": FROM_0,
+    "temperature": ABOVE_0,
+}
+"""Valid values of the numbers; those that may be null are free to be."""
 
 
 @RLAlgorithmConfig.register_subclass("ppo")
@@ -37,7 +93,7 @@ class PPOConfig(RLAlgorithmConfig):
     entropy_coef: float = 0.0
     """Weight of the entropy bonus."""
     value_coef: float = 1.0
-    """Weight of the value loss; it matters where policy and value share parameters."""
+    """Weight of the value loss, in all passes; it matters where policy and value share parameters."""
     value_loss: str = "huber"
     """`huber` or `mse` (half the squared error)."""
     huber_delta: float = 10.0
@@ -54,8 +110,8 @@ class PPOConfig(RLAlgorithmConfig):
     target_kl: float | None = 0.05
     """KL divergence [nats] between the policies before and after an update that is aimed at; null if none."""
     kl_stop_factor: float | None = 2.0
-    """The policy's training in an update stops once a step sees a KL above this times target_kl; null never
-    stops it."""
+    """The policy's training in an update stops once a step sees a KL above this times target_kl, and an adaptive
+    learning rate falls; null never stops it."""
     lr_factor: float = 1.5
     """Factor by which the adaptive learning rate rises or falls."""
     policy_lr_min: float = 1e-6
@@ -63,9 +119,11 @@ class PPOConfig(RLAlgorithmConfig):
     policy_lr_max: float = 1e-3
     """Upper end of the adaptive learning rate."""
     kl_base_coef: float = 0.0
-    """Weight of the KL divergence from the policy that the run began with, which is then kept in memory."""
+    """Weight of KL(policy || the policy that the run began with), whose trained parameters are kept in memory."""
     max_grad_norm: float = 1.0
-    """Gradients are scaled down to this norm, over all parameters."""
+    """The gradient of the policy's parameters is scaled down to this norm."""
+    value_max_grad_norm: float = 1.0
+    """The gradient of the value's parameters is scaled down to this norm."""
     beta1: float = 0.9
     """AdamW's decay of the gradient's mean."""
     beta2: float = 0.999
@@ -76,19 +134,20 @@ class PPOConfig(RLAlgorithmConfig):
     """Sampling temperature while training."""
 
     def __post_init__(self) -> None:
-        for name in ("epochs", "minibatch_size", "grad_accumulation"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"algorithm.{name} must be >= 1, got {getattr(self, name)}.")
-        for name in ("value_epochs", "value_warmup_updates"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"algorithm.{name} must be >= 0, got {getattr(self, name)}.")
+        for name, interval in RANGES.items():
+            value = getattr(self, name)
+            if value is not None and value not in interval:
+                raise ValueError(f"algorithm.{name} must be {interval}, got {value}.")
         for name, choices in (("lr_schedule", LR_SCHEDULES), ("value_loss", VALUE_LOSSES)):
             if getattr(self, name) not in choices:
                 raise ValueError(f"algorithm.{name} must be one of {choices}, got {getattr(self, name)!r}.")
         if self.target_kl is None and self.lr_schedule != "fixed":
             raise ValueError(f"algorithm.lr_schedule={self.lr_schedule} needs algorithm.target_kl.")
-        if self.temperature <= 0:
-            raise ValueError(f"algorithm.temperature must be > 0 while training, got {self.temperature}.")
+        if self.policy_lr_min > self.policy_lr_max:
+            raise ValueError(
+                f"algorithm.policy_lr_min must be at most policy_lr_max={self.policy_lr_max}, got "
+                f"{self.policy_lr_min}."
+            )
 
     @classmethod
     def from_policy_config(cls, policy_cfg: Any) -> PPOConfig:
@@ -117,3 +176,4 @@ class PaperPPOConfig(PPOConfig):
     lr_schedule: str = "fixed"
     target_kl: float | None = None
     max_grad_norm: float = 10.0
+    value_max_grad_norm: float = 10.0

@@ -2,96 +2,54 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
-from collections.abc import Generator, Iterator
+import math
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import huber_loss
 
 from cronos_lerobot.agents.base import Columns, check_trainable
+from cronos_lerobot.agents.ppo.base_policy import BasePolicy
 from cronos_lerobot.agents.ppo.config import PPOConfig
+from cronos_lerobot.agents.ppo.learning_rate import AdaptiveLR
+from cronos_lerobot.agents.ppo.losses import (
+    approximate_kl,
+    bounded_log_ratio,
+    clipped_objective,
+    explained_variance,
+    kl_to_base,
+    value_error,
+)
+from cronos_lerobot.agents.ppo.metrics import UpdateMetrics
 from cronos_lerobot.agents.ppo.rollout_buffer import Minibatch, RolloutBuffer
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.processes import Processes
 
 
-def clipped_objective(log_ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
-    """min(r A, clip(r, 1 - eps, 1 + eps) A), (B,), to be maximised; r = exp(log_ratio)."""
-    ratio = log_ratio.exp()
-    return torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)
+@dataclass(frozen=True)
+class Loss:
+    """What a minibatch costs."""
 
-
-def approximate_kl(log_ratio: Tensor) -> Tensor:
-    """KL(old || new) from samples of old, (B,): (r - 1) - log r, unbiased and never negative [nats]."""
-    return log_ratio.exp() - 1 - log_ratio
-
-
-def value_error(value: Tensor, old_value: Tensor, return_: Tensor, config: PPOConfig) -> Tensor:
-    """Loss of each value, (B,): Huber or half squared error, the worse of clipped and unclipped if clipping."""
-
-    def loss(prediction: Tensor) -> Tensor:
-        if config.value_loss == "huber":
-            return huber_loss(prediction, return_, reduction="none", delta=config.huber_delta)
-        return 0.5 * (prediction - return_).square()
-
-    if config.value_clip is None:
-        return loss(value)
-    clipped = old_value + (value - old_value).clamp(-config.value_clip, config.value_clip)
-    return torch.maximum(loss(value), loss(clipped))
-
-
-def adapted_lr(lr: float, kl: float, config: PPOConfig) -> float:
-    """Return a smaller learning rate if `kl` is above twice the target, a larger one if below half of it."""
-    assert config.target_kl is not None
-    if kl > 2 * config.target_kl:
-        return max(lr / config.lr_factor, config.policy_lr_min)
-    if kl < config.target_kl / 2:
-        return min(lr * config.lr_factor, config.policy_lr_max)
-    return lr
-
-
-def explained_variance(values: np.ndarray, returns: np.ndarray) -> float:
-    """Return 1 - Var[R - V] / Var[R]: 1 is a perfect critic, 0 one that knows the mean only."""
-    variance = float(np.var(returns))
-    return float("nan") if variance == 0 else 1 - float(np.var(returns - values)) / variance
-
-
-class _Means:
-    """Means and maxima of metrics over minibatches, weighted by their size."""
-
-    def __init__(self) -> None:
-        self.sums: dict[str, float] = {}
-        self.weights: dict[str, float] = {}
-
-    def add(self, metrics: dict[str, float], weight: float = 1.0) -> None:
-        for name, value in metrics.items():
-            if name.endswith("_max"):
-                self.sums[name] = max(value, self.sums.get(name, value))
-                self.weights[name] = 1.0
-            else:
-                self.sums[name] = self.sums.get(name, 0.0) + value * weight
-                self.weights[name] = self.weights.get(name, 0.0) + weight
-
-    def result(self) -> dict[str, float]:
-        return {name: total / self.weights[name] for name, total in self.sums.items()}
-
-    def result_of_all(self, processes: Processes) -> dict[str, float]:
-        together = _Means()
-        for result in processes.gather(self.result()):
-            together.add(result)
-        return together.result()
+    total: Tensor
+    """Scalar, to be minimised."""
+    means: dict[str, float]
+    """For the log; to be averaged over minibatches."""
+    maxima: dict[str, float] = field(default_factory=dict)
+    """For the log; the largest of all minibatches counts."""
+    kl: float | None = None
+    """KL(old || new) of the policies [nats], if the policy is trained."""
 
 
 class PPO:
     """Updates a policy from rollouts.
 
     Args:
-        policy: a TrainablePolicy, already on its device.
+        policy: a TrainablePolicy, already on its device. Its parameters in no group are frozen.
         processors: from stored observations to the policy's batches.
         config: see PPOConfig.
         rng: draws the order of the minibatches.
@@ -118,6 +76,7 @@ class PPO:
         self.processes = processes or Processes()
         self.num_updates = 0
         lrs = {"policy": config.policy_lr, "value": config.value_lr}
+        self._max_norms = {"policy": config.max_grad_norm, "value": config.value_max_grad_norm}
         self._params: dict[str, list[Tensor]] = {"policy": [], "value": []}
         groups = policy.rl_parameter_groups()
         for group in groups:
@@ -126,137 +85,171 @@ class PPO:
             group["lr"] = lrs[group["name"]]
             group["params"] = [p for p in group["params"] if p.requires_grad]
             self._params[group["name"]] += group["params"]
+        _freeze_all_but(self._params["policy"] + self._params["value"], policy)
         betas = (config.beta1, config.beta2)
-        self.optimizer = torch.optim.AdamW(groups, betas=betas, weight_decay=config.weight_decay)
-        self.base_policy = _frozen_copy(policy) if config.kl_base_coef else None
+        # Without `fused`, a small network's step on a CPU costs as much as a tenth of its backward pass.
+        fused = True if processors.device.type == "cpu" else None
+        self.optimizer = torch.optim.AdamW(groups, betas=betas, weight_decay=config.weight_decay, fused=fused)
+        self.lr = AdaptiveLR(self.optimizer, config)
+        self.base_policy = BasePolicy(policy, self._params["policy"]) if config.kl_base_coef else None
 
     def update(self, buffer: RolloutBuffer) -> dict[str, float]:
-        """Learn from every transition in `buffer`, which is left as it is, and return metrics."""
+        """Learn from every transition in `buffer`, and return metrics.
+
+        The buffer's `advantages` and `returns` are filled in, the advantages normalised if the config says so;
+        all else in it stays as it is.
+        """
         config = self.config
         buffer.compute_advantages(config.gamma, config.gae_lambda)
         rollout = {name: self.processes.concatenate(array, axis=1) for name, array in buffer.results().items()}
-        metrics = _describe_rollout(rollout)
+        described = _describe_rollout(rollout)
         if config.normalize_advantage:
             buffer.normalize_advantages(rollout["advantages"].mean(), rollout["advantages"].std())
-        means = _Means()
+        metrics = UpdateMetrics()
         warming_up = self.num_updates < config.value_warmup_updates
-        epochs = 0 if warming_up else self._train_policy(buffer, means)
-        for _ in range(max(config.value_epochs, config.epochs) if warming_up else config.value_epochs):
-            self._value_epoch(buffer, means)
+        epochs = 0 if warming_up else self._train_policy(buffer, metrics)
+        self._train_value(buffer, metrics, max(config.value_epochs, config.epochs * warming_up))
         self.num_updates += 1
-        metrics |= means.result_of_all(self.processes) | {"policy_epochs": epochs, "policy_lr": self.policy_lr}
-        return metrics | {"value_lr": self._group("value")["lr"]}
+        described |= metrics.result(self.processes)
+        return described | {"policy_epochs": epochs, "policy_lr": self.policy_lr, "value_lr": config.value_lr}
 
     @property
     def policy_lr(self) -> float:
         """The policy's learning rate now."""
-        return self._group("policy")["lr"]
+        return self.lr.value
 
     @policy_lr.setter
     def policy_lr(self, lr: float) -> None:
-        for group in self.optimizer.param_groups:
-            if group["name"] == "policy":
-                group["lr"] = lr
+        self.lr.value = lr
 
-    def _train_policy(self, buffer: RolloutBuffer, means: _Means) -> float:
+    def _train_policy(self, buffer: RolloutBuffer, metrics: UpdateMetrics) -> float:
         """Train policy and value together; returns the epochs that were run, fractions included."""
         config, steps = self.config, 0
-        num_minibatches = -(-len(buffer) // config.minibatch_size)
-        steps_per_epoch = -(-num_minibatches // config.grad_accumulation)
-        epoch_kl = _Means()
-        for epoch in range(config.epochs):
-            epoch_kl = _Means()
-            for group in _batched(buffer.minibatches(config.minibatch_size, self.rng), config.grad_accumulation):
-                kl = self._accumulate_gradients(group, means)
-                epoch_kl.add({"kl": kl})
-                if self._should_stop(kl):
-                    self._adapt_lr("kl_step", kl)
-                    self._adapt_lr("kl_update", kl)
-                    return epoch + (steps - epoch * steps_per_epoch) / steps_per_epoch
-                # Before the first step the policy is still the old one and its KL says nothing.
-                if steps > 0:
-                    self._adapt_lr("kl_step", kl)
-                self._optimizer_step(means)
+        steps_per_epoch = -(-len(buffer) // (config.minibatch_size * config.grad_accumulation))
+        seen: list[float] = []
+        self.lr.begin_update()
+        for _ in range(config.epochs):
+            seen = []
+            for group in self._groups(buffer):
+                # Before the first step the policy is still the old one: its KL is rounding.
+                kl = self._accumulate(group, self._loss, metrics, self._kl_limit if steps else math.inf)
+                if steps and kl > self._kl_limit:
+                    self.lr.stopped_early()
+                    return steps / steps_per_epoch
+                if steps:
+                    seen.append(kl)
+                    self.lr.see("kl_step", kl)
+                norms = self._optimizer_step(metrics)
+                self.lr.after_step(norms["policy"])
                 steps += 1
-        self._adapt_lr("kl_update", epoch_kl.result()["kl"])
+        self.lr.see("kl_update", float(np.mean(seen)) if seen else None)
+        self.lr.end_update()
         return float(config.epochs)
 
-    def _accumulate_gradients(self, group: list[Minibatch], means: _Means) -> float:
-        """Backpropagate the mean loss over a group of minibatches; returns the KL divergence of all processes'."""
+    def _train_value(self, buffer: RolloutBuffer, metrics: UpdateMetrics, epochs: int) -> None:
+        """Train the value alone, on what the policy's layers, which stay as they are, make of the observations."""
+        value_inputs = getattr(self.policy, "value_inputs", None)
+        inputs = None
+        if epochs and value_inputs is not None:
+            inputs = buffer.map_observations(self.config.minibatch_size, self.processors.making(value_inputs))
+
+        def loss_of(minibatch: Minibatch) -> Loss:
+            columns, texts = minibatch.observation, minibatch.instructions
+            make = self.processors.encoded_batch if inputs is None else self.processors.made_batch
+            value = self.policy.predict_values(make(columns, texts))
+            error = self._value_error(value, minibatch)
+            return Loss(self.config.value_coef * error, {"value_epochs_loss": error.item()})
+
+        with _frozen(self._params["policy"]):
+            for _ in range(epochs):
+                for group in self._groups(buffer, inputs):
+                    self._accumulate(group, loss_of, metrics)
+                    self._optimizer_step(metrics)
+
+    def _groups(self, buffer: RolloutBuffer, observations: Columns | None = None) -> Iterator[list[Minibatch]]:
+        """The minibatches of each optimizer step of one epoch."""
+        minibatches = buffer.minibatches(self.config.minibatch_size, self.rng, observations)
+        while group := list(itertools.islice(minibatches, self.config.grad_accumulation)):
+            yield group
+
+    def _accumulate(
+        self,
+        group: list[Minibatch],
+        loss_of: Callable[[Minibatch], Loss],
+        metrics: UpdateMetrics,
+        kl_limit: float = math.inf,
+    ) -> float:
+        """Backpropagate the mean loss over a group of minibatches.
+
+        Returns the KL divergence over the minibatches of all processes, of as many as were looked at: none is
+        negative, so the first ones may do to exceed `kl_limit`, and there are no gradients then.
+        """
         self.optimizer.zero_grad(set_to_none=True)
         size = sum(len(minibatch.indices) for minibatch in group)
         kl = 0.0
         for minibatch in group:
             weight = len(minibatch.indices) / size
-            loss, metrics = self._loss(minibatch)
-            if not torch.isfinite(loss):
-                raise FloatingPointError(f"The loss of update {self.num_updates} is {loss.item()}: {metrics}.")
-            (loss * weight).backward()
-            means.add(metrics, len(minibatch.indices))
-            kl += metrics["approx_kl"] * weight
-        return float(self.processes.concatenate(np.array([kl])).mean())
+            loss = loss_of(minibatch)
+            metrics.add_means(loss.means, len(minibatch.indices))
+            metrics.add_maxima(loss.maxima)
+            if loss.kl is not None:
+                kl += weight * float(self.processes.concatenate(np.array([loss.kl])).mean())
+            if kl > kl_limit:
+                self.optimizer.zero_grad(set_to_none=True)
+                return kl
+            if not torch.isfinite(loss.total):
+                raise FloatingPointError(
+                    f"The loss of update {self.num_updates} is {loss.total.item()}: {loss.means}."
+                )
+            (loss.total * weight).backward()
+        return kl
 
-    def _loss(self, minibatch: Minibatch) -> tuple[Tensor, dict[str, float]]:
+    def _loss(self, minibatch: Minibatch) -> Loss:
         config = self.config
         batch = self.processors.encoded_batch(minibatch.observation, minibatch.instructions)
-        tokens = self._tensor(minibatch.tokens)
-        advantage = self._tensor(minibatch.advantage)
+        tokens, old_log_prob = self._tensor(minibatch.tokens), self._tensor(minibatch.log_prob)
         new = self.policy.evaluate_actions(batch, tokens, temperature=config.temperature)
-        log_ratio = new["log_prob"] - self._tensor(minibatch.log_prob)
-        policy_loss = -clipped_objective(log_ratio, advantage, config.clip).mean()
-        value_loss = value_error(
-            new["value"], self._tensor(minibatch.value), self._tensor(minibatch.return_), config
-        ).mean()
+        log_ratio = bounded_log_ratio(new["log_prob"], old_log_prob)
+        policy_loss = -clipped_objective(log_ratio, self._tensor(minibatch.advantage), config.clip).mean()
+        value_loss = self._value_error(new["value"], minibatch)
         entropy = new["entropy"].mean()
-        loss = policy_loss + config.value_coef * value_loss - config.entropy_coef * entropy
+        total = policy_loss + config.value_coef * value_loss - config.entropy_coef * entropy
         ratio = log_ratio.detach().exp()
-        metrics = {
+        kl = approximate_kl(log_ratio.detach()).mean().item()
+        means = {
             "policy_loss": policy_loss.item(),
             "value_loss": value_loss.item(),
             "entropy": entropy.item(),
-            "approx_kl": approximate_kl(log_ratio.detach()).mean().item(),
+            "approx_kl": kl,
             "clip_fraction": ((ratio - 1).abs() > config.clip).float().mean().item(),
-            "ratio_max": ratio.max().item(),
         }
         if self.base_policy is not None:
-            with torch.no_grad():
-                base = self.base_policy.evaluate_actions(batch, tokens, temperature=config.temperature)
-            base_kl = approximate_kl(base["log_prob"] - new["log_prob"]).mean()
-            loss = loss + config.kl_base_coef * base_kl
-            metrics["base_kl"] = base_kl.item()
-        return loss, metrics
+            base_log_prob = self.base_policy.log_prob(batch, tokens, config.temperature)
+            base_kl = kl_to_base(new["log_prob"], old_log_prob, base_log_prob).mean()
+            total = total + config.kl_base_coef * base_kl
+            means["base_kl"] = base_kl.item()
+        return Loss(total, means, {"ratio_max": ratio.max().item()}, kl)
 
-    def _value_epoch(self, buffer: RolloutBuffer, means: _Means) -> None:
-        config = self.config
-        with _frozen(self._params["policy"]):
-            for group in _batched(buffer.minibatches(config.minibatch_size, self.rng), config.grad_accumulation):
-                self.optimizer.zero_grad(set_to_none=True)
-                size = sum(len(minibatch.indices) for minibatch in group)
-                for minibatch in group:
-                    batch = self.processors.encoded_batch(minibatch.observation, minibatch.instructions)
-                    old_value, return_ = self._tensor(minibatch.value), self._tensor(minibatch.return_)
-                    error = value_error(self.policy.predict_values(batch), old_value, return_, config)
-                    (error.sum() / size).backward()
-                    means.add({"value_epochs_loss": error.mean().item()}, len(minibatch.indices))
-                self._optimizer_step(means, "value_grad_norm")
+    def _value_error(self, value: Tensor, minibatch: Minibatch) -> Tensor:
+        old_value, return_ = self._tensor(minibatch.value), self._tensor(minibatch.return_)
+        return value_error(value, old_value, return_, self.config).mean()
 
-    def _optimizer_step(self, means: _Means, norm_name: str = "grad_norm") -> None:
-        params = self._params["policy"] + self._params["value"]
-        self.processes.average_gradients(params)
-        norm = torch.nn.utils.clip_grad_norm_(params, self.config.max_grad_norm)
-        means.add({norm_name: norm.item()})
+    def _optimizer_step(self, metrics: UpdateMetrics) -> dict[str, float]:
+        """Step along the mean gradient of all processes; returns its norm in each group that has one."""
+        self.processes.average_gradients(self._params["policy"] + self._params["value"])
+        norms = {}
+        for name, params in self._params.items():
+            if any(param.grad is not None for param in params):
+                norms[name] = torch.nn.utils.clip_grad_norm_(params, self._max_norms[name]).item()
+        metrics.add_means({f"{name}_grad_norm": norm for name, norm in norms.items()})
         self.optimizer.step()
+        return norms
 
-    def _adapt_lr(self, when: str, kl: float) -> None:
-        if self.config.lr_schedule == when:
-            self.policy_lr = adapted_lr(self.policy_lr, kl, self.config)
-
-    def _should_stop(self, kl: float) -> bool:
+    @property
+    def _kl_limit(self) -> float:
+        """The KL divergence beyond which the policy's training in an update stops."""
         target, factor = self.config.target_kl, self.config.kl_stop_factor
-        return target is not None and factor is not None and kl > factor * target
-
-    def _group(self, name: str) -> dict[str, Any]:
-        return next(group for group in self.optimizer.param_groups if group["name"] == name)
+        return math.inf if target is None or factor is None else factor * target
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.processors.device)
@@ -272,15 +265,11 @@ def _describe_rollout(rollout: Columns) -> dict[str, float]:
     }
 
 
-def _batched(minibatches: Iterator[Minibatch], size: int) -> Iterator[list[Minibatch]]:
-    while group := list(itertools.islice(minibatches, size)):
-        yield group
-
-
-def _frozen_copy(policy: Any) -> Any:
-    base = copy.deepcopy(policy)
-    base.requires_grad_(False)
-    return base.eval()
+def _freeze_all_but(params: Sequence[Tensor], policy: torch.nn.Module) -> None:
+    trained = {id(param) for param in params}
+    for param in policy.parameters():
+        if id(param) not in trained:
+            param.requires_grad_(False)
 
 
 @contextmanager

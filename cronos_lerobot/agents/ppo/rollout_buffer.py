@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +27,7 @@ class Minibatch:
 
 
 class RolloutBuffer:
-    """Preallocated at the first `add`; images stay uint8, instructions are kept as indices.
+    """Preallocated at the first `add`; every column keeps its type and shape, instructions are kept as indices.
 
     Args:
         num_rows: U, transitions of each stream.
@@ -117,22 +117,49 @@ class RolloutBuffer:
         advantages = self.advantages[: self.rows]
         advantages[:] = (advantages - mean) / (std + 1e-8)
 
-    def minibatches(self, batch_size: int, rng: np.random.Generator) -> Iterator[Minibatch]:
-        """Yield every transition exactly once, in an order drawn from `rng`; the last batch may be smaller."""
+    def minibatches(
+        self, batch_size: int, rng: np.random.Generator, observations: Columns | None = None
+    ) -> Iterator[Minibatch]:
+        """Yield every transition exactly once, in an order drawn from `rng`; the last batch may be smaller.
+
+        Args:
+            batch_size: transitions in one.
+            rng: draws the order.
+            observations: columns (rows, num_streams, ...) in place of the stored ones.
+        """
+        observations = self.observations if observations is None else observations
         order = rng.permutation(len(self))
         for start in range(0, len(order), batch_size):
-            yield self._gather(order[start : start + batch_size])
+            yield self._gather(order[start : start + batch_size], observations)
+
+    def map_observations(self, batch_size: int, function: Callable[[Columns, list[str]], Columns]) -> Columns:
+        """Return what `function` makes of all observations, as columns (rows, num_streams, ...).
+
+        Args:
+            batch_size: of observations at a time, about.
+            function: columns (B, ...) and B instructions -> columns (B, ...). It sees the buffer's own memory.
+        """
+        rows = max(1, batch_size // self.num_streams)
+        parts = []
+        for start in range(0, self.rows, rows):
+            part = slice(start, min(start + rows, self.rows))
+            size = (part.stop - part.start) * self.num_streams
+            columns = {name: col[part].reshape(size, *col.shape[2:]) for name, col in self.observations.items()}
+            texts = [self._instructions[i] for i in self.instruction_ids[part].reshape(-1)]
+            parts.append(function(columns, texts))
+        whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return {name: col.reshape(self.rows, self.num_streams, *col.shape[1:]) for name, col in whole.items()}
 
     def clear(self) -> None:
         """Forget the transitions; the memory is kept."""
         self.rows = 0
 
-    def _gather(self, indices: np.ndarray) -> Minibatch:
+    def _gather(self, indices: np.ndarray, observations: Columns) -> Minibatch:
         assert self.tokens is not None
         row, stream = np.divmod(indices, self.num_streams)
         return Minibatch(
             indices=indices,
-            observation={name: column[row, stream] for name, column in self.observations.items()},
+            observation={name: column[row, stream] for name, column in observations.items()},
             instructions=[self._instructions[i] for i in self.instruction_ids[row, stream]],
             tokens=self.tokens[row, stream],
             log_prob=self.log_probs[row, stream],
@@ -143,7 +170,7 @@ class RolloutBuffer:
 
     def _allocate(self, observation: Columns, sample: ActionSample) -> None:
         shape = (self.num_rows, self.num_streams)
-        self.tokens = np.zeros((*shape, sample.tokens.shape[1]), np.int64)
+        self.tokens = np.zeros((*shape, *sample.tokens.shape[1:]), sample.tokens.dtype)
         self.observations = {
             name: np.zeros((*shape, *column.shape[1:]), column.dtype) for name, column in observation.items()
         }

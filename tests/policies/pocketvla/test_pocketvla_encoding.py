@@ -1,8 +1,14 @@
 """Reinforcement learning on a frozen encoder: encodings are made once, while acting, and trained on later."""
 
+import numpy as np
 import pytest
 import torch
+from lerobot.policies import make_pre_post_processors
 from pocketvla_samples import make_batch, make_policy
+
+from cronos_lerobot.agents.ppo.config import PPOConfig
+from cronos_lerobot.agents.ppo.ppo import PPO
+from cronos_lerobot.agents.processing import make_processors
 
 
 @pytest.fixture
@@ -34,3 +40,48 @@ def test_a_trainable_encoder_keeps_the_images():
     assert policy.encode_observation is None
     count = sum(len(group["params"]) for group in policy.rl_parameter_groups())
     assert count == len(list(policy.parameters()))
+
+
+def test_what_is_frozen_gathers_no_gradient(policy):
+    PPO(
+        policy,
+        make_processors(policy, *make_pre_post_processors(policy.config)),
+        PPOConfig(),
+        np.random.default_rng(0),
+    )
+    batch = policy.encode_observation(make_batch(4))
+    result = policy.evaluate_actions(batch, policy.sample_actions(batch)["tokens"])
+    (result["log_prob"].sum() + result["value"].sum()).backward()
+    grown = {name.rsplit(".", 1)[0] for name, p in policy.named_parameters() if p.grad is not None}
+    assert grown
+    assert not [name for name in grown if name.startswith(("actor.text", "actor.encoder"))]
+
+
+CRITICS = {
+    "privileged": {"critic_observation": "environment_state"},
+    "detached": {},
+    "state": {"image": False},
+}
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+@pytest.mark.parametrize("options", CRITICS.values(), ids=CRITICS)
+def test_the_values_inputs_stand_in_for_the_batch(options, frozen):
+    policy = make_policy(freeze_encoder=frozen, **options)
+    batch = make_batch(6)
+    if policy.encode_observation is not None:
+        batch = policy.encode_observation(batch)
+    inputs = policy.value_inputs(batch)
+    assert not [key for key in inputs if "images" in key]
+    values = policy.predict_values(inputs | {"task": batch["task"]})
+    torch.testing.assert_close(values, policy.predict_values(batch))
+    values.sum().backward()
+    params = {group["name"]: group["params"] for group in policy.rl_parameter_groups()}
+    assert all(p.grad is not None for p in params["value"])
+    assert all(p.grad is None for p in params["policy"])
+
+
+def test_a_value_loss_that_trains_the_actor_needs_the_whole_batch():
+    assert make_policy(value_detach=False).value_inputs is None
+    # A critic of its own trains nothing of the actor either way.
+    assert make_policy(value_detach=False, critic_observation="environment_state").value_inputs is not None

@@ -44,6 +44,8 @@ class OpenVLAPolicy(PreTrainedPolicy):
 
     config_class = OpenVLAConfig  # ty: ignore[invalid-assignment]
     name = "openvla"  # ty: ignore[invalid-assignment]
+    takes_uint8_images = True
+    """Camera frames may come as they are, in 0..255."""
 
     def __init__(self, config: OpenVLAConfig, **kwargs: Any) -> None:
         """Load the checkpoint.

@@ -27,6 +27,8 @@ Batch = Mapping[str, Any]
 
 ENCODING = f"{OBS_STR}.encoding"
 """Key of a cached encoding in a batch, see `PocketVLAPolicy.encode_observation`."""
+FEATURES = f"{OBS_STR}.features"
+"""Key of the actor's cached features in a batch, see `PocketVLAPolicy.value_inputs`."""
 
 
 class PocketVLAPolicy(PreTrainedPolicy):
@@ -38,6 +40,8 @@ class PocketVLAPolicy(PreTrainedPolicy):
 
     config_class = PocketVLAConfig  # ty: ignore[invalid-assignment]
     name = "pocketvla"  # ty: ignore[invalid-assignment]
+    takes_uint8_images = True
+    """Camera frames may come as they are, in 0..255: converting them to floats costs as much as a convolution."""
 
     def __init__(self, config: PocketVLAConfig, **kwargs: Any) -> None:
         """Build the networks; LeRobot's further arguments (data set statistics, metadata) are not needed."""
@@ -112,7 +116,8 @@ class PocketVLAPolicy(PreTrainedPolicy):
         """Values (B,); `features` are the actor's, if they are at hand."""
         if self.critic is not None:
             return self.value_head(self.critic(self._vector(batch, with_environment=True), self._texts(batch)))
-        features = self._features(batch) if features is None else features
+        if features is None:
+            features = batch[FEATURES] if FEATURES in batch else self._features(batch)
         return self.value_head(features.detach() if self.config.value_detach else features)
 
     def _full_precision(self) -> torch.autocast:
@@ -218,6 +223,22 @@ class PocketVLAPolicy(PreTrainedPolicy):
         with self._full_precision():
             kept = {key: value for key, value in batch.items() if key != self.config.camera[0]}
             return kept | {ENCODING: self._encode(batch)}
+
+    @property
+    def value_inputs(self) -> Callable[[Batch], Batch] | None:
+        """The function that makes of a batch what the value's own parameters begin with: the inputs of a critic
+        of its own, or the actor's features; None if the value loss trains the actor, too."""
+        if self.critic is not None:
+            return self._critic_inputs
+        return self._actor_features if self.config.value_detach else None
+
+    def _critic_inputs(self, batch: Batch) -> Batch:
+        return {key: value for key, value in batch.items() if key in ("task", OBS_STATE, OBS_ENV_STATE)}
+
+    @torch.no_grad()
+    def _actor_features(self, batch: Batch) -> Batch:
+        with self._full_precision():
+            return {FEATURES: self._features(batch)}
 
     @torch.no_grad()
     def sample_actions(

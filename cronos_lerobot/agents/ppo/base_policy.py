@@ -1,0 +1,58 @@
+"""The policy that a run began with, kept as the parameters that have changed since."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+
+class BasePolicy:
+    """What a policy was: it shares every parameter that is not trained, and every buffer, with what it is now.
+
+    Args:
+        policy: a TrainablePolicy.
+        params: those of its parameters that will be trained and that the actions depend on; copied.
+
+    Attributes:
+        parameters: the copies by the policy's names of them; a checkpoint holds them.
+    """
+
+    def __init__(self, policy: nn.Module, params: Sequence[Tensor]) -> None:
+        wanted = {id(param) for param in params}
+        self.parameters = {
+            name: param.detach().clone() for name, param in policy.named_parameters() if id(param) in wanted
+        }
+        self._evaluate = _Evaluate(policy)
+
+    @torch.no_grad()
+    def log_prob(self, batch: Any, tokens: Tensor, temperature: float) -> Tensor:
+        """Log-probability of drawn actions, (B,) [nats]."""
+        parameters = {f"policy.{name}": param for name, param in self.parameters.items()}
+        return functional_call(self._evaluate, parameters, (batch, tokens, temperature))
+
+    def load(self, parameters: dict[str, Tensor]) -> None:
+        """Go on with the parameters of a checkpoint.
+
+        Raises:
+            ValueError: they are not those of this policy.
+        """
+        if parameters.keys() != self.parameters.keys():
+            differing = sorted(parameters.keys() ^ self.parameters.keys())
+            raise ValueError(f"The base policy's parameters are another policy's; they differ in {differing}.")
+        for name, param in parameters.items():
+            self.parameters[name].copy_(param)
+
+
+class _Evaluate(nn.Module):
+    """`functional_call` calls `forward`."""
+
+    def __init__(self, policy: Any) -> None:
+        super().__init__()
+        self.policy: Any = policy
+
+    def forward(self, batch: Any, tokens: Tensor, temperature: float) -> Tensor:
+        return self.policy.evaluate_actions(batch, tokens, temperature=temperature)["log_prob"]

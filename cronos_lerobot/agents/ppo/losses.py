@@ -1,0 +1,64 @@
+"""What PPO minimises (Schulman et al., 2017), and what it measures."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import huber_loss
+
+from cronos_lerobot.agents.ppo.config import PPOConfig
+
+LOG_RATIO_LIMIT = 20.0
+"""Largest |log r|: e^20 times any advantage is finite in float32, and any early stop stops long before."""
+
+
+def bounded_log_ratio(new_log_prob: Tensor, old_log_prob: Tensor) -> Tensor:
+    """log r of the probability ratio r = new / old, (B,), within LOG_RATIO_LIMIT: no gradient beyond it [nats]."""
+    return (new_log_prob - old_log_prob).clamp(-LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
+
+
+def clipped_objective(log_ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
+    """min(r A, clip(r, 1 - eps, 1 + eps) A), (B,), to be maximised; r = exp(log_ratio)."""
+    ratio = log_ratio.exp()
+    return torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)
+
+
+def approximate_kl(log_ratio: Tensor) -> Tensor:
+    """KL(old || new) from samples of old, (B,): (r - 1) - log r, unbiased and never negative [nats]."""
+    return log_ratio.exp() - 1 - log_ratio
+
+
+def kl_to_base(new_log_prob: Tensor, old_log_prob: Tensor, base_log_prob: Tensor) -> Tensor:
+    """KL(new || base) from samples of old, (B,), never negative [nats].
+
+    With r = new / old and s = base / new it is r ((s - 1) - log s): its mean over samples of old is the
+    divergence, and the mean of its gradient r (log new - log base) grad log new is the divergence's gradient.
+
+    Args:
+        new_log_prob: (B,) of the policy that is trained, differentiable.
+        old_log_prob: (B,) of the policy that drew the samples.
+        base_log_prob: (B,) of the policy that is held on to.
+    """
+    ratio = bounded_log_ratio(new_log_prob, old_log_prob).exp()
+    return ratio * approximate_kl(bounded_log_ratio(base_log_prob, new_log_prob))
+
+
+def value_error(value: Tensor, old_value: Tensor, return_: Tensor, config: PPOConfig) -> Tensor:
+    """Loss of each value, (B,): Huber or half squared error, the worse of clipped and unclipped if clipping."""
+
+    def loss(prediction: Tensor) -> Tensor:
+        if config.value_loss == "huber":
+            return huber_loss(prediction, return_, reduction="none", delta=config.huber_delta)
+        return 0.5 * (prediction - return_).square()
+
+    if config.value_clip is None:
+        return loss(value)
+    clipped = old_value + (value - old_value).clamp(-config.value_clip, config.value_clip)
+    return torch.maximum(loss(value), loss(clipped))
+
+
+def explained_variance(values: np.ndarray, returns: np.ndarray) -> float:
+    """Return 1 - Var[R - V] / Var[R]: 1 is a perfect critic, 0 one that knows the mean only."""
+    variance = float(np.var(returns))
+    return float("nan") if variance == 0 else 1 - float(np.var(returns - values)) / variance
