@@ -45,6 +45,8 @@ DROP_HEIGHT = 0.003
 """Gap under the object when the hand lets go; more than 12 mm topples objects [m]."""
 RETREAT_HEIGHT = 0.13
 """Height at which the hand waits once the task is complete [m]."""
+LET_GO_STEPS = 4
+"""Steps for which the hand goes up from what it has put down, until that counts as lying still."""
 NUM_FAILED, MAX_VAIN_STEPS = 3, 5
 """Failed grasps that are remembered, and steps at a grasp after which it has failed."""
 MAX_CLEARED, MAX_CLEARING_STEPS = 3, 40
@@ -94,6 +96,7 @@ class ScriptedExpert:
         # The last grasp points that failed, and for how long the hand has been at the current one in vain.
         self._failed, self._vain = np.full((n, NUM_FAILED, 3), np.inf), np.zeros(n, dtype=int)
         self._was_holding = np.zeros(n, dtype=bool)
+        self._letting_go = np.zeros(n, dtype=int)
         self._place_xy, self._place_anchor, self._place_closing = (np.zeros((n, 2)) for _ in range(3))
         # The object that is being cleared away (-1: none), whether it has been in the hand, since when, how often.
         self._clear, self._clear_held = np.full(n, -1), np.zeros(n, dtype=bool)
@@ -106,7 +109,7 @@ class ScriptedExpert:
 
     def _forget_choices(self, ids: np.ndarray) -> None:
         self._grasp_known[ids] = self._place_known[ids] = self._was_holding[ids] = False
-        self._failed[ids], self._vain[ids] = np.inf, 0
+        self._failed[ids], self._vain[ids], self._letting_go[ids] = np.inf, 0, 0
 
     def act(self) -> np.ndarray:
         """Actions (n, 7) in physical units, within the action bounds."""
@@ -114,8 +117,10 @@ class ScriptedExpert:
         self._update_goals()
         self._update_grasps()
         self._update_places()
-        command = self._pick()
-        for applies, other in ((self._holding, self._place()), (self._success, self._finish())):
+        command, place = self._pick(), self._place()
+        done = self._success | ~self._holding & (self._letting_go > 0)
+        self._letting_go -= done & ~self._success
+        for applies, other in ((self._holding, place), (done, self._finish())):
             mask = applies[:, None]
             command = Command(*(np.where(mask, theirs, ours) for theirs, ours in zip(other, command)))
         return self._action(command)
@@ -303,12 +308,13 @@ class ScriptedExpert:
         # The target is down but the hand is not: the object rests on something.
         rests = (self._target_p[:, 2] - position[:, 2] < 0.004) & (self._p[:, 2] - self._target_p[:, 2] > 0.005)
         release = (error < ALIGNED + 0.006) & ((low < 0.006) | rests)
+        self._letting_go[self._holding & release] = LET_GO_STEPS
         gripper = np.where(release, OPEN, CLOSE)[:, None]
         none = np.zeros(len(i))
         return Command(self._funnel(position, error, none, none), closing, gripper)
 
     def _finish(self) -> Command:
-        """The task is complete: open, go straight up and wait."""
+        """The object is put down: open, go straight up and wait."""
         position = self._target_p.copy()
         opened = self._opening > 0.5
         height = np.maximum(self._target_p[:, 2], RETREAT_HEIGHT)

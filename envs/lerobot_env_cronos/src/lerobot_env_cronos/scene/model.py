@@ -37,9 +37,18 @@ def grasp_sensor(side: str, obj: str) -> str:
     return f"{side}_pad/{obj}"
 
 
-def support_sensor(obj: str, receptacle: str) -> str:
-    """Name of the sensor of the force between an object and a receptacle (or `table`)."""
-    return f"{obj}/{receptacle}"
+def hand_sensor(obj: str) -> str:
+    """Name of the sensor of the number of contacts between the hand, palm and fingers, and an object."""
+    return f"hand/{obj}"
+
+
+TABLE = "table"
+"""Name of the table's geom, and of the table as what objects lie on."""
+
+
+def support_sensor(obj: str, support: str) -> str:
+    """Name of the sensor of the force of a receptacle, or of `TABLE`, on an object."""
+    return f"{obj}/{support}"
 
 
 def build_spec(scene: Scene) -> mujoco.MjSpec:
@@ -113,7 +122,7 @@ def _add_furniture(spec: mujoco.MjSpec) -> None:
         "solimp": CONTACT_SOLIMP,
     }
     spec.worldbody.add_geom(
-        name="table", type=mujoco.mjtGeom.mjGEOM_BOX, size=[*size, TABLE_THICKNESS / 2],
+        name=TABLE, type=mujoco.mjtGeom.mjGEOM_BOX, size=[*size, TABLE_THICKNESS / 2],
         pos=[*centre, -TABLE_THICKNESS / 2], group=3, **contact,
     )  # fmt: skip
     spec.worldbody.add_geom(
@@ -127,19 +136,24 @@ def _add_furniture(spec: mujoco.MjSpec) -> None:
 
 
 def _add_contact_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
-    """Net contact forces that success and grasp are judged from, each 3 numbers in the world frame [N]."""
+    """What success and grasp are judged from: net contact forces on each object, world frame [N], and contacts."""
+    force, found = mujoco.mjtConDataField.mjCONDATA_FORCE, mujoco.mjtConDataField.mjCONDATA_FOUND
+    geom, body, subtree = mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY
     for obj in scene.objects:
         for side in ("left", "right"):
-            _add_force_sensor(spec, grasp_sensor(side, obj), (mujoco.mjtObj.mjOBJ_GEOM, f"{side}_pad"), obj)
-        _add_force_sensor(spec, support_sensor(obj, "table"), (mujoco.mjtObj.mjOBJ_GEOM, "table"), obj)
+            _add_contact_sensor(spec, grasp_sensor(side, obj), (geom, f"{side}_pad"), obj, force)
+        _add_contact_sensor(spec, hand_sensor(obj), (subtree, "gripper_link"), obj, found)
+        _add_contact_sensor(spec, support_sensor(obj, TABLE), (geom, TABLE), obj, force)
         for receptacle in scene.receptacles:
-            _add_force_sensor(spec, support_sensor(obj, receptacle), (mujoco.mjtObj.mjOBJ_BODY, receptacle), obj)
+            _add_contact_sensor(spec, support_sensor(obj, receptacle), (body, receptacle), obj, force)
 
 
-def _add_force_sensor(spec: mujoco.MjSpec, name: str, other: tuple[mujoco.mjtObj, str], obj: str) -> None:
-    data_spec = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+def _add_contact_sensor(
+    spec: mujoco.MjSpec, name: str, other: tuple[mujoco.mjtObj, str], obj: str, field: mujoco.mjtConDataField
+) -> None:
+    """Add a sensor of the contacts of `other` with `obj`: net force on it (3,), or their number (1,)."""
     net_force, num = 3, 1
     spec.add_sensor(
         name=name, type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=other[0], objname=other[1],
-        reftype=mujoco.mjtObj.mjOBJ_BODY, refname=obj, intprm=[data_spec, net_force, num],
+        reftype=mujoco.mjtObj.mjOBJ_BODY, refname=obj, intprm=[1 << int(field), net_force, num],
     )  # fmt: skip

@@ -9,9 +9,10 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-from lerobot_env_cronos.scene.model import SUBSTEPS, build_model, grasp_sensor, support_sensor
+from lerobot_env_cronos.scene.model import SUBSTEPS, build_model
 from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, FINGER_CLOSED, FINGER_OPEN, FINGERTIP_REACH, HOME_QPOS
-from lerobot_env_cronos.scene.scenes import BODIES, Scene
+from lerobot_env_cronos.scene.scenes import Scene
+from lerobot_env_cronos.simulation.judging import Judge
 from lerobot_env_cronos.simulation.kinematics import (
     forward_kinematics,
     inverse_kinematics,
@@ -55,7 +56,7 @@ class Simulation:
         self._sensor_slice = self._find_sensors()
         self.arm_target = np.tile(HOME_QPOS, (num_sims, 1))
         self.gripper_target = np.full(num_sims, FINGER_OPEN)
-        self._heights = {name: BODIES[name].size[2] for name in scene.bodies}
+        self.judge = Judge(scene, self.model, self.sensordata, self.qvel)
 
     def _find_sensors(self) -> dict[str, slice]:
         sensors = (self.model.sensor(i) for i in range(self.model.nsensor))
@@ -88,6 +89,7 @@ class Simulation:
         diverged = broken[ids] | self._is_diverged(ids)
         if diverged.any():
             self._restore(ids[diverged], before[diverged])
+        self._read(ids)
         return diverged
 
     def _advance(self, ids: np.ndarray, nstep: int) -> np.ndarray:
@@ -126,13 +128,16 @@ class Simulation:
     def place(self, ids: np.ndarray, poses: np.ndarray) -> None:
         """Put every body of the simulations `ids` at `poses` (k, bodies, 7) and the arm home."""
         qpos = np.empty((len(ids), self.model.nq))
-        qpos[:, NUM_ROBOT_JOINTS:] = np.asarray(poses).reshape(len(ids), -1)
+        poses = np.asarray(poses)
+        qpos[:, NUM_ROBOT_JOINTS:] = poses.reshape(len(ids), -1)
         self._home(ids, qpos)
+        self.judge.put(ids, poses[:, : len(self.scene.objects)])
 
     def send_arm_home(self, ids: np.ndarray) -> None:
         """Put the arm home with an open gripper; bodies stay, and those that were held fall and settle."""
         self._home(ids, self.qpos[ids].copy())
         self.settle(ids)
+        self._read(ids, settled=True)
 
     def _home(self, ids: np.ndarray, qpos: np.ndarray) -> None:
         qpos[:, :NUM_ARM_JOINTS] = HOME_QPOS
@@ -145,6 +150,7 @@ class Simulation:
         qpos = self.qpos[ids].copy()
         qpos[:, :NUM_ARM_JOINTS] = arm_qpos
         self._restore(ids, qpos)
+        self._read(ids)
 
     def move_body(self, ids: np.ndarray, body: str, poses: np.ndarray) -> None:
         """Put one body at `poses` (k, 7); all else stays where it is."""
@@ -154,6 +160,8 @@ class Simulation:
         self._restore(ids, qpos)
         self.arm_target[ids] = arm_target
         self._ctrl[ids, :NUM_ARM_JOINTS] = arm_target
+        self.judge.put_one(ids, body)
+        self._read(ids)
 
     def settle(self, ids: np.ndarray) -> None:
         """Let the bodies of the simulations come to rest, the arm holding still.
@@ -199,39 +207,23 @@ class Simulation:
         """Net contact force (n, 3) of a sensor [N], world frame."""
         return self.sensordata[:, self._sensor_slice[sensor]]
 
+    def _read(self, ids: np.ndarray, *, settled: bool = False) -> None:
+        """Let the judge see the simulations `ids` as they are now."""
+        _, R, _ = forward_kinematics(self.qpos[ids, :NUM_ARM_JOINTS])
+        self.judge.read(ids, R[:, :, 1], settled=settled)
+
     def is_grasped(self, obj: str) -> np.ndarray:
-        """Both fingers press on the object (n,): at least 0.5 N each, within 85 degrees of the closing axis."""
-        closing_axis = forward_kinematics(self.qpos[:, :NUM_ARM_JOINTS])[1][:, :, 1]
-        grasped = np.ones(self.num_sims, dtype=bool)
-        for side in ("left", "right"):
-            force = self.force(grasp_sensor(side, obj))
-            strength = np.linalg.norm(force, axis=1)
-            along = np.abs((force * closing_axis).sum(1))
-            grasped &= (strength >= GRASP_MIN_FORCE_N) & (along >= np.cos(GRASP_MAX_ANGLE_RAD) * strength)
-        return grasped
+        """Both fingers press on the object (n,); see `Judge.is_grasped`."""
+        return self.judge.is_grasped(obj)
 
     def is_on(self, obj: str, receptacle: str) -> np.ndarray:
-        """The object rests on the receptacle (n,): centres close in the plane, just above it, in contact."""
-        offset = self.body_pose(obj)[:, :3] - self.body_pose(receptacle)[:, :3]
-        reach = max(BODIES[receptacle].size[:2]) / 2 + SUCCESS_XY_MARGIN_M
-        gap = offset[:, 2] - (self._heights[obj] + self._heights[receptacle]) / 2
-        near = np.linalg.norm(offset[:, :2], axis=1) <= reach
-        above = (offset[:, 2] > 0) & (gap <= SUCCESS_MAX_GAP_M)
-        touching = np.linalg.norm(self.force(support_sensor(obj, receptacle)), axis=1) > SUCCESS_MIN_FORCE_N
-        return near & above & touching
+        """The object is placed on the receptacle (n,); see `Judge.is_on`."""
+        return self.judge.is_on(obj, receptacle)
 
     def is_on_table(self, obj: str) -> np.ndarray:
-        """The object rests on the table within reach, touches no receptacle and is not grasped (n,)."""
-        i = self.scene.bodies.index(obj)
-        speed = np.linalg.norm(self.qvel[:, NUM_ROBOT_JOINTS + 6 * i : NUM_ROBOT_JOINTS + 6 * i + 3], axis=1)
+        """The object is released and rests on the table within reach, on no receptacle (n,)."""
         xy = self.body_pose(obj)[:, :2]
-        on = ((xy >= EE_LOW[:2]) & (xy <= EE_HIGH[:2])).all(1)
-        on &= np.linalg.norm(self.force(support_sensor(obj, "table")), axis=1) > SUCCESS_MIN_FORCE_N
-        for side in ("left", "right"):
-            on &= np.linalg.norm(self.force(grasp_sensor(side, obj)), axis=1) < GRASP_MIN_FORCE_N
-        for receptacle in self.scene.receptacles:
-            on &= np.linalg.norm(self.force(support_sensor(obj, receptacle)), axis=1) <= SUCCESS_MIN_FORCE_N
-        return on & (speed < SETTLE_SPEED)
+        return self.judge.is_on_table(obj) & ((xy >= EE_LOW[:2]) & (xy <= EE_HIGH[:2])).all(1)
 
     def body_rotations(self) -> np.ndarray:
         """Rotation matrices of all bodies (n, bodies, 3, 3)."""
@@ -249,6 +241,7 @@ class Simulation:
         """
         state = {name: self._batch.bind(name).copy() for name in self._STATE_FIELDS}
         state |= {"arm_target": self.arm_target.copy(), "gripper_target": self.gripper_target.copy()}
+        state |= self.judge.get_state()
         self.set_state(state)
         return state
 
@@ -259,9 +252,5 @@ class Simulation:
             self._batch.bind(name)[:] = state[name]
         self.arm_target[:] = state["arm_target"]
         self.gripper_target[:] = state["gripper_target"]
+        self.judge.set_state(state)
         self._batch.forward()
-
-
-GRASP_MIN_FORCE_N, GRASP_MAX_ANGLE_RAD = 0.5, np.deg2rad(85)
-SUCCESS_XY_MARGIN_M, SUCCESS_MAX_GAP_M, SUCCESS_MIN_FORCE_N = 0.01, 0.05, 0.03
-"""Grasp and success of the SimplerEnv Bridge tasks."""

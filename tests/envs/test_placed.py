@@ -1,0 +1,222 @@
+"""What counts as placed: carried there, let go, still, and borne by the receptacle."""
+
+import numpy as np
+import pytest
+from lerobot_env_cronos import CronosVectorEnv, Task, get_scene
+from lerobot_env_cronos.expert.expert import ScriptedExpert
+from lerobot_env_cronos.scene.model import TABLE, hand_sensor, support_sensor
+from lerobot_env_cronos.scene.robot import FINGERTIP_REACH, HOME_QPOS
+from lerobot_env_cronos.scene.scenes import BODIES, SCENES
+from lerobot_env_cronos.simulation.kinematics import forward_kinematics, inverse_kinematics
+
+STATE = "environment_state_agent_pos"
+CENTRE = np.array([0.30, 0.0])
+STILL = np.array([0, 0, 0, 0, 0, 0, 1.0])
+BOTTLE, SHOVEL, PLATE = "ketchup bottle", "kitchen shovel", "yellow plate"
+PLATE_TOP = 0.006
+WEIGHT = {BOTTLE: 0.1388, SHOVEL: 0.3246}
+"""Volume of the boxes that they consist of, times density and 9.81 m/s^2 [N]."""
+
+
+def make(n: int, scene: str = "kitchen_2x2") -> CronosVectorEnv:
+    return CronosVectorEnv(n, scene, obs_type=STATE)
+
+
+def put(env: CronosVectorEnv, tasks: list[Task], offsets: np.ndarray, centres: np.ndarray | None = None) -> None:
+    """Each stream's receptacle at `centres` (n, 2), its object `offsets` (n, 3) from there, its underside at that
+    height; all other bodies far away, all as they rest."""
+    bodies = env.scene.bodies
+    poses = np.zeros((env.num_envs, len(bodies), 7))
+    poses[..., 3] = 1.0
+    for i, name in enumerate(bodies):
+        poses[:, i, :3] = [-0.10, 0.16 * i - 0.40, BODIES[name].size[2] / 2]
+    for n, (task, offset) in enumerate(zip(tasks, offsets, strict=True)):
+        centre = CENTRE if centres is None else centres[n]
+        poses[n, bodies.index(task.receptacle), :2] = centre
+        poses[n, bodies.index(task.object), :2] = centre + offset[:2]
+        poses[n, bodies.index(task.object), 2] = offset[2] + BODIES[task.object].size[2] / 2
+    env.place_bodies(np.arange(env.num_envs), poses)
+    env.set_task(range(env.num_envs), tasks)
+
+
+def move_hand(env: CronosVectorEnv, fingertips: np.ndarray, closing: np.ndarray) -> None:
+    """Teleport the arm: the hand points down, `fingertips` (n, 3), the fingers close along `closing` (n, 2)."""
+    n = env.num_envs
+    down, side = np.tile([0.0, 0.0, -1.0], (n, 1)), np.concatenate([closing, np.zeros((n, 1))], 1)
+    R = np.stack([down, side, np.cross(down, side)], 2)
+    goal, q = fingertips + np.array([0, 0, FINGERTIP_REACH]), np.tile(HOME_QPOS, (n, 1))
+    start, _, _ = forward_kinematics(q)
+    for way in np.linspace(0.05, 1.0, 20):
+        q = inverse_kinematics(q, start + way * (goal - start), R)
+    assert np.linalg.norm(forward_kinematics(q)[0] - goal, axis=1).max() < 0.01
+    env.simulation.move_arm(np.arange(n), q)
+
+
+def drive(env: CronosVectorEnv, motion: np.ndarray, gripper: np.ndarray, steps: int = 1) -> np.ndarray:
+    """Move the hand by `motion` (n or 1, 3) at every step; success (steps, n)."""
+    actions = np.zeros((env.num_envs, 7))
+    actions[:, :3], actions[:, 6] = motion, gripper
+    return np.array([env.step(actions)[4]["is_success"] for _ in range(steps)])
+
+
+def wait(env: CronosVectorEnv, steps: int) -> np.ndarray:
+    return drive(env, np.zeros((1, 3)), np.ones(env.num_envs), steps)
+
+
+def lies_on(env: CronosVectorEnv, task: Task) -> np.ndarray:
+    """From the forces alone: nothing but the receptacle bears any of the object."""
+    sim = env.simulation
+    borne = sim.force(support_sensor(task.object, task.receptacle))[:, 2]
+    rest = np.linalg.norm(sim.force(support_sensor(task.object, TABLE)), axis=1)
+    return (borne > 0.05) & (rest == 0) & (sim.force(hand_sensor(task.object))[:, 0] == 0)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_no_push_along_the_table_counts(scene):
+    # Each pair of bodies once: those of kitchen_2x2 are in kitchen_3x3, too.
+    tasks = [t for t in get_scene(scene).tasks if scene != "kitchen_3x3" or t not in SCENES["kitchen_2x2"].tasks]
+    which, side, high, opened = (
+        a.ravel() for a in np.meshgrid(range(len(tasks)), range(8), range(2), range(2), indexing="ij")
+    )
+    env, each = make(len(which), scene), [tasks[i] for i in which]
+    angle = side * np.pi / 4
+    out = np.stack([np.cos(angle), np.sin(angle)], 1)
+    size, base = (np.array([BODIES[getattr(t, kind)].size for t in each]) for kind in ("object", "receptacle"))
+    reach = (np.abs(out) * size[:, :2]).sum(1) / 2
+    gap = reach + (np.abs(out) * base[:, :2]).sum(1) / 2 + 0.003
+    far = gap + reach + 0.03 + 0.03 * opened
+    centre = CENTRE - out * far[:, None] / 2
+    put(env, each, np.concatenate([out * gap[:, None], 0 * gap[:, None]], 1), centre)
+    tips = np.where(high, 0.85 * size[:, 2], 0.004)
+    # An open hand pushes with the back of one finger, a closed one with both.
+    closing = np.where(opened[:, None], out, np.stack([-out[:, 1], out[:, 0]], 1))
+    start = np.concatenate([centre + out * far[:, None], tips[:, None]], 1)
+    move_hand(env, start + np.array([0, 0, 0.08]), closing)
+    drive(env, np.zeros((1, 3)), opened, 2)
+    move_hand(env, start, closing)
+    push = np.concatenate([-0.02 * out, 0 * gap[:, None]], 1)
+    success, lay = np.zeros(len(each), dtype=bool), np.zeros(len(each), dtype=bool)
+    for motion, steps in ((push, 10), (np.array([[0, 0, 0.04]]), 2), (np.zeros((1, 3)), 2)):
+        success |= drive(env, motion, opened, steps).any(0)
+    for i, task in enumerate(tasks):
+        lay |= lies_on(env, task) & (which == i)
+    assert not success.any(), [(each[i], side[i], high[i], opened[i]) for i in np.flatnonzero(success)]
+    # Tall and round ones topple and roll onto it: the receptacle then bears all of them, and still no hand has.
+    assert lay.any()
+
+
+def test_an_overhang_counts_and_a_lean_does_not():
+    # The shovel points along y, its centre of mass 5 mm from its middle; the plate's rim is 55 mm from its centre.
+    # At 45 mm it overhangs by 64 mm, at 75 mm it tips over the rim until one end is on the table.
+    task = Task(SHOVEL, PLATE)
+    env = make(5)
+    offsets = np.array([[0, y, PLATE_TOP] for y in (0.0, 0.045, -0.045, 0.075, -0.075)])
+    put(env, [task] * 5, offsets)
+    success = wait(env, 10)
+    np.testing.assert_array_equal(success[-1], [True, True, True, False, False])
+    assert not success[:, 3:].any()
+    table = env.simulation.force(support_sensor(SHOVEL, TABLE))[:, 2]
+    plate = env.simulation.force(support_sensor(SHOVEL, PLATE))[:, 2]
+    np.testing.assert_allclose(plate[:3], WEIGHT[SHOVEL], rtol=0.02)
+    np.testing.assert_allclose((plate + table)[3:], WEIGHT[SHOVEL], rtol=0.02)
+    # Both bear some of it: it leans.
+    assert np.minimum(plate, table)[3:].min() > 0.03
+    assert not env.simulation.is_on_table(SHOVEL).any()
+
+
+def test_what_lies_on_another_object_is_not_on_the_receptacle():
+    env, task = make(1), Task(BOTTLE, PLATE)
+    put(env, [task], np.array([[0, -0.03, PLATE_TOP + 0.015]]))
+    poses = env.simulation.body_poses().copy()
+    shovel = env.scene.bodies.index(SHOVEL)
+    poses[:, shovel, :3] = [*CENTRE, PLATE_TOP + BODIES[SHOVEL].size[2] / 2]
+    env.place_bodies(np.array([0]), poses)
+    assert not wait(env, 8).any()
+    assert env.simulation.is_on(SHOVEL, PLATE)[0]
+    assert env.simulation.body_pose(BOTTLE)[0, 2] > PLATE_TOP + 0.02
+
+
+def test_pressed_from_above_counts_once_the_hand_is_gone():
+    task = Task(BOTTLE, PLATE)
+    env = make(2)
+    put(env, [task] * 2, np.array([[0, 0, PLATE_TOP]] * 2))
+    top = PLATE_TOP + BODIES[BOTTLE].size[2]
+    move_hand(env, np.tile([*CENTRE, top + 0.02], (2, 1)), np.tile([1.0, 0.0], (2, 1)))
+    assert drive(env, np.zeros((1, 3)), np.zeros(2), 3)[-1].all()
+    pressing = drive(env, np.array([[0, 0, -0.01], [0, 0, 0]]), np.zeros(2), 4)
+    # Only the first hand goes down: it presses from the third step on.
+    np.testing.assert_array_equal(pressing[2:], [[False, True]] * 2)
+    assert env.simulation.force(support_sensor(BOTTLE, PLATE))[0, 2] > 2 * WEIGHT[BOTTLE]
+    raised = drive(env, np.array([[0, 0, 0.02], [0, 0, 0]]), np.zeros(2), 8)
+    assert raised[-1].all()
+
+
+def test_what_is_dropped_counts_when_it_lies_still():
+    heights = np.linspace(0.001, 0.06, 16)
+    env = make(len(heights))
+    put(env, [Task(BOTTLE, PLATE)] * len(heights), np.array([[0, 0, PLATE_TOP + h] for h in heights]))
+    assert not env.is_success.any()
+    before = env.simulation.body_pose(BOTTLE).copy()
+    for _ in range(12):
+        env.step(np.tile(STILL, (len(heights), 1)))
+        now = env.simulation.body_pose(BOTTLE).copy()
+        # In the last 0.2 s it neither fell nor turned.
+        assert np.abs(now - before)[env.is_success].max(initial=0) < 0.004
+        before = now
+    assert env.is_success.all()
+
+
+def test_the_expert_is_paid_after_it_has_let_go():
+    env = make(16)
+    env.set_task(range(16), [env.scene.tasks[i % 4] for i in range(16)])
+    expert, paid = ScriptedExpert(env), np.zeros(16, dtype=bool)
+    for _ in range(80):
+        env.step(expert.act())
+        for i in np.flatnonzero(env.is_success & ~paid):
+            assert lies_on(env, env.tasks[i])[i]
+        paid |= env.is_success
+    assert paid.all()
+
+
+def test_pushed_off_and_on_again_does_not_count():
+    task = Task(BOTTLE, "cloth")
+    env = make(1)
+    put(env, [task], np.array([[0, 0, 0.0094]]))
+    assert wait(env, 3)[-1, 0]
+    # An intervention that moves the cloth away drops the bottle on the table, another slides the cloth under it.
+    cloth = env.simulation.body_pose("cloth").copy()
+    env.simulation.move_body(np.array([0]), "cloth", cloth + np.array([0.2, 0, 0, 0, 0, 0, 0]))
+    assert not wait(env, 5).any()
+    assert env.simulation.is_on_table(BOTTLE)[0]
+    lifted = env.simulation.body_pose(BOTTLE) + np.array([0, 0, 0.0094, 0, 0, 0, 0])
+    env.simulation.qpos[:, 8:15] = lifted
+    env.simulation.move_body(np.array([0]), "cloth", cloth)
+    assert not wait(env, 5).any()
+    assert lies_on(env, task)[0]
+    # Put there by an intervention of its own it counts as carried.
+    env.simulation.move_body(np.array([0]), BOTTLE, env.simulation.body_pose(BOTTLE).copy())
+    assert wait(env, 3)[-1, 0]
+
+
+def test_a_reset_task_is_complete_from_the_start_when_bodies_were_put_on_the_table():
+    env = CronosVectorEnv(2, "playroom_2x2", obs_type=STATE, reward="difference")
+    env.set_task([0, 1], [Task("toy bear", None), Task("plastic bottle", None)])
+    assert env.is_success.all()
+    _, reward, *_ = env.step(np.tile(STILL, (2, 1)))
+    assert env.is_success.all()
+    assert not reward.any()
+
+
+def test_what_was_read_is_part_of_the_state():
+    heights = np.linspace(0.01, 0.12, 8)
+    env, other = make(8), make(8)
+    put(env, [Task(BOTTLE, PLATE)] * 8, np.array([[0, 0, PLATE_TOP + h] for h in heights]))
+    wait(env, 1)
+    for _ in range(4):
+        other.set_state(env.get_state())
+        for name in env.simulation.judge.STATE_FIELDS:
+            np.testing.assert_array_equal(
+                getattr(env.simulation.judge, name), getattr(other.simulation.judge, name)
+            )
+        np.testing.assert_array_equal(wait(env, 1), wait(other, 1))
+    assert env.is_success.any()
