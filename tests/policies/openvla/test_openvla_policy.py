@@ -1,5 +1,7 @@
 """The policy against timm and transformers called by hand, and its two ways of computing against each other."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -43,6 +45,25 @@ def test_greedy_tokens_with_the_cache_are_those_without(base, parts):
             drawn.append(VOCABULARY - BINS + int(logits[VOCABULARY - BINS : VOCABULARY].argmax()))
         assert tokens[row].tolist() == drawn
     assert len({tuple(row) for row in tokens.tolist()}) > 1
+
+
+def test_the_documented_check_of_a_checkpoint_is_greedy():
+    """As OpenVLA's own evaluation is; the configuration's default samples."""
+    text = (Path(__file__).parents[3] / "docs/openvla.md").read_text()
+    command = text.split("## 1. The checkpoint as it is")[1].split("```")[1]
+    assert "--policy.checkpoint=openvla/openvla-7b " in command
+    assert "--policy.temperature=0 " in command
+
+
+def test_images_may_be_levels_or_fractions(published):
+    """uint8 in 0..255 and floats in [0, 1], resized or cropped."""
+    batch, uniform = make_batch(2), torch.full((2, 7), 0.5)
+    fractions = batch | {CAMERA: batch[CAMERA].float() / 255}
+    for crop in (False, True):
+        policy = make_policy(published, center_crop=crop)
+        levels, floats = (policy.sample_actions(images, uniform=uniform) for images in (batch, fractions))
+        assert torch.equal(levels["tokens"], floats["tokens"])
+        torch.testing.assert_close(floats["log_prob"], levels["log_prob"], atol=1e-2, rtol=0)
 
 
 @pytest.mark.parametrize("kind", ["base", "lora"])
