@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import datetime as dt
-import hashlib
-import json
 import sys
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -14,13 +13,12 @@ from typing import Any
 import draccus
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs.configs import EnvConfig
-from lerobot_env_cronos import Benchmark, CronosEnvConfig, load_benchmark
-from lerobot_env_cronos.benchmark import orderings
+from lerobot_env_cronos import Benchmark, CronosEnvConfig, gymnasium_id, load_benchmark
 from lerobot_env_cronos.benchmark.benchmark import SUITES
 from lerobot_env_cronos.benchmark.configurations import SPLITS
-from lerobot_env_cronos.benchmark.version import VERSION
 
-from cronos_lerobot.evaluation.policy_env import observations_of, trained_scene
+from cronos_lerobot.evaluation.policy_env import check_observations, observations_of, trained_scene
+from cronos_lerobot.evaluation.policy_source import PolicySource, find_policy, fingerprint
 
 QUICK_CONFIGURATIONS, QUICK_ORDERINGS = 16, 3
 EXPERT = "scripted expert"
@@ -74,7 +72,7 @@ class CronosEvalConfig:
     """Scene, benchmark and observations. What is not given follows from the benchmark, if there is one, and from
     the policy: the scene that it was trained in, and the images or the state that it takes."""
     policy: PreTrainedConfig | None = None
-    """The policy: --policy.path=<checkpoint or Hub id>."""
+    """The policy: --policy.path=<checkpoint, or Hub id[@revision]>."""
     eval: SuitesConfig = field(default_factory=SuitesConfig)
     """Suites, splits, and how much of them."""
     advance: str = "window"
@@ -94,6 +92,8 @@ class CronosEvalConfig:
     """Observations to rename for the policy, as in lerobot-eval."""
     torch_threads: int | None = None
     """Threads of PyTorch on the CPU; null leaves PyTorch's default."""
+    source: PolicySource | None = field(init=False, default=None)
+    """Where the policy was found, set by `validate`."""
 
     def validate(self) -> None:
         """Resolve the policy and what follows from it.
@@ -116,6 +116,8 @@ class CronosEvalConfig:
         self._derive_env({name.removeprefix("--") for name in given})
         self.env.advance, self.env.end_effector_reset = self.advance, self.end_effector_reset
         self.env.__post_init__()
+        if self.policy is not None and not self.rename_map:
+            check_observations(self.policy, self.env)
         most = self._most_configurations()
         if self.eval.n_episodes is not None and self.eval.n_episodes > most:
             raise ValueError(f"eval.n_episodes must be 1 to {most}, got {self.eval.n_episodes}")
@@ -131,8 +133,9 @@ class CronosEvalConfig:
             return
         if path:
             overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
-            self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
-            self.policy.pretrained_path = Path(path)
+            self.source = find_policy(path)
+            self.policy = PreTrainedConfig.from_pretrained(self.source.folder, cli_overrides=overrides)
+            self.policy.pretrained_path = self.source.folder
         if self.policy is None or not self.policy.pretrained_path:
             raise ValueError("choose a policy: --policy.path=<checkpoint or Hub id> (or --expert=true)")
 
@@ -188,7 +191,21 @@ class CronosEvalConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """The config as JSON values."""
-        return draccus.encode(self)
+        config = draccus.encode(self)
+        config.pop("source", None)
+        return config
+
+    @property
+    def policy_name(self) -> str:
+        """The policy as it was given."""
+        if self.policy is None:
+            return EXPERT
+        return self.source.name if self.source else str(self.policy.pretrained_path)
+
+    @cached_property
+    def policy_fingerprint(self) -> str:
+        """What tells the policy from another one of its name."""
+        return EXPERT if self.policy is None else fingerprint(self.policy)
 
     def identity(self) -> dict[str, Any]:
         """Everything that decides the result of a chain, as JSON values."""
@@ -197,13 +214,14 @@ class CronosEvalConfig:
         decisive = (
             "scene", "obs_type", "privileged_state", "observation_height", "observation_width", "camera_name"
         )  # fmt: skip
-        own = {} if env.benchmark is None else {"benchmark": self.benchmark().fingerprint}
+        own = {}
         if env.renderer != "classic" and env.obs_type == "pixels_agent_pos":
             own["renderer"] = env.renderer
         return own | {
-            "policy": EXPERT if self.policy is None else fingerprint(self.policy),
+            "environment": gymnasium_id(self.benchmark().scene.name),
+            "benchmark": self.benchmark().fingerprint,
+            "policy": self.policy_fingerprint,
             "env": {name: getattr(env, name) for name in decisive},
-            "versions": {"environment": VERSION, "orderings": orderings.VERSION},
             "n_episodes": self.num_configurations,
             "orderings": self.num_orderings,
             "temperature": self.eval.temperature,
@@ -222,16 +240,3 @@ class CronosEvalConfig:
 
 def _words(text: str) -> list[str]:
     return [word.strip() for word in text.split(",") if word.strip()]
-
-
-def fingerprint(policy: PreTrainedConfig) -> str:
-    """A policy's config and weights as a short hash, of its path too where the weights are not local files."""
-    config = {name: value for name, value in draccus.encode(policy).items() if name != "pretrained_path"}
-    digest = hashlib.sha256(json.dumps(config, sort_keys=True, default=str).encode())
-    files = sorted(Path(policy.pretrained_path or "").glob("*.safetensors"))
-    if not files:
-        digest.update(str(policy.pretrained_path).encode())
-    for file in files:
-        with file.open("rb") as weights:
-            digest.update(hashlib.file_digest(weights, "sha256").digest())
-    return digest.hexdigest()[:16]

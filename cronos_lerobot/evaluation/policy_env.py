@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
+from lerobot_env_cronos import CronosEnvConfig
 from lerobot_env_cronos.scene.model import CAMERAS
 from lerobot_env_cronos.scene.scenes import SCENES
 
@@ -35,3 +37,33 @@ def trained_scene(path: Path | None) -> dict[str, str]:
         return {}
     scene = (json.loads(file.read_text()).get("env") or {}).get("scene")
     return {"scene": scene} if scene in SCENES else {}
+
+
+def check_observations(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
+    """Check that an environment shows a policy what it takes, of the size that it takes.
+
+    Images may have another size: policies scale them.
+
+    Raises:
+        ValueError: it does not; the sentence has the flag that would.
+    """
+    given = {env.features_map[name]: feature for name, feature in env.features.items()}
+    for name, taken in (policy.input_features or {}).items():
+        feature = given.get(name)
+        if feature is None:
+            flags = {OBS_ENV_STATE: "--env.obs_type=environment_state_agent_pos"}
+            flag = flags.get(name, "--env.obs_type=pixels_agent_pos with --env.camera_name=<its cameras>")
+            raise ValueError(f"the policy takes {name}, which the environment does not give: {flag} does")
+        if taken.type is FeatureType.VISUAL or tuple(taken.shape) == tuple(feature.shape):
+            continue
+        sizes = {scene: _state_size(name, scene, env) for scene in SCENES}
+        fitting = [f"--env.scene={scene}" for scene, size in sizes.items() if (size,) == tuple(taken.shape)]
+        raise ValueError(
+            f"the policy takes {name} of {taken.shape[0]} numbers, {env.scene} gives {feature.shape[0]}: it was "
+            f"trained {'in another scene; ' + ' or '.join(fitting) + ' fits' if fitting else 'with other options'}"
+        )
+
+
+def _state_size(name: str, scene: str, env: CronosEnvConfig) -> int:
+    other = replace(env, scene=scene, benchmark=None, task=None)
+    return next(other.features[key].shape[0] for key, feature in other.features_map.items() if feature == name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import platform
@@ -14,21 +15,30 @@ import numpy as np
 from lerobot.envs.factory import make_env_pre_post_processors
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
-from lerobot_env_cronos import CronosEnvConfig, SequentialVectorEnv, get_scene, gymnasium_id
+from lerobot_env_cronos import CronosEnvConfig, SequentialVectorEnv, check_environment_id, get_scene, gymnasium_id
 from tqdm import tqdm
 
 from cronos_lerobot.agents.processing import make_processors
 from cronos_lerobot.evaluation.actors import Actor, ExpertActor, make_actor
 from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
-from cronos_lerobot.evaluation.config import EXPERT, CronosEvalConfig
+from cronos_lerobot.evaluation.config import CronosEvalConfig
 from cronos_lerobot.evaluation.film import film_best_and_worst
 from cronos_lerobot.evaluation.plan import Part, make_parts
 from cronos_lerobot.evaluation.results import independent_results, sequential_results
-from cronos_lerobot.evaluation.store import RESULTS, ResultStore, chain_key, chain_records, write_json
+from cronos_lerobot.evaluation.store import (
+    ANEW,
+    FORMAT,
+    RESULTS,
+    ResultStore,
+    chain_key,
+    chain_records,
+    write_json,
+)
+from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.provenance import git_commit, package_versions
 
-FORMAT = 1
-"""Version of results.json."""
+MAKERS = ("environment", "benchmark", "policy")
+"""Fields of an evaluation's identity that every part carries."""
 
 MakeActor = Callable[[SequentialVectorEnv], Actor]
 
@@ -42,7 +52,8 @@ class Evaluation:
 
     Raises:
         FileExistsError: the output folder holds something else.
-        ValueError: the output folder is of another evaluation.
+        ValueError: the output folder or a part in it is of another evaluation, or of another version of the
+            environments.
     """
 
     def __init__(self, config: CronosEvalConfig, make_actor: MakeActor | None = None) -> None:
@@ -56,12 +67,21 @@ class Evaluation:
             self.benchmark, config.suites, config.splits, config.num_configurations, config.num_orderings
         )
         self.store = ResultStore(config.output_dir, config.identity())
+        self._maker = self._made_by()
+        self._missing = [part for part in self.parts if not self._is_kept(part)]
 
     def run(self) -> dict[str, Any]:
-        """Run the parts that are not there yet, write videos and results.json; returns the results."""
-        missing = [part for part in self.parts if self.store.read(part.name) is None]
+        """Run the parts that are not there yet, write videos and results.json; returns the results.
+
+        Raises:
+            FolderInUseError: another process evaluates into the folder.
+        """
+        with FolderLock(self.store.folder):
+            return self._run_and_report()
+
+    def _run_and_report(self) -> dict[str, Any]:
         try:
-            self._run(missing)
+            self._run(self._missing)
         finally:
             self._close()
         results = self.results()
@@ -78,6 +98,8 @@ class Evaluation:
         done = total - sum(len(part.chains) for part in missing)
         with tqdm(total=total, initial=done, unit="chain", disable=None, smoothing=0.1) as bar:
             for part in missing:
+                for outdated in self.store.folder.glob(f"videos/{part.suite}_{part.split}_*.mp4"):
+                    outdated.unlink()
                 self._run_part(part, bar)
 
     def _run_part(self, part: Part, bar: tqdm) -> None:
@@ -106,6 +128,7 @@ class Evaluation:
             "split": part.split,
             "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             "seconds": time.perf_counter() - start,
+            "made_by": self._maker,
             "chains": records,
         }
         kept = {
@@ -116,6 +139,43 @@ class Evaluation:
         self.store.write(part.name, content, kept)
         if bar.disable:
             logging.info(f"{part.name}: {len(records)} chains, {summary()}, {content['seconds']:.0f} s")
+
+    # What is there already ---------------------------------------------------------------------------------
+
+    def _made_by(self) -> dict[str, Any]:
+        """What a part made now is made by, and with."""
+        identity = self.config.identity()
+        return {name: identity[name] for name in MAKERS} | {
+            "versions": {"python": platform.python_version()} | package_versions(),
+            "opengl_platform": os.environ.get("MUJOCO_GL"),
+            "commit": git_commit(),
+        }
+
+    def _is_kept(self, part: Part) -> bool:
+        """Whether a part is there and need not be run again.
+
+        It is run again if other packages made it, or if it has no states and videos are asked for now. A part of
+        another commit is kept: results.json names them all.
+        """
+        content = self.store.read(part.name)
+        if content is None:
+            return False
+        there, what = content.get("made_by", {}), f"part {part.name} in {self.store.folder}"
+        check_environment_id(there.get("environment"), what, ANEW)
+        for name in MAKERS:
+            if there[name] != self._maker[name]:
+                raise ValueError(
+                    f"{what} was made by another {name}: {there[name]} there, {self._maker[name]} now; choose "
+                    "another --output_dir, or delete it to have it made again"
+                )
+        if there["versions"] != self._maker["versions"]:
+            changes = _changes(there["versions"], self._maker["versions"])
+            logging.warning(f"{what} was made with other packages ({changes}): it is made again")
+            return False
+        if self.config.eval.videos and not self.store.has_trajectories(part.name):
+            logging.info(f"{what} has no states to draw videos from: it is run again")
+            return False
+        return True
 
     # Who acts where ---------------------------------------------------------------------------------------
 
@@ -159,9 +219,13 @@ class Evaluation:
         finished = [content for content in contents if content is not None]
         assert len(finished) == len(self.parts)
         config = self.config
+        makers = self._makers()
+        commits = {maker["commit"] for maker in makers}
         header = {
             "format": FORMAT,
-            "policy": EXPERT if config.policy is None else str(config.policy.pretrained_path),
+            "policy": config.policy_name,
+            "policy_fingerprint": config.policy_fingerprint,
+            "policy_revision": config.source.revision if config.source else None,
             "scene": self.scene.name,
             "benchmark": {
                 "environment": gymnasium_id(self.scene.name),
@@ -174,15 +238,27 @@ class Evaluation:
             "advance": config.advance,
             "end_effector_reset": config.end_effector_reset,
             "renderer": self.env_config.renderer,
-            "opengl_platform": os.environ.get("MUJOCO_GL"),
-            "versions": {"python": platform.python_version()} | package_versions(),
-            "commit": git_commit(),
+            "versions": self._maker["versions"],
+            "commit": commits.pop() if len(commits) == 1 else None,
+            "made_by": makers,
             "date": max(content["date"] for content in finished),
             "seconds": round(sum(content["seconds"] for content in finished), 1),
             "config": config.to_dict(),
             "identity": config.identity(),
         }
         return header | {suite: self._suite_results(suite, finished) for suite in config.suites}
+
+    def _makers(self) -> list[dict[str, Any]]:
+        """Who made the parts: one entry, or more if the evaluation was gone on with after a change."""
+        makers: dict[str, dict[str, Any]] = {}
+        for part in self.parts:
+            content = self.store.read(part.name)
+            assert content is not None
+            maker = makers.setdefault(
+                json.dumps(content["made_by"], sort_keys=True), content["made_by"] | {"parts": []}
+            )
+            maker["parts"].append(part.name)
+        return list(makers.values())
 
     def _has_temperature(self) -> bool:
         """Whether actions are sampled at the config's temperature, or at whatever the policy does by itself."""
@@ -203,5 +279,10 @@ class Evaluation:
             if suite == "independent":
                 found[split] = independent_results(records, [group.tasks[0] for group in groups])
             else:
-                found[split] = sequential_results(records, [group.tasks for group in groups])
+                found[split] = sequential_results(records, [group.tasks for group in groups], self.scene)
         return found
+
+
+def _changes(there: dict[str, str], here: dict[str, str]) -> str:
+    names = [name for name in sorted(there | here) if there.get(name) != here.get(name)]
+    return ", ".join(f"{name} {there.get(name)}, now {here.get(name)}" for name in names)

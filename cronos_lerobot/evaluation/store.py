@@ -8,11 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lerobot_env_cronos import check_environment_id
 
 from cronos_lerobot.evaluation.chains import ChainResult, Trajectory
 
 IDENTITY = "evaluation.json"
 RESULTS = "results.json"
+FORMAT = 2
+"""Version of results.json; 1 was of version 0 of the environments."""
+
+ANEW = "evaluate anew with another --output_dir"
 
 
 class ResultStore:
@@ -24,14 +29,16 @@ class ResultStore:
 
     Raises:
         FileExistsError: the folder holds something else.
-        ValueError: the folder is of another evaluation.
+        ValueError: the folder is of another evaluation, or of another version of the environments.
     """
 
     def __init__(self, folder: Path, identity: dict[str, Any]) -> None:
         self.folder = folder
         path = folder / IDENTITY
         if path.is_file():
-            self._compare(json.loads(path.read_text()), identity)
+            there = json.loads(path.read_text())
+            check_environment_id(there.get("environment"), f"the evaluation in {folder}", ANEW)
+            self._compare(there, identity)
         elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise FileExistsError(f"{folder} is not empty and not of an evaluation; choose another --output_dir")
         else:
@@ -63,6 +70,11 @@ class ResultStore:
         # Written last: a part is finished when it is there.
         write_json(self._path(name), content)
 
+    def has_trajectories(self, name: str) -> bool:
+        """Whether a part was written with trajectories."""
+        with np.load(self._path(name).with_suffix(".npz")) as arrays:
+            return bool(arrays.files)
+
     def read_trajectory(self, name: str, key: str) -> Trajectory | None:
         """Return a trajectory that `write` kept, or None."""
         with np.load(self._path(name).with_suffix(".npz")) as arrays:
@@ -72,6 +84,28 @@ class ResultStore:
 
     def _path(self, name: str) -> Path:
         return self.folder / "parts" / f"{name}.json"
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """Read results.json of cronos-eval, given itself or its folder.
+
+    Raises:
+        FileNotFoundError: it is not there.
+        ValueError: it is of something else, or of another version of the environments.
+    """
+    file = path / RESULTS if path.is_dir() else path
+    if not file.is_file():
+        raise FileNotFoundError(f"no {RESULTS} of cronos-eval at {path}")
+    try:
+        results = json.loads(file.read_text())
+    except ValueError as error:
+        raise ValueError(f"{file} is damaged: {error}") from error
+    if not isinstance(results, dict) or "format" not in results:
+        raise ValueError(f"{file} is no {RESULTS} of cronos-eval")
+    check_environment_id((results.get("benchmark") or {}).get("environment"), str(file), ANEW)
+    if results["format"] != FORMAT:
+        raise ValueError(f"{file} is in format {results['format']!r}; this version reads {FORMAT}")
+    return results
 
 
 def chain_key(record: dict[str, Any]) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.experiments.definitions import INTERVENTIONS, CheckpointEvaluation, Experiment, Row
 from cronos_lerobot.experiments.jobs import changed_flags, read_record
 from cronos_lerobot.experiments.plan import train_job
@@ -164,7 +165,7 @@ def _read_seed(spec: RunSpec, evaluations: Iterable[CheckpointEvaluation]) -> Se
             folders[0] = base_evaluation_folder(spec.scene, evaluation.suite, split, spec.options)
             for checkpoint, folder in folders.items():
                 if (folder / RESULTS).is_file():
-                    found[checkpoint] = json.loads((folder / RESULTS).read_text())[evaluation.suite][split]
+                    found[checkpoint] = read_results(folder)[evaluation.suite][split]
     return result
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from cronos_lerobot.evaluation.store import RESULTS
+from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.hub.cards import render_card
 from cronos_lerobot.hub.config import PolicyConfig
 from cronos_lerobot.hub.runs import (
@@ -52,22 +52,6 @@ def write_policy_repository(config: PolicyConfig, folder: Path) -> str:
     (folder / "README.md").write_text(_card(config, checkpoint, policy, run, curves, results))
     steps = f" after {run.last['interaction_steps']} interaction steps" if run else ""
     return f"{policy['type']} policy{steps}"
-
-
-def read_results(path: Path) -> dict[str, Any]:
-    """Read results.json of cronos-eval, given itself or its folder.
-
-    Raises:
-        FileNotFoundError: it is not there.
-        ValueError: it is of something else.
-    """
-    file = path / RESULTS if path.is_dir() else path
-    if not file.is_file():
-        raise FileNotFoundError(f"no {RESULTS} of cronos-eval at {path}")
-    results = json.loads(file.read_text())
-    if not isinstance(results, dict) or results.get("format") != 1:
-        raise ValueError(f"{file} is no {RESULTS} of cronos-eval in format 1")
-    return results
 
 
 def _draw_curves(run: TrainingRun, folder: Path) -> list[tuple[str, str]]:

@@ -11,9 +11,9 @@ from huggingface_hub.errors import EntryNotFoundError
 from lerobot_env_cronos import Benchmark, gymnasium_id, load_benchmark
 from lerobot_env_cronos.benchmark.benchmark import SUITES
 
+from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.hub.benchmark import task_id
 from cronos_lerobot.hub.config import ResultsConfig
-from cronos_lerobot.hub.policy import read_results
 from cronos_lerobot.hub.push import PublishError, explained
 
 FILE = ".eval_results/cronos.yaml"
@@ -43,12 +43,7 @@ def write_results(config: ResultsConfig, folder: Path) -> str:
 
 def _load(config: ResultsConfig, results: dict[str, Any]) -> Benchmark:
     """The benchmark's repository, checked to be what was evaluated."""
-    evaluated = results.get("benchmark")
-    if evaluated is None:
-        raise ValueError(
-            "results.json does not say which benchmark was evaluated: an older version wrote it. The cronos-eval"
-            " command that made it, run again, writes it anew from the finished parts"
-        )
+    evaluated = results["benchmark"]
     name = config.benchmark or evaluated["source"]
     if name.count("/") != 1 or Path(name).is_dir():
         raise ValueError(f"--benchmark=<owner>/<repository>[@<revision>] is required; evaluated was {name}")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from cronos_lerobot.evaluation.store import RESULTS
+from cronos_lerobot.evaluation.store import read_results
 
 SUITES = ("independent", "sequential")
 DECISIVE = ("policy", "scene", "obs_type", "temperature", "seed", "advance", "end_effector_reset")
@@ -45,7 +45,7 @@ def read_suite_runs(files: Iterable[Path]) -> list[SuiteRun]:
     """Read results.json files, each once; the evaluations of one policy in several folders are put together."""
     merged: dict[str, SuiteRun] = {}
     for folder in dict.fromkeys(path.resolve().parent for path in files):
-        results = json.loads((folder / RESULTS).read_text())
+        results = read_results(folder)
         settings = _settings(results)
         key = json.dumps(settings)
         run = merged.setdefault(key, SuiteRun(policy_name(results["policy"]), {}, []))

@@ -21,8 +21,6 @@ import logging
 import sys
 
 import torch
-from draccus.utils import ParsingError
-from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import init_logging
@@ -32,17 +30,16 @@ from cronos_lerobot.evaluation.config import CronosEvalConfig
 from cronos_lerobot.evaluation.results import make_tables
 from cronos_lerobot.evaluation.runner import Evaluation
 from cronos_lerobot.evaluation.store import RESULTS
+from cronos_lerobot.locks import FolderInUseError
+from cronos_lerobot.scripts.errors import error_line, parse_command_line, stop
 
 
-@parser.wrap()
 def evaluate(config: CronosEvalConfig) -> None:
     """Evaluate as `config` says, or go on where an earlier evaluation was stopped."""
-    try:
+    init_logging()
+    with error_line():
         config.validate()
         evaluation = Evaluation(config)
-    except (ValueError, FileExistsError) as error:
-        sys.exit(f"error: {error}")
-    init_logging()
     logging.getLogger("lerobot.configs.video").setLevel(logging.WARNING)
     if config.torch_threads is not None:
         torch.set_num_threads(config.torch_threads)
@@ -52,6 +49,8 @@ def evaluate(config: CronosEvalConfig) -> None:
         results = evaluation.run()
     except KeyboardInterrupt:
         sys.exit(f"\ninterrupted: the same command with --output_dir={config.output_dir} goes on from here")
+    except FolderInUseError as error:
+        stop(error)
     console = Console(width=None if sys.stdout.isatty() else 120)
     for table in make_tables(results):
         console.print(table)
@@ -68,10 +67,9 @@ def main() -> None:
     # draccus wants the type of a choice whenever one of its fields is set.
     if any(a.startswith("--env.") for a in arguments) and not any(a.startswith("--env.type") for a in arguments):
         sys.argv.append("--env.type=cronos")
-    try:
-        evaluate()  # ty: ignore[missing-argument]  (parser.wrap reads it from the command line)
-    except ParsingError as error:
-        sys.exit(f"error: {error.__cause__ or error}")
+    with error_line():
+        config = parse_command_line(CronosEvalConfig)
+    evaluate(config)
 
 
 if __name__ == "__main__":

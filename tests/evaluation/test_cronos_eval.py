@@ -1,6 +1,7 @@
 """`cronos-eval` and `lerobot-eval` on the real scenes with tiny policies, and the scripted expert."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -19,7 +20,8 @@ from tiny_checkpoints import STATE, save_policy
 from cronos_lerobot.agents.processing import make_processors
 from cronos_lerobot.evaluation.actors import make_actor
 from cronos_lerobot.evaluation.chains import Chain, ChainRunner, chain_noise
-from cronos_lerobot.evaluation.config import CronosEvalConfig
+from cronos_lerobot.evaluation.config import CronosEvalConfig, SuitesConfig
+from cronos_lerobot.evaluation.policy_source import fingerprint
 from cronos_lerobot.evaluation.runner import Evaluation
 from cronos_lerobot.evaluation.store import RESULTS
 from cronos_lerobot.scripts import eval as script
@@ -50,7 +52,7 @@ def test_everything_in_one_go_then_again_after_a_kill(pocketvla, tmp_path, monke
     for text in ("put the ketchup bottle on the cloth", "SEQ 3", "chain length", "held_out (n=6)"):
         assert text in output
     results = json.loads((whole / RESULTS).read_text())
-    assert {"format": 1, "scene": "kitchen_2x2", "obs_type": STATE["obs_type"], "temperature": 0.6}.items() <= (
+    assert {"format": 2, "scene": "kitchen_2x2", "obs_type": STATE["obs_type"], "temperature": 0.6}.items() <= (
         results.items()
     )
     assert results["independent"]["held_out"]["n"] == 4 * 2
@@ -178,6 +180,7 @@ def test_observations_and_scene_follow_from_the_policy(tmp_path, monkeypatch):
         (("--expert=true", "--eval.batch_size=0"), "batch_size must be at least 1, got 0"),
         (("--expert=true", "--seed=-1"), "seed must be at least 0"),
         (("--expert=true", "--env.scene=garage"), "garage.*kitchen_2x2"),
+        (("--policy.path=outputs/no/where",), "outputs/no/where is neither a folder nor"),
     ],
 )
 def test_command_line_errors_name_the_bad_value_and_the_valid_ones(flags, message, tmp_path, monkeypatch):
@@ -228,3 +231,85 @@ def test_lerobot_eval_command(pocketvla, tmp_path):
     assert len(entry["metrics"]["sum_rewards"]) == 2
     assert set(entry["metrics"]["sum_rewards"]) <= {0, 1, 2, 3, 4}
     assert info["per_group"]["sequential_held_out"]["n_episodes"] == 2
+
+
+def test_a_part_says_what_made_it_and_is_kept_made_again_or_refused_by_that(pocketvla, tmp_path, caplog):
+    folder = tmp_path / "out"
+
+    def evaluate(videos=0):
+        policy = PreTrainedConfig.from_pretrained(pocketvla)
+        policy.pretrained_path, policy.device = pocketvla, "cpu"
+        suites = SuitesConfig("independent", "train", n_episodes=1, batch_size=4, videos=videos)
+        env = CronosEnvConfig(**STATE, render_size=(48, 64))
+        return Evaluation(CronosEvalConfig(env, policy, suites, output_dir=folder)).run()
+
+    def edit(**made_by):
+        content = json.loads(path.read_text())
+        content["made_by"] |= made_by
+        path.write_text(json.dumps(content))
+        return path.stat().st_mtime_ns
+
+    first = evaluate()
+    path = folder / "parts/independent_train.json"
+    made_by = json.loads(path.read_text())["made_by"]
+    assert made_by["environment"] == "lerobot_env_cronos/kitchen_2x2-v1"
+    assert made_by["policy"] == first["policy_fingerprint"] == first["identity"]["policy"]
+    assert first["made_by"] == [made_by | {"parts": ["independent_train"]}]
+    assert first["commit"] == made_by["commit"]
+    # Another commit made it: kept, and named.
+    before = edit(commit="a" * 40)
+    again = evaluate()
+    assert path.stat().st_mtime_ns == before
+    assert (again["commit"], again["made_by"][0]["commit"]) == ("a" * 40, "a" * 40)
+    # Another package: made again, with a word.
+    edit(versions=made_by["versions"] | {"mujoco": "1.0"})
+    assert evaluate()["made_by"] == first["made_by"]
+    assert "mujoco 1.0, now" in caplog.text
+    # It has no states to draw videos from: run again, to the same outcome.
+    filmed = evaluate(videos=2)
+    assert filmed["independent"] == first["independent"]
+    assert len(filmed["videos"]) == 2
+    before = path.stat().st_mtime_ns
+    # More videos than the first time, without running anything.
+    assert len(evaluate(videos=4)["videos"]) == 4
+    assert path.stat().st_mtime_ns == before
+    edit(policy="another")
+    with pytest.raises(ValueError, match=r"another policy: another there, .*now; choose another --output_dir"):
+        evaluate()
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({name: content[name] for name in ("suite", "split", "date", "seconds", "chains")}))
+    with pytest.raises(ValueError, match=r"part independent_train .* does not say which version"):
+        evaluate()
+
+
+def test_a_policy_is_known_by_its_files_and_not_by_its_folder(pocketvla, tmp_path):
+    def fingerprint_of(folder):
+        config = PreTrainedConfig.from_pretrained(folder)
+        config.pretrained_path = folder
+        return fingerprint(config)
+
+    copy = shutil.copytree(pocketvla, tmp_path / "copy")
+    assert fingerprint_of(copy) == fingerprint_of(pocketvla)
+    (copy / "train_config.json").write_text("{}")
+    assert fingerprint_of(copy) == fingerprint_of(pocketvla)
+    seen = {fingerprint_of(pocketvla)}
+    for name in ("model.safetensors", "policy_preprocessor.json"):
+        file = copy / name
+        changed = file.read_bytes()
+        file.write_bytes(changed[:-1] + bytes([changed[-1] ^ 1]))
+        seen.add(fingerprint_of(copy))
+    assert len(seen) == 3
+
+
+@pytest.mark.parametrize(
+    ("flag", "message"),
+    [
+        ("--env.obs_type=pixels_agent_pos", "environment_state.*--env.obs_type=environment_state_agent_pos"),
+        ("--env.scene=kitchen_3x3", "of 48 numbers, kitchen_3x3 gives 72.*--env.scene=kitchen_2x2"),
+    ],
+)
+def test_an_environment_that_does_not_fit_the_policy_is_refused_with_the_flag_that_would(
+    flag, message, pocketvla, tmp_path, monkeypatch
+):
+    with pytest.raises(SystemExit, match=message):
+        cronos_eval(monkeypatch, f"--policy.path={pocketvla}", flag, f"--output_dir={tmp_path / 'out'}")

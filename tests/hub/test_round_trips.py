@@ -177,7 +177,10 @@ HfApi().upload_file(path_or_fileobj={yaml.safe_dump([old, other]).encode()!r}, r
     entries = yaml.safe_load(after[".eval_results/cronos.yaml"])
     assert [entry["dataset"]["task_id"] for entry in entries] == ["independent_train", "t", "independent_held_out"]
     assert entries[1] == other
-    results = json.loads((evaluation / "results.json").read_text())["independent"]
+    written = json.loads((evaluation / "results.json").read_text())
+    assert written["policy"] == policy
+    assert re.fullmatch(r"[0-9a-f]{40}", written["policy_revision"])
+    results = written["independent"]
     for i, split in ((0, "train"), (2, "held_out")):
         assert entries[i]["value"] == pytest.approx(100 * results[split]["success"])
         assert entries[i]["dataset"]["revision"] == hub.repositories["datasets", "me/bench"].branches["main"]

@@ -15,7 +15,8 @@ from cronos_lerobot.scripts.report import make_report
 
 def write_results(folder, policy, content, **settings):
     folder.mkdir(parents=True)
-    head = {"format": 1, "policy": policy, "temperature": 0.6, "scene": "kitchen_2x2"} | settings
+    head = {"format": 2, "policy": policy, "temperature": 0.6, "scene": "kitchen_2x2"} | settings
+    head["benchmark"] = {"environment": "lerobot_env_cronos/kitchen_2x2-v1"}
     (folder / "results.json").write_text(json.dumps(head | content))
 
 

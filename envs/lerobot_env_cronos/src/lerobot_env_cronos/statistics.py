@@ -6,8 +6,8 @@ Z_95 = 1.959963984540054
 """97.5 % quantile of the normal distribution."""
 
 
-def wilson_interval(successes: int, n: int) -> tuple[float, float]:
-    """95 % score interval of a success rate (Wilson 1927).
+def wilson_interval(successes: float, n: float) -> tuple[float, float]:
+    """95 % score interval of a success rate (Wilson 1927); of an effective number of trials, not a whole one, too.
 
     Raises:
         ValueError: there are no trials, or more successes than trials.

@@ -1,0 +1,90 @@
+"""Where a policy comes from, and what tells it from another: the commit on the Hub, a hash of what was loaded."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import draccus
+from huggingface_hub import HfApi, snapshot_download
+from huggingface_hub.errors import HFValidationError
+from huggingface_hub.utils import validate_repo_id
+from lerobot.configs import PreTrainedConfig
+
+FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
+"""What a policy is loaded from: configs, weights, tokenizers."""
+
+UNDECISIVE = ("pretrained_path", "pretrained_revision", "push_to_hub", "repo_id", "private", "tags", "license")
+"""Fields of a policy's config that say where it is and not what it does."""
+
+
+@dataclass(frozen=True)
+class PolicySource:
+    """A checkpoint as it was when it was looked up."""
+
+    name: str
+    """As it was given: a folder, or `<owner>/<repository>[@<revision>]` on the Hub."""
+    folder: Path
+    """Its files; of the Hub's, those of one commit in the cache."""
+    revision: str | None = None
+    """The Hub's commit."""
+
+
+def find_policy(name: str) -> PolicySource:
+    """Find a checkpoint; one on the Hub is downloaded whole, so that all of it is of one commit.
+
+    Raises:
+        ValueError: it is neither a folder with a config.json nor a repository's name.
+        OSError: the Hub has no such repository, or cannot be reached.
+    """
+    folder = Path(name)
+    if folder.is_dir():
+        if not (folder / "config.json").is_file():
+            raise ValueError(f"{name} is no checkpoint of a policy: it has no config.json")
+        return PolicySource(name, folder)
+    repository, _, revision = name.partition("@")
+    try:
+        validate_repo_id(repository)
+    except HFValidationError:
+        raise ValueError(f"{name} is neither a folder nor <owner>/<repository> on the Hub") from None
+    snapshot = Path(snapshot_download(repository, revision=revision or None, allow_patterns=list(FILES)))
+    return PolicySource(name, snapshot, snapshot.name)
+
+
+def fingerprint(policy: PreTrainedConfig) -> str:
+    """A short hash of all that decides a policy's actions: its config, its weights and its processors.
+
+    Weights that the config names (`checkpoint`, `adapter`) count too: by their files, or the Hub's commit.
+    """
+    config = {name: value for name, value in draccus.encode(policy).items() if name not in UNDECISIVE}
+    digest = hashlib.sha256(json.dumps(config, sort_keys=True, default=str).encode())
+    for file in _weights_and_processors(Path(policy.pretrained_path or "")):
+        digest.update(file.name.encode() + _hash(file))
+    for field in ("checkpoint", "adapter"):
+        if name := getattr(policy, field, None):
+            files = sorted(Path(name).glob("*.safetensors")) if Path(name).is_dir() else []
+            for content in [_hash(file) for file in files] or [_commit(name).encode()]:
+                digest.update(content)
+    return digest.hexdigest()[:16]
+
+
+def _weights_and_processors(folder: Path) -> Iterator[Path]:
+    """Not config.json, of which flags may have another mind, nor train_config.json, which says how it was made."""
+    for pattern in ("*.safetensors", "policy_*.json", "adapter_config.json"):
+        yield from sorted(folder.glob(pattern))
+
+
+def _hash(file: Path) -> bytes:
+    with file.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").digest()
+
+
+def _commit(repository: str) -> str:
+    """The commit of a repository on the Hub, or of its copy in the cache where the Hub cannot be reached."""
+    try:
+        return HfApi().model_info(repository).sha or repository
+    except OSError:
+        return Path(snapshot_download(repository, local_files_only=True, allow_patterns=["config.json"])).name
