@@ -89,7 +89,16 @@ def test_policy_features_match_what_the_env_observes():
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("suite", "chains"), ("split", "test"), ("scene", "x"), ("task", "tidy up"), ("fps", 30)]
+    ("field", "value"),
+    [
+        ("suite", "chains"),
+        ("split", "test"),
+        ("scene", "x"),
+        ("task", "tidy up"),
+        ("fps", 30),
+        ("num_threads", -3),
+        ("observation_height", -1),
+    ],
 )
 def test_config_errors_name_the_bad_value(field, value, caplog):
     with pytest.raises(ValueError, match=str(value)):

@@ -257,6 +257,7 @@ def test_a_simulation_that_diverges_while_its_bodies_settle_is_put_back(monkeypa
         ({"scene": "garage"}, "unknown scene 'garage'.*kitchen_2x2"),
         ({"reward": "dense"}, "unknown reward 'dense'.*difference.*level"),
         ({"obs_type": "pixels"}, "unknown obs_type 'pixels'.*pixels_agent_pos"),
+        ({"num_threads": -3}, "num_threads must be at least 0 .*got -3"),
         ({"camera_name": "top"}, "unknown camera 'top'.*bridge.*front"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from lerobot_env_cronos.simulation import gl as gl  # isort: skip  # chooses OpenGL's platform before mujoco
 
+from lerobot_env_cronos.autoreset import CronosGymVectorEnv
 from lerobot_env_cronos.benchmark.benchmark import Benchmark, EpisodeGroup
 from lerobot_env_cronos.benchmark.load import load_benchmark
 from lerobot_env_cronos.benchmark.orderings import load_orderings
@@ -26,6 +27,7 @@ __all__ = [
     "Body",
     "CronosEnv",
     "CronosEnvConfig",
+    "CronosGymVectorEnv",
     "CronosVectorEnv",
     "EpisodeGroup",
     "IndependentVectorEnv",

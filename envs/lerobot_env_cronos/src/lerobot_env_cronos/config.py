@@ -90,6 +90,13 @@ class CronosEnvConfig(EnvConfig):
         _check("renderer", self.renderer, RENDERERS)
         if self.fps != CONTROL_HZ:
             raise ValueError(f"env.fps is fixed at {CONTROL_HZ} Hz by the protocol, got {self.fps}")
+        if self.num_threads < 0:
+            raise ValueError(f"env.num_threads must be at least 0 (all cores), got {self.num_threads}")
+        if min(self.observation_height, self.observation_width, *self.render_size) < 1:
+            sizes = f"{self.observation_height} x {self.observation_width} and {tuple(self.render_size)}"
+            raise ValueError(
+                f"env.observation_height, observation_width and render_size must be positive, got {sizes}"
+            )
         self._chosen()
         pixels = self.obs_type == "pixels_agent_pos"
         self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),))}

@@ -11,7 +11,7 @@ import numpy as np
 
 from lerobot_env_cronos.benchmark.configurations import check_split
 from lerobot_env_cronos.scene.scenes import STEPS_PER_TASK, Task, get_scene
-from lerobot_env_cronos.vector_env import CronosVectorEnv
+from lerobot_env_cronos.vector_env import LEROBOT_OPTIONS, CronosVectorEnv, check_options
 
 
 class EpisodicVectorEnv(CronosVectorEnv):
@@ -75,6 +75,7 @@ class IndependentVectorEnv(EpisodicVectorEnv):
 
     def reset(self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None):
         """Start new episodes everywhere, at starts number `seed + i` or `seeds[i]`, modulo their count."""
+        check_options(options, LEROBOT_OPTIONS)
         gym.vector.VectorEnv.reset(self, seed=seed if isinstance(seed, int) else None)
         self.scene_reset(self._all, self._choose_starts(seed, self.starts), self.split)
         self.set_task(self._all, [self.task] * self.num_envs)
@@ -153,6 +154,8 @@ class CronosEnv(gym.Env):
         **kwargs: see `CronosVectorEnv`.
 
     `reset(options={"configuration": i})` picks configuration i; otherwise it is drawn from the seeded generator.
+    An episode is terminated when its task is complete and truncated after 80 steps. It stays so until the next
+    `reset`: further steps change nothing, pay nothing, and return the same observation and flags.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": CronosVectorEnv.metadata["render_fps"]}  # noqa: RUF012
@@ -174,7 +177,7 @@ class CronosEnv(gym.Env):
         self._env = IndependentVectorEnv(1, scene, task=self._tasks[0], split=split, **kwargs)
         self.observation_space = self._env.single_observation_space
         self.action_space = self._env.single_action_space
-        self._num_configurations = len(self._env.starts)
+        self._over = (False, False)
 
     @property
     def task_description(self) -> str:
@@ -184,20 +187,19 @@ class CronosEnv(gym.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Start an episode; see the class."""
         super().reset(seed=seed)
-        configuration = (options or {}).get("configuration")
-        if configuration is None:
-            configuration = int(self.np_random.integers(self._num_configurations))
-        if not 0 <= configuration < self._num_configurations:
-            raise ValueError(f"configuration must be in 0..{self._num_configurations - 1}, got {configuration}")
-        self._env.task = self._tasks[self.np_random.integers(len(self._tasks))]
-        observation, info = self._env.reset(seed=[configuration])
+        chosen = check_options(options, ("configuration",)).get("configuration")
+        start, self._env.task = draw_start(self.np_random, len(self._env.starts), self._tasks, chosen)
+        observation, info = self._env.reset(seed=[start])
+        self._over = (False, False)
         return _first(observation), _first(info) | {"task": self.task_description}
 
     def step(self, action: np.ndarray):
         """Apply an action (7,) in physical units."""
         observation, reward, terminated, truncated, info = self._env.step(np.asarray(action)[None])
         info = _first(info) | {"task": self.task_description}
-        return _first(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+        if not any(self._over):
+            self._over = (bool(terminated[0]), bool(truncated[0]))
+        return _first(observation), float(reward[0]), *self._over, info
 
     def render(self) -> np.ndarray | None:
         """Frame (height, width, 3) uint8 at `render_size`, or None without a render mode."""
@@ -206,6 +208,20 @@ class CronosEnv(gym.Env):
     def close(self) -> None:
         """Free the renderers."""
         self._env.close()
+
+
+def draw_start(
+    rng: np.random.Generator, num_starts: int, tasks: Sequence[Task], chosen: int | None = None
+) -> tuple[int, Task]:
+    """Draw where an episode starts, unless it is `chosen`, and its task.
+
+    Raises:
+        ValueError: `chosen` is no number of a configuration.
+    """
+    start = int(rng.integers(num_starts)) if chosen is None else chosen
+    if not isinstance(start, int | np.integer) or not 0 <= start < num_starts:
+        raise ValueError(f"configuration must be in 0..{num_starts - 1}, got {start!r}")
+    return int(start), tasks[int(rng.integers(len(tasks)))]
 
 
 def find_task(scene: str, instruction: str | None) -> Task | None:
@@ -231,4 +247,6 @@ def _copy(batch: dict[str, Any]) -> dict[str, Any]:
 
 
 def _first(batch: dict[str, Any]) -> dict[str, Any]:
-    return {k: _first(v) if isinstance(v, dict) else v[0] for k, v in batch.items()}
+    """The only row of a batch; numbers are Python's."""
+    first = {k: _first(v) if isinstance(v, dict) else v[0] for k, v in batch.items()}
+    return {k: v.item() if isinstance(v, np.generic) else v for k, v in first.items()}

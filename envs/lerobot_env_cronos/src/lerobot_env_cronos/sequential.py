@@ -13,6 +13,7 @@ import numpy as np
 
 from lerobot_env_cronos.episodic import EpisodicVectorEnv
 from lerobot_env_cronos.scene.scenes import STEPS_PER_TASK, Task
+from lerobot_env_cronos.vector_env import LEROBOT_OPTIONS, check_options
 
 ADVANCES = ("window", "on_success")
 
@@ -87,6 +88,7 @@ class SequentialVectorEnv(EpisodicVectorEnv):
 
     def reset(self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None):
         """Start `ordering` everywhere, at starts number `seed + i` or `seeds[i]`, modulo their count."""
+        check_options(options, LEROBOT_OPTIONS)
         gym.vector.VectorEnv.reset(self, seed=seed if isinstance(seed, int) else None)
         self.start(self._all, [self.ordering] * self.num_envs, self._choose_starts(seed, self.starts))
         nothing = np.zeros(self.num_envs, dtype=bool)

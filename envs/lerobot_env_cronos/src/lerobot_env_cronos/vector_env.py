@@ -19,6 +19,8 @@ from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW, Si
 from lerobot_env_cronos.simulation.workspace import find_free_pose, find_unsuitable
 
 GRASP_REWARD, SUCCESS_REWARD = 0.1, 1.0
+LEROBOT_OPTIONS = ("lerobot_new_rollout",)
+"""Of `reset`: what LeRobot's rollout says, which changes nothing here."""
 REWARDS = ("difference", "level")
 
 
@@ -70,13 +72,16 @@ class CronosVectorEnv(gym.vector.VectorEnv):
     ):
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        if num_threads < 0:
+            raise ValueError(f"num_threads must be at least 0 (all cores), got {num_threads}")
         if reward not in REWARDS:
             raise ValueError(f"unknown reward {reward!r}; valid rewards: {list(REWARDS)}")
         self.scene = get_scene(scene)
         self.benchmark = load_benchmark(benchmark, scene)
         self.num_envs = num_envs
-        self.timer: Callable[[str], AbstractContextManager] = lambda name: nullcontext()
+        self.timer: Callable[[str], AbstractContextManager] = nullcontext
         self.reward = reward
+        self._num_threads = num_threads
         self.simulation = Simulation(self.scene, num_envs, num_threads)
         self._observations = ObservationBuilder(
             self.simulation, obs_type, privileged_state, observation_height, observation_width, camera_name,
@@ -99,6 +104,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
 
     def reset(self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None):
         """Scene-reset every stream to a training configuration, of n: `(seed + i) % n`, or `seeds[i] % n`."""
+        check_options(options, LEROBOT_OPTIONS)
         super().reset(seed=seed if isinstance(seed, int) else None)
         starts = np.arange(len(self.benchmark.configurations["train"]))
         self.scene_reset(self._all, self._choose_starts(seed, starts))
@@ -236,6 +242,18 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         for name in ("level", "is_success", "is_grasped"):
             getattr(self, "_level" if name == "level" else name)[:] = state[name]
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickle and `copy.deepcopy`: a copy goes on bit for bit, without the renderers and the timer."""
+        kept = {name: value for name, value in self.__dict__.items() if name not in ("simulation", "timer")}
+        return kept | {"simulation": self.simulation.get_state()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.timer = nullcontext
+        self.simulation = Simulation(self.scene, self.num_envs, self._num_threads)
+        self.simulation.set_state(state["simulation"])
+        self._observations.simulation = self.simulation
+
     # LeRobot ----------------------------------------------------------------------------------------------
 
     @property
@@ -274,6 +292,14 @@ class CronosVectorEnv(gym.vector.VectorEnv):
     def close_extras(self, **kwargs) -> None:
         """Free the renderers."""
         self._observations.close()
+
+
+def check_options(options: dict[str, Any] | None, valid: Sequence[str]) -> dict[str, Any]:
+    """The options of a `reset`; a ValueError names what is unknown and what is valid."""
+    unknown = sorted(set(options or {}) - set(valid))
+    if unknown:
+        raise ValueError(f"unknown options {unknown} of reset; valid options: {list(valid)}")
+    return options or {}
 
 
 class LazyFrames(Sequence):

@@ -70,4 +70,5 @@ def register_gymnasium() -> None:
 
 def _register_gymnasium(scene: str) -> None:
     entry_point = "lerobot_env_cronos.episodic:CronosEnv"
-    gym.register(id=gymnasium_id(scene), entry_point=entry_point, kwargs={"scene": scene})
+    vector_entry_point = "lerobot_env_cronos.autoreset:CronosGymVectorEnv"
+    gym.register(gymnasium_id(scene), entry_point, vector_entry_point=vector_entry_point, kwargs={"scene": scene})

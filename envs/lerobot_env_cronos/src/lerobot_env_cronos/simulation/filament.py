@@ -6,6 +6,7 @@ one state differ by a grey level here and there, and by more at a few edges.
 """
 
 import ctypes
+import os
 import sys
 import threading
 import weakref
@@ -17,6 +18,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
+
+from lerobot_env_cronos.simulation import gl
 
 HELP = (
     "Filament finds no Vulkan device. Debian and Ubuntu draw in software with `apt-get install "
@@ -73,10 +76,11 @@ class FilamentRenderer:
         self.model, self.height, self.width = model, height, width
         self.camera = model.camera(camera).id
         self._view: list[Any] = _thread().call(_open, model, self.camera)
-        self._finalizer = weakref.finalize(self, _thread().call, self._view.clear)
+        self._finalizer = weakref.finalize(self, _close, self._view, os.getpid())
 
     def render(self, qpos: np.ndarray) -> np.ndarray:
         """Render states `qpos` (n, nq) to uint8 frames (n, height, width, 3)."""
+        gl.claim_process()
         return _thread().call(self._render, qpos)
 
     def _render(self, qpos: np.ndarray) -> np.ndarray:
@@ -94,6 +98,12 @@ class FilamentRenderer:
     def close(self) -> None:
         """Free the scene; also done when the renderer is garbage-collected."""
         self._finalizer()
+
+
+def _close(view: list[Any], opened_by: int) -> None:
+    # A forked process has no such thread.
+    if opened_by == os.getpid():
+        _thread().call(view.clear)
 
 
 def _open(model: mujoco.MjModel, camera: int) -> list[Any]:

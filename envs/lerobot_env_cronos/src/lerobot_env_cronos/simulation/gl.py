@@ -11,6 +11,28 @@ HELP = (
 )
 
 
+FORKED = (
+    "this process was forked from one that had drawn, and OpenGL does not survive a fork: start it by spawn or "
+    "forkserver (gymnasium.vector.AsyncVectorEnv(..., context='spawn')), or before the first frame is drawn; "
+    "`--env.obs_type=environment_state_agent_pos` needs no OpenGL"
+)
+
+_drawn_by: int | None = None
+
+
+def claim_process() -> None:
+    """Note that this process draws.
+
+    Raises:
+        RuntimeError: it inherited OpenGL from a process that did, so drawing would wait for threads that are gone.
+    """
+    global _drawn_by
+    if _drawn_by is None:
+        _drawn_by = os.getpid()
+    if _drawn_by != os.getpid():
+        raise RuntimeError(FORKED)
+
+
 def choose_platform() -> None:
     """Without a display, Linux renders through EGL, unless MUJOCO_GL says otherwise."""
     headless = sys.platform == "linux" and not os.environ.get("DISPLAY")

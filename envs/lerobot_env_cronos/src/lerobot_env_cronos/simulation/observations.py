@@ -114,6 +114,9 @@ class ObservationBuilder:
             self._renderers[key] = make_renderer(self.renderer, self.simulation.model, *size, camera)
         return self._renderers[key]
 
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_renderers": {}, "simulation": None}
+
     def close(self) -> None:
         """Free all renderers."""
         for renderer in self._renderers.values():

@@ -39,8 +39,9 @@ def make_renderer(name: str, model: mujoco.MjModel, height: int, width: int, cam
 
     Raises:
         KeyError: the model has no such camera.
-        RuntimeError: it cannot draw on this machine; says what is missing.
+        RuntimeError: it cannot draw on this machine, or in this process; says why.
     """
+    gl.claim_process()
     if name == "classic":
         return ClassicRenderer(model, height, width, camera)
     return FilamentRenderer(model, height, width, camera)
@@ -62,10 +63,11 @@ class ClassicRenderer:
         self.camera = model.camera(camera).id
         self._data = mujoco.MjData(model)
         self._renderer = _GL_THREAD.submit(_open, model, height, width, shadows).result()
-        self._finalizer = weakref.finalize(self, _close, self._renderer)
+        self._finalizer = weakref.finalize(self, _close, self._renderer, os.getpid())
 
     def render(self, qpos: np.ndarray) -> np.ndarray:
         """Render states `qpos` (n, nq) to uint8 frames (n, height, width, 3)."""
+        gl.claim_process()
         return _GL_THREAD.submit(self._render, qpos).result()
 
     def _render(self, qpos: np.ndarray) -> np.ndarray:
@@ -93,7 +95,10 @@ def _open(model: mujoco.MjModel, height: int, width: int, shadows: bool) -> mujo
     return renderer
 
 
-def _close(renderer: mujoco.Renderer) -> None:
+def _close(renderer: mujoco.Renderer, opened_by: int) -> None:
+    # A forked process has neither the thread nor the context.
+    if opened_by != os.getpid():
+        return
     # Nobody waits for it: the garbage collector may run in the OpenGL thread itself.
     try:
         _GL_THREAD.submit(renderer.close)

@@ -1,0 +1,119 @@
+"""Episodes that follow one another by themselves: what `gymnasium.make_vec` makes of a scene."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils.seeding import np_random
+from gymnasium.vector import AutoresetMode
+
+from lerobot_env_cronos.episodic import IndependentVectorEnv, draw_start, find_task
+from lerobot_env_cronos.scene.scenes import get_scene
+from lerobot_env_cronos.vector_env import check_options
+
+
+class CronosGymVectorEnv(IndependentVectorEnv):
+    """`num_envs` episodes at a time, each the same as `CronosEnv`'s of its seed, reset by Gymnasium's rules.
+
+    An episode is `terminated` when its task is complete and `truncated` after 80 steps.
+
+    Args:
+        num_envs: episodes at a time.
+        scene: name of the scene.
+        task: an instruction, or None to draw one for each episode.
+        split: `train` or `held_out`.
+        autoreset_mode: a `gymnasium.vector.AutoresetMode` or its value. `NextStep`: the step after an episode's
+            end ignores the action, starts the next one, pays nothing and returns its first observation.
+            `SameStep`: the ending step returns the next episode's first observation, and `info` the last one as
+            `final_obs` and `final_info`, with masks `_final_obs` and `_final_info`. `Disabled`: what is over
+            stays as it is until `reset(options={"reset_mask": ...})`.
+        render_mode: None or `rgb_array`.
+        **kwargs: see `CronosVectorEnv`.
+
+    Of `reset`'s options, `configuration` is where all episodes start, and `reset_mask` (n,) bool who is reset.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scene: str = "kitchen_2x2",
+        *,
+        task: str | None = None,
+        split: str = "train",
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **kwargs,
+    ):
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"unknown render_mode {render_mode!r}; valid: None, 'rgb_array'")
+        modes = [mode.value for mode in AutoresetMode]
+        if autoreset_mode not in [*modes, *AutoresetMode]:
+            raise ValueError(f"unknown autoreset_mode {autoreset_mode!r}; valid values: {modes}")
+        chosen = find_task(scene, task)
+        self._choices = get_scene(scene).tasks if chosen is None else (chosen,)
+        super().__init__(num_envs, scene, task=self._choices[0], split=split, **kwargs)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode}
+        self._generators = [np_random()[0] for _ in range(num_envs)]
+
+    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None):
+        """Start an episode in every environment; environment i is seeded with `seed + i` or `seeds[i]`."""
+        gym.vector.VectorEnv.reset(self, seed=seed if isinstance(seed, int) else None)
+        options = check_options(options, ("configuration", "reset_mask"))
+        mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise ValueError(f"reset_mask must be ({self.num_envs},) bool with a True in it, got {mask}")
+        seeds = [None if seed is None else seed + i for i in self._all] if not isinstance(seed, Sequence) else seed
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"got {len(seeds)} seeds for {self.num_envs} environments")
+        ids = self._all[mask]
+        for i in ids:
+            if seeds[i] is not None:
+                self._generators[i] = np_random(int(seeds[i]))[0]
+        self._begin(ids, options.get("configuration"))
+        info = {"is_success": self.is_success.copy(), "is_grasped": self.is_grasped.copy()}
+        return self.observe_running(ids), self._mark(info, mask)
+
+    def step(self, actions: np.ndarray):
+        """Step the running episodes, and start the next ones as `autoreset_mode` says."""
+        starting = self.done.copy()
+        observation, reward, terminated, truncated, info = super().step(actions)
+        info = self._mark(info, np.ones(self.num_envs, dtype=bool))
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
+            starting = terminated | truncated
+            for i in self._all[starting]:
+                final: dict[str, Any] = {
+                    name: bool(info[name][i]) for name in ("is_success", "is_grasped", "diverged")
+                }
+                final["task"] = info["task"][i]
+                info = self._add_info(info, {"final_obs": _row(observation, i), "final_info": final}, i)
+        if self.autoreset_mode is not AutoresetMode.DISABLED and starting.any():
+            ids = self._all[starting]
+            self._begin(ids)
+            observation = self.observe_running(ids)
+            new = {"is_success": self.is_success, "is_grasped": self.is_grasped, "task": self._instructions()}
+            for name, value in new.items():
+                info[name][ids] = value[ids]
+            info["diverged"][ids] = False
+        return observation, reward, terminated, truncated, info
+
+    def _begin(self, ids: np.ndarray, configuration: int | None = None) -> None:
+        """Start an episode in each of the environments `ids`, drawn from its generator."""
+        drawn = [draw_start(self._generators[i], len(self.starts), self._choices, configuration) for i in ids]
+        self.scene_reset(ids, self.starts[[start for start, _ in drawn]], self.split)
+        self.set_task(ids, [task for _, task in drawn])
+        self.done[ids] = False
+        self._elapsed[ids] = 0
+
+    def _mark(self, info: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
+        """Add the instructions, and Gymnasium's masks of who has what."""
+        info = info | {"task": self._instructions()}
+        return info | {f"_{name}": mask.copy() for name in info}
+
+    def _instructions(self) -> np.ndarray:
+        return np.array(self.instructions, dtype=object)
+
+
+def _row(batch: dict[str, Any], i: int) -> dict[str, Any]:
+    return {key: _row(value, i) if isinstance(value, dict) else value[i].copy() for key, value in batch.items()}
