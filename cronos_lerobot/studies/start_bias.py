@@ -39,6 +39,8 @@ class SecondTask:
     """(num_envs,) bool."""
     complete: np.ndarray
     """(num_envs,) bool: the task was complete when it was given, so that nothing had to be done."""
+    grasped: np.ndarray
+    """(num_envs,) bool: the object was grasped at the start or after any step."""
 
 
 def run_second_tasks(env: CronosVectorEnv, agent: Spectator, split: str, seed: int = 0) -> list[SecondTask]:
@@ -75,19 +77,20 @@ def run_second_tasks(env: CronosVectorEnv, agent: Spectator, split: str, seed: i
         env.set_task(ids, [tasks[(i + 1) % len(tasks)] for i in first])
         complete = env.is_success.copy()
         set_seed(seed)
-        success = _run_task(env, agent, f"bodies {bodies}, arm {arm}")
-        outcomes.append(SecondTask(bodies, arm, success, complete))
+        success, grasped = _run_task(env, agent, f"bodies {bodies}, arm {arm}")
+        outcomes.append(SecondTask(bodies, arm, success, complete, grasped))
     return outcomes
 
 
-def _run_task(env: CronosVectorEnv, agent: Spectator, name: str) -> np.ndarray:
-    """Act for a task's steps; returns (num_envs,) bool, whether it was complete at any of them."""
+def _run_task(env: CronosVectorEnv, agent: Spectator, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Act for a task's steps; returns (num_envs,) bool twice: complete at any of them, its object ever grasped."""
     agent.begin_segment()
-    observation, success = env.observe(), np.zeros(env.num_envs, bool)
+    observation, success, grasped = env.observe(), np.zeros(env.num_envs, bool), env.is_grasped.copy()
     for _ in trange(STEPS_PER_TASK, desc=name, unit="step", leave=False, disable=None):
         observation, _, _, _, info = env.step(agent.choose(observation, env.instructions))
         success |= info["is_success"]
-    return success
+        grasped |= info["is_grasped"]
+    return success, grasped
 
 
 def pool(repetitions: list[list[SecondTask]]) -> list[SecondTask]:
@@ -98,20 +101,23 @@ def pool(repetitions: list[list[SecondTask]]) -> list[SecondTask]:
             same[0].arm,
             np.concatenate([outcome.success for outcome in same]),
             np.concatenate([outcome.complete for outcome in same]),
+            np.concatenate([outcome.grasped for outcome in same]),
         )
         for same in zip(*repetitions, strict=True)
     ]
 
 
-Row = tuple[str, str, int, int, float, float, int]
+Row = tuple[str, str, int, int, float, float, int, int]
 
 
 def rows(outcomes: list[SecondTask]) -> list[Row]:
-    """Bodies, arm, successes, n, 95 % interval, and how many were left out because they were complete."""
+    """Bodies, arm, successes, n, 95 % interval, those left out as complete, and successes without a grasp."""
     table = []
     for outcome in outcomes:
         k, n = int(outcome.success[~outcome.complete].sum()), int((~outcome.complete).sum())
-        table.append((outcome.bodies, outcome.arm, k, n, *wilson_interval(k, n), int(outcome.complete.sum())))
+        never_grasped = int((outcome.success & ~outcome.complete & ~outcome.grasped).sum())
+        apart = int(outcome.complete.sum()), never_grasped
+        table.append((outcome.bodies, outcome.arm, k, n, *wilson_interval(k, n), *apart))
     return table
 
 
@@ -136,14 +142,16 @@ def main() -> None:
     env = CronosVectorEnv(num_envs, env_config.scene, **env_config.gym_kwargs)
     table = rows(pool([run_second_tasks(env, agent, args.split, seed) for seed in range(args.seeds)]))
     env.close()
-    print("bodies  arm   success  95 % interval    n  complete from the start (left out)")
-    for bodies, arm, k, n, low, high, complete in table:
-        print(f"{bodies:6s}  {arm:4s}  {k / n:7.3f}  {low:.3f}-{high:.3f}  {n:>4d}  {complete}")
+    print("bodies  arm   success  95 % interval    n  complete from the start (left out)  never grasped")
+    for bodies, arm, k, n, low, high, complete, never in table:
+        print(f"{bodies:6s}  {arm:4s}  {k / n:7.3f}  {low:.3f}-{high:.3f}  {n:>4d}  {complete:<34d}  {never}")
     if args.output is not None:
         args.output.parent.mkdir(parents=True, exist_ok=True)
         with args.output.open("w", newline="") as file:
             writer = csv.writer(file)
-            writer.writerow(["bodies", "arm", "successes", "n", "ci95_low", "ci95_high", "left_out"])
+            writer.writerow(
+                ["bodies", "arm", "successes", "n", "ci95_low", "ci95_high", "left_out", "never_grasped"]
+            )
             writer.writerows(table)
 
 

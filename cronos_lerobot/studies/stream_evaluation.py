@@ -66,6 +66,8 @@ class StreamOutcomes:
     """(num_segments, num_streams, nq), MuJoCo's generalised positions at the end of each segment."""
     instructions: list[list[str]]
     """[num_segments][num_streams]."""
+    never_grasped: np.ndarray
+    """(num_segments, num_streams) bool, a success not found complete whose object was never grasped."""
 
     def stuck(self, count: int) -> np.ndarray:
         """The `count` streams whose second half has the fewest tasks done by the policy, of equals the first.
@@ -125,7 +127,7 @@ def run_streams(
     task_set = TaskSet.of(env.scene, protocol)
     loop = task_set.new_loop(env.num_envs)
     total_steps = num_segments * protocol.task_switch_interval * env.num_envs
-    successes, starts, positions, instructions = [], [], [], []
+    successes, starts, positions, instructions, never_grasped = [], [], [], [], []
     last_step = protocol.task_switch_interval - 1
     with tqdm(total=total_steps, unit="step", unit_scale=True, disable=None) as bar:
         agent.begin_segment()
@@ -143,35 +145,45 @@ def run_streams(
                     positions.append(env.positions(np.arange(env.num_envs)))
             elif isinstance(event, SegmentEnd):
                 successes.append(event.success)
+                never_grasped.append(event.never_grasped)
                 agent.begin_segment()
-    return StreamOutcomes(np.stack(successes), np.stack(starts), np.stack(positions), instructions)
+    return StreamOutcomes(
+        np.stack(successes), np.stack(starts), np.stack(positions), instructions, np.stack(never_grasped)
+    )
 
 
-Row = tuple[str, int, int, float, float, int]
+Row = tuple[str, int, int, float, float, int, int]
 
 
 def rows_by_segment(outcomes: StreamOutcomes) -> list[Row]:
-    """One row for each segment, and one for all: name, successes, n, interval, complete from the start."""
-    named = [(str(i), success, start) for i, (success, start) in enumerate(zip(outcomes.success, outcomes.start))]
-    return [_row(*group) for group in [*named, ("all", outcomes.success, outcomes.start)]]
+    """One row for each segment, and one for all.
+
+    Name, successes, n, interval, and of the successes those complete from the start and those without a grasp.
+    """
+    everything = np.ones_like(outcomes.success)
+    one = [np.arange(len(everything))[:, None] == i for i in range(len(everything))]
+    masks = {str(i): everything & mask for i, mask in enumerate(one)} | {"all": everything}
+    return [_row(name, outcomes, mask) for name, mask in masks.items()]
 
 
 def rows_by_start(outcomes: StreamOutcomes) -> list[Row]:
     """One row for each kind of start that occurred."""
     masks = {start.name.lower(): outcomes.start == start for start in Start}
-    return [_row(k, outcomes.success[mask], outcomes.start[mask]) for k, mask in masks.items() if mask.any()]
+    return [_row(name, outcomes, mask) for name, mask in masks.items() if mask.any()]
 
 
-def _row(name: str, success: np.ndarray, start: np.ndarray) -> Row:
-    k, n = int(success.sum()), success.size
-    return (name, k, n, *wilson_interval(k, n), int((start == Start.COMPLETE).sum()))
+def _row(name: str, outcomes: StreamOutcomes, mask: np.ndarray) -> Row:
+    """`mask` (num_segments, num_streams) bool chooses the segments."""
+    k, n = int(outcomes.success[mask].sum()), int(mask.sum())
+    complete = int((outcomes.start[mask] == Start.COMPLETE).sum())
+    return (name, k, n, *wilson_interval(k, n), complete, int(outcomes.never_grasped[mask].sum()))
 
 
 def print_rows(title: str, rows: list[Row]) -> None:
     """A line for each row."""
-    print(f"{title:>20}  success  95 % interval     n  complete from the start")
-    for name, k, n, low, high, complete in rows:
-        print(f"{name:>20}  {k / n:7.3f}  {low:.3f}-{high:.3f}  {n:>6d}  {complete / n:.3f}")
+    print(f"{title:>20}  success  95 % interval     n  complete from the start  never grasped")
+    for name, k, n, low, high, complete, never in rows:
+        print(f"{name:>20}  {k / n:7.3f}  {low:.3f}-{high:.3f}  {n:>6d}  {complete / n:<23.3f}  {never / n:.3f}")
 
 
 def draw_stuck(env: CronosVectorEnv, outcomes: StreamOutcomes) -> Image.Image:
@@ -223,7 +235,9 @@ def main() -> None:
         args.output.parent.mkdir(parents=True, exist_ok=True)
         with args.output.open("w", newline="") as file:
             writer = csv.writer(file)
-            writer.writerow(["table", "name", "successes", "n", "ci95_low", "ci95_high", "found_complete"])
+            writer.writerow(
+                ["table", "name", "successes", "n", "ci95_low", "ci95_high", "found_complete", "never_grasped"]
+            )
             writer.writerows([title, *row] for title, rows in tables.items() for row in rows)
 
 

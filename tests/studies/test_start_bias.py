@@ -59,16 +59,19 @@ def test_the_next_task_of_the_cycle_is_given_and_the_expert_does_it(watched):
     env, agent, outcomes = watched
     assert agent.tasks == [env.scene.tasks[1]] * 4  # four configurations of the first task
     assert [(o.bodies, o.arm) for o in outcomes] == list(CONDITIONS)
-    for (*_, k, n, _low, _high, complete), outcome in zip(rows(outcomes), outcomes, strict=True):
-        assert (k, n, complete) == (4, 4, 0), outcome
+    for (*_, k, n, _low, _high, complete, never), outcome in zip(rows(outcomes), outcomes, strict=True):
+        assert (k, n, complete, never) == (4, 4, 0, 0), outcome
 
 
 def test_seeds_are_counted_together_but_not_conditions():
-    def outcome(bodies, success, complete):
-        return SecondTask(bodies, "home", np.array(success), np.array(complete))
+    def outcome(bodies, success, complete, grasped=(True, True)):
+        return SecondTask(bodies, "home", np.array(success), np.array(complete), np.array(grasped))
 
-    first = [outcome("new", [True, False], [False, False]), outcome("left", [True, True], [True, False])]
+    first = [
+        outcome("new", [True, False], [False, False]),
+        outcome("left", [True, True], [True, False], (False, False)),
+    ]
     second = [outcome("new", [True, True], [False, False]), outcome("left", [False, False], [False, False])]
-    table = [(bodies, k, n, complete) for bodies, _, k, n, _, _, complete in rows(pool([first, second]))]
+    table = [(bodies, k, n, *apart) for bodies, _, k, n, _, _, *apart in rows(pool([first, second]))]
     # A task that was complete when it was given does not count.
-    assert table == [("new", 3, 4, 0), ("left", 1, 3, 1)]
+    assert table == [("new", 3, 4, 0, 0), ("left", 1, 3, 1, 1)]

@@ -56,6 +56,8 @@ def test_the_experts_segments_succeed_and_the_idle_ones_do_not():
     assert outcomes.success.all(axis=1).tolist() == [True, False, True, False]
     assert not outcomes.success[[1, 3]].any()
     assert (outcomes.start != Start.COMPLETE).all()
+    # The expert picks up what it puts down.
+    assert not outcomes.never_grasped.any()
 
 
 def test_a_task_left_complete_is_found_so_when_its_turn_comes_again():
@@ -94,7 +96,7 @@ def test_streams_in_which_the_policy_did_nothing_are_stuck_and_drawn():
     start[2:, :2] = Start.COMPLETE
     env = make_env()
     positions = np.repeat(env.positions(np.arange(3))[None], 4, axis=0)
-    outcomes = StreamOutcomes(success, start, positions, [["put it there"] * 3] * 4)
+    outcomes = StreamOutcomes(success, start, positions, [["put it there"] * 3] * 4, np.zeros_like(success))
     assert outcomes.stuck(2).tolist() == [0, 1]
     status = outcomes.describe(2, 1)
     assert (status.succeeded, status.outcomes, status.message) == (False, [True, False, False], "begins complete")
@@ -111,3 +113,14 @@ def test_positions_are_those_at_the_end_of_each_segment():
     assert np.abs(outcomes.positions[1] - outcomes.positions[0]).max() < 0.2
     first, second = outcomes.instructions
     assert all(a != b for a, b in zip(first, second))
+
+
+def test_successes_without_a_grasp_have_a_column():
+    success = np.array([[1, 1, 0], [1, 1, 1]], bool)
+    start = np.full((2, 3), Start.FREE)
+    start[1, 2] = Start.COMPLETE
+    never_grasped = np.array([[0, 1, 0], [1, 1, 0]], bool)
+    outcomes = StreamOutcomes(success, start, np.zeros((2, 3, 1)), [[""] * 3] * 2, never_grasped)
+    counts = [(name, k, n, complete, never) for name, k, n, _, _, complete, never in rows_by_segment(outcomes)]
+    assert counts == [("0", 2, 3, 0, 1), ("1", 3, 3, 1, 2), ("all", 5, 6, 1, 3)]
+    assert [(row[0], row[-1]) for row in rows_by_start(outcomes)] == [("complete", 0), ("free", 3)]
