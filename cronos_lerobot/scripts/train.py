@@ -35,8 +35,10 @@ def train(config: CronosTrainConfig) -> None:
         sys.exit(f"error: {error}")
     config.output_dir = processes.broadcast(config.output_dir)
     init_logging(console_level="INFO" if processes.is_main else "ERROR")
-    if config.torch_threads is not None:
-        torch.set_num_threads(config.torch_threads)
+    # Sums depend on it in their last digits: the run's config says it, and a resumed run keeps to it.
+    if config.torch_threads is None:
+        config.torch_threads = torch.get_num_threads()
+    torch.set_num_threads(config.torch_threads)
     set_seed(config.seed)
     policy, preprocessor, postprocessor = make_policy_and_processors(config)
     if not processes.is_main:

@@ -2,7 +2,8 @@
 
     python -m cronos_lerobot.studies.speed [--num_envs 64] [--seconds 8] [--skip train]
 
-Ratios against the pure-physics bound of the same run compare across machines; absolute numbers do not.
+Ratios against the pure-physics bound of the same run compare across machines; absolute numbers do not. To compare
+versions of the physics, give the bound of the other one, measured in the same minutes, as --reference.
 """
 
 import argparse
@@ -22,6 +23,8 @@ from lerobot_env_cronos.simulation.rendering import RENDERERS
 from lerobot_env_cronos.simulation.simulation import Simulation
 
 PARTS = ("state", "pixels", "expert", "inference", "train")
+TRAININGS = {"state": "state", "frozen": "pixels, frozen encoder", "all": "pixels, all layers"}
+"""What `cronos-train` is timed on: the privileged state, or pixels with the encoder frozen or trained."""
 
 
 def rate(step: Callable[[], int], seconds: float) -> float:
@@ -119,9 +122,18 @@ def inference_rate(num_envs: int, scene: str, seconds: float) -> float:
 
 
 def train_rate(
-    num_envs: int, scene: str, record_streams: str, frozen_encoder: bool, updates: int = 2
+    num_envs: int, scene: str, record_streams: str, training: str, updates: int, torch_threads: int
 ) -> dict[str, float]:
-    """Interaction steps per second of `cronos-train` on pixels, and the shares of its time, by update mean."""
+    """Interaction steps per second of `cronos-train`: mean and standard deviation over updates, shares of time.
+
+    Args:
+        num_envs: streams.
+        scene: its name.
+        record_streams: how many of them are recorded.
+        training: one of TRAININGS.
+        updates: that are timed, after one that is not: it pays for what is built lazily.
+        torch_threads: of PyTorch.
+    """
     from lerobot.policies import make_policy_config
 
     from cronos_lerobot.agents.ppo.config import PPOConfig
@@ -129,18 +141,16 @@ def train_rate(
     from cronos_lerobot.scripts.train import train
     from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
 
+    env, options = CronosEnvConfig(scene=scene, obs_type="environment_state_agent_pos"), {}
+    if training != "state":
+        env = CronosEnvConfig(scene=scene, privileged_state=True)
+        options = {"critic_observation": "environment_state", "freeze_encoder": training == "frozen"}
     with tempfile.TemporaryDirectory() as folder:
         config = CronosTrainConfig(
-            env=CronosEnvConfig(scene=scene, privileged_state=True),
-            policy=make_policy_config(
-                "pocketvla",
-                device="cpu",
-                push_to_hub=False,
-                critic_observation="environment_state",
-                freeze_encoder=frozen_encoder,
-            ),
+            env=env,
+            policy=make_policy_config("pocketvla", device="cpu", push_to_hub=False, **options),
             output_dir=Path(folder) / "run",
-            steps=updates * 160 * num_envs,
+            steps=(1 + updates) * 160 * num_envs,
             num_envs=num_envs,
             protocol=ProtocolConfig(),
             algorithm=PPOConfig(value_warmup_updates=0),
@@ -150,15 +160,16 @@ def train_rate(
             eval_freq=0,
             save_checkpoint=False,
             tensorboard=False,
+            torch_threads=torch_threads,
         )
         train(config)
         lines = [json.loads(line) for line in (Path(folder) / "run/metrics.jsonl").read_text().splitlines()]
-    # The first update pays for what is built lazily.
     rows = [line for line in lines if line["kind"] == "update"][1:]
     shares = {
         f"share {k}": float(np.mean([row["time_share"].get(k, 0) for row in rows])) for k in rows[0]["time_share"]
     }
-    return {"steps/s": float(np.mean([row["steps_per_s"] for row in rows]))} | shares
+    speeds = [row["steps_per_s"] for row in rows]
+    return {"steps/s": float(np.mean(speeds)), "std": float(np.std(speeds))} | shares
 
 
 def main() -> None:
@@ -170,6 +181,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=8.0, help="time spent on each part [s]")
     parser.add_argument("--skip", nargs="*", default=[], choices=PARTS)
     parser.add_argument("--record_streams", nargs="*", default=["0", "all"], help="streams recorded in `train`")
+    parser.add_argument("--trainings", nargs="*", default=list(TRAININGS), choices=TRAININGS, help="of `train`")
+    parser.add_argument("--updates", type=int, default=2, help="policy updates that are timed in `train`")
+    parser.add_argument(
+        "--torch_threads", type=int, default=os.cpu_count() or 1, help="in `train`; the cores by default"
+    )
+    parser.add_argument("--reference", type=float, help="another bound [steps/s], for one more ratio in `train`")
     args = parser.parse_args()
     register_third_party_plugins()
     print(f"{args.num_envs} streams of {args.scene}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
@@ -187,11 +204,15 @@ def main() -> None:
         ms = 1000 * args.num_envs / speed
         print(f"{'PocketVLA from pixels':28s} {speed:8.0f} steps/s  {speed / bound:.2f}  ({ms:.0f} ms a batch)")
     for streams in [] if "train" in args.skip else args.record_streams:
-        for frozen in (True, False):
-            result = train_rate(args.num_envs, args.scene, streams, frozen)
+        for training in args.trainings:
+            result = train_rate(args.num_envs, args.scene, streams, training, args.updates, args.torch_threads)
             shares = ", ".join(f"{k[6:]} {v:.0%}" for k, v in result.items() if k.startswith("share"))
-            name = f"cronos-train, pixels, {'frozen encoder' if frozen else 'all layers'}, {streams} recorded"
-            print(f"{name:52s} {result['steps/s']:8.0f} steps/s  {result['steps/s'] / bound:.2f}  ({shares})")
+            name = f"cronos-train, {TRAININGS[training]}, {streams} recorded"
+            speed = f"{result['steps/s']:8.0f} +- {result['std']:.0f} steps/s"
+            ratios = f"{result['steps/s'] / bound:.2f}"
+            if args.reference:
+                ratios += f"  {result['steps/s'] / args.reference:.2f} of the reference"
+            print(f"{name:52s} {speed}  {ratios}  ({shares})")
 
 
 if __name__ == "__main__":

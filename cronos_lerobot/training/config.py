@@ -161,7 +161,8 @@ class CronosTrainConfig:
     wandb: WandBConfig = field(default_factory=WandBConfig)
     """Weights & Biases."""
     torch_threads: int | None = None
-    """Threads of PyTorch on the CPU, in each process; null leaves PyTorch's default."""
+    """Threads of PyTorch on the CPU, in each process; null becomes PyTorch's own choice (the cores, or
+    OMP_NUM_THREADS), which the checkpoints' config then names."""
     checkpoint_path: Path | None = field(init=False, default=None)
     """The checkpoint to resume from, set by `validate`."""
 

@@ -48,6 +48,9 @@ def test_train_kill_resume(observation, tmp_path, monkeypatch):
     assert any(not torch.equal(before[name], after[name]) for name in before)
     for name, tensor in weights(whole).items():
         assert torch.equal(tensor, after[name]), name
+    # Not given, PyTorch's own number of threads is on record, and a resumed run takes it from there.
+    starts = json.loads((broken / "manifest.json").read_text())["starts"]
+    assert [start["config"]["torch_threads"] for start in starts] == [torch.get_num_threads()] * 2
 
 
 def test_checkpoint_is_a_lerobot_policy(tmp_path, monkeypatch):
