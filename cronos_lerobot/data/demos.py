@@ -18,13 +18,17 @@ from cronos_lerobot.data.perturbations import (
     NoiseConfig,
     move_arm_at_random,
 )
-from cronos_lerobot.data.schema import SUCCESS
+from cronos_lerobot.data.schema import SUCCESS, TRUNCATED
 from cronos_lerobot.data.writer import SegmentWriter
 
 ARM_POSES = ("home", "random", "after_task")
 LAYOUTS = ("train", "random")
 CONFIGURATION = "cronos.configuration"
 MAX_FAILURES_IN_A_ROW = 200
+
+
+class ExpertError(RuntimeError):
+    """The expert cannot demonstrate what was asked for."""
 
 
 class Expert(Protocol):
@@ -73,6 +77,13 @@ class DemoConfig:
     start: StartConfig = field(default_factory=StartConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     misses: MissConfig = field(default_factory=MissConfig)
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if self.max_steps < 1:
+            raise ValueError(f"max_steps must be at least 1, got {self.max_steps}")
+        if self.steps_after_release < 0:
+            raise ValueError(f"steps_after_release must be at least 0, got {self.steps_after_release}")
 
 
 @dataclass
@@ -136,7 +147,7 @@ class DemoCollector:
             on_episode: called with the number of frames of each episode written.
 
         Raises:
-            RuntimeError: the expert failed 200 times in a row.
+            ExpertError: the expert failed 200 times in a row.
         """
         self._on_episode = on_episode
         self._start_idle_streams(num_episodes)
@@ -188,10 +199,15 @@ class DemoCollector:
         self.successes += succeeded
         self._failures_in_a_row = 0 if succeeded else self._failures_in_a_row + 1
         if self._failures_in_a_row >= MAX_FAILURES_IN_A_ROW:
-            raise RuntimeError(f"the expert failed {MAX_FAILURES_IN_A_ROW} times in a row, last: {episode.task}")
+            raise ExpertError(
+                f"the expert failed {MAX_FAILURES_IN_A_ROW} times in a row, last to {episode.task.instruction!r}"
+                f" within --max_steps={self.config.max_steps}"
+            )
         if keep:
             frames = {key: np.stack(values) for key, values in episode.frames.items()}
-            frames[DONE] = np.arange(episode.steps) == episode.steps - 1
+            is_last = np.arange(episode.steps) == episode.steps - 1
+            # The expert stops because its task is done; a failure that is kept ran out of time.
+            frames |= {DONE: is_last & succeeded, TRUNCATED: is_last & (not succeeded)}
             metadata = {CONFIGURATION: episode.configuration, SUCCESS: succeeded}
             self.writer.add_segment(frames, episode.task.instruction, episode_metadata=metadata)
             self._kept[episode.task] += 1

@@ -1,7 +1,7 @@
 """Records training streams as a LeRobotDataset: an observer that the training loop calls once per step."""
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -12,10 +12,12 @@ from lerobot_env_cronos import CronosVectorEnv
 
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.data.drawing import LateCamera, UndrawnFrames
+from cronos_lerobot.data.origin import STREAMS, origin_of
 from cronos_lerobot.data.schema import (
     INTERVENTION,
     LOG_PROB,
     POLICY_VERSION,
+    POSITION,
     SEGMENT_INDEX,
     STEP,
     STREAM_ID,
@@ -23,6 +25,7 @@ from cronos_lerobot.data.schema import (
     SUCCESS,
     SUCCESS_FRAME,
     TOTAL_INTERVENTIONS,
+    TRUNCATED,
     VALUE,
     feature_names,
     frame_format,
@@ -31,6 +34,7 @@ from cronos_lerobot.data.schema import (
 )
 from cronos_lerobot.data.writer import SegmentWriter
 from cronos_lerobot.protocol.interventions import Intervention
+from cronos_lerobot.protocol.loop_state import Step
 
 
 class StreamRecorder:
@@ -38,10 +42,9 @@ class StreamRecorder:
 
     ```python
     recorder = StreamRecorder.open(env, "me/stream", root, segment_length=80, streams="all")
-    for ...:                                                    # the training loop, after each env.step
-        recorder.on_step(obs, instructions, actions, rewards, success, log_prob, value, policy_version,
-                         interventions=..., stream_interventions=..., total_interventions=...,
-                         steps=..., segments=..., segment_ends=...)
+    for event in train(...):                                    # the main loop, `cronos_lerobot.protocol.rf_mtrl`
+        if isinstance(event, Step):
+            recorder.on_step(event)
     state = recorder.state_dict()                               # at a checkpoint: flushes to disk first
     recorder.close()
     # later: StreamRecorder.open(env, "me/stream", root, ..., state=state) drops what came after `state`
@@ -61,7 +64,7 @@ class StreamRecorder:
 
         Args:
             writer: takes the segments; its features are those of `stream_features`.
-            num_envs: streams the loop runs, n of the arrays of `on_step`.
+            num_envs: streams the loop runs.
             segment_length: the most steps between two task switches (K), the buffers' capacity.
             streams: how many of the streams to record, the first ones, or "all".
             cameras: whose pictures are drawn when they are written, by name.
@@ -96,6 +99,7 @@ class StreamRecorder:
         streams: int | str = "all",
         cameras: Mapping[str, LateCamera] | None = None,
         state: Mapping[str, Any] | None = None,
+        flags: Mapping[str, Any] | None = None,
         **writer_options: Any,
     ) -> Self:
         """A recorder of `env`'s streams: into a new dataset, or on from a checkpoint.
@@ -109,8 +113,14 @@ class StreamRecorder:
             cameras: pictures to record in place of the observation's, by name; `on_step` then takes, under
                 `pixels` and this name, the states (n, nq) to draw from.
             state: of `state_dict()`. Everything that was written after it is dropped from the dataset.
+            flags: what the streams are made with, for `meta/cronos.json`.
             writer_options: passed on to `SegmentWriter`.
+
+        Raises:
+            ValueError: the dataset to resume is of another scene, version or benchmark.
+            FolderInUseError: another process writes to `root`.
         """
+        writer_options |= {"origin": origin_of(env, STREAMS, flags or {})}
         if cameras:
             # A loop that is far ahead of the drawing waits: no more than two rounds of segments are due.
             pixels = sum(camera.height * camera.width for camera in cameras.values())
@@ -133,71 +143,43 @@ class StreamRecorder:
             recorder.load_partial_segments(state)
         return recorder
 
-    def on_step(
-        self,
-        obs: Mapping[str, Any],
-        instructions: Sequence[str],
-        actions: np.ndarray,
-        rewards: np.ndarray,
-        success: np.ndarray,
-        log_prob: np.ndarray,
-        value: np.ndarray,
-        policy_version: int,
-        *,
-        interventions: np.ndarray,
-        stream_interventions: np.ndarray,
-        total_interventions: int,
-        steps: np.ndarray,
-        segments: np.ndarray,
-        segment_ends: np.ndarray,
-    ) -> None:
+    def on_step(self, step: Step) -> None:
         """Take one step of all n streams. Everything is copied.
 
         Args:
-            obs: the raw observation that the actions were chosen on, leading dimension n; at least that of the
-                recorded streams.
-            instructions: n instructions, those the actions were chosen under.
-            actions: (n, 7), physical units, as given to `env.step`.
-            rewards: (n,) of this step.
-            success: (n,) bool, the task is complete after this step.
-            log_prob: (n,) of the actions under the policy that chose them.
-            value: (n,) that policy's value of `obs`.
-            policy_version: policy updates so far.
-            interventions: (n,) `Intervention` codes: what preceded `obs`. NONE inside a segment, anything
-                else on its first frame.
-            stream_interventions: (n,) interventions that count, so far, per stream.
-            total_interventions: the same over all streams.
-            steps: (n,) control steps of each stream before this one.
-            segments: (n,) pieces of each stream before this one: task switches and divergences end one.
-            segment_ends: (n,) bool, this is the segment's last step (a switch or a reset follows).
+            step: its observation may be that of the recorded streams alone. `preceded_by` is NONE inside a
+                segment and anything else on its first frame; `cut` says where a switch or a reset follows.
 
         Raises:
             ValueError: an intervention inside a segment or none at its start; a segment that outgrows
                 `segment_length` or changes its instruction.
         """
+        same = partial(np.full, self.num_envs)
         columns = {
-            ACTION: actions,
-            REWARD: rewards,
-            SUCCESS: success,
-            DONE: segment_ends,
-            INTERVENTION: interventions,
-            STREAM_INTERVENTIONS: stream_interventions,
-            STEP: steps,
-            SEGMENT_INDEX: segments,
-            LOG_PROB: log_prob,
-            VALUE: value,
+            ACTION: step.action.action,
+            REWARD: step.reward,
+            SUCCESS: step.success,
+            DONE: same(False),
+            TRUNCATED: step.cut,
+            INTERVENTION: step.preceded_by,
+            STREAM_INTERVENTIONS: step.interventions,
+            STEP: same(step.t),
+            SEGMENT_INDEX: step.piece,
+            POSITION: step.segments_since_reset,
+            LOG_PROB: step.action.log_prob,
+            VALUE: step.action.value,
             STREAM_ID: np.arange(self.num_envs),
-            TOTAL_INTERVENTIONS: np.full(self.num_envs, total_interventions),
-            POLICY_VERSION: np.full(self.num_envs, policy_version),
+            TOTAL_INTERVENTIONS: same(int(np.sum(step.interventions))),
+            POLICY_VERSION: same(step.policy_version),
         }
         columns = {key: np.asarray(column) for key, column in columns.items()}
         for key, column in columns.items():
             if len(column) != self.num_envs:
                 raise ValueError(f"{key} has leading dimension {len(column)}, expected {self.num_envs}")
-        columns |= observation_columns(obs)
+        columns |= observation_columns(step.observation)
         for stream in range(self.num_streams):
-            self._append(stream, columns, instructions[stream])
-            if segment_ends[stream]:
+            self._append(stream, columns, step.instructions[stream])
+            if step.cut[stream]:
                 self._write_segment(stream)
 
     def state_dict(self) -> dict[str, Any]:
@@ -218,7 +200,7 @@ class StreamRecorder:
         }
 
     def close(self) -> None:
-        """Write the unfinished segments too (their last `next.done` is False) and finalize the dataset."""
+        """Write the unfinished segments too (their last `next.truncated` is False) and finalize the dataset."""
         for stream in range(self.num_streams):
             if self._lengths[stream]:
                 self._write_segment(stream)
@@ -267,6 +249,7 @@ class StreamRecorder:
         metadata = {
             STREAM_ID: stream,
             SEGMENT_INDEX: int(frames[SEGMENT_INDEX][0]),
+            POSITION: int(frames[POSITION][0]),
             STEP: int(frames[STEP][0]),
             INTERVENTION: int(frames[INTERVENTION][0]),
             POLICY_VERSION: int(frames[POLICY_VERSION][0]),

@@ -20,9 +20,11 @@ from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 from cronos_lerobot.agents.processing import VECTOR_KEYS
 
 SUCCESS = "next.success"
+TRUNCATED = "next.truncated"
 STREAM_ID = "cronos.stream_id"
 STEP = "cronos.step"
 SEGMENT_INDEX = "cronos.segment_index"
+POSITION = "cronos.position"
 INTERVENTION = "cronos.intervention"
 STREAM_INTERVENTIONS = "cronos.stream_interventions"
 TOTAL_INTERVENTIONS = "cronos.total_interventions"
@@ -39,6 +41,7 @@ _STREAM_COLUMNS: dict[str, str] = {
     STREAM_ID: "int64",
     STEP: "int64",
     SEGMENT_INDEX: "int64",
+    POSITION: "int64",
     INTERVENTION: "int8",
     STREAM_INTERVENTIONS: "int64",
     TOTAL_INTERVENTIONS: "int64",
@@ -66,7 +69,8 @@ def demonstration_features(
         environment_state_names: the same for `environment_state`.
 
     Returns:
-        LeRobot's feature dictionary: the observation, `action`, `next.reward`, `next.success`, `next.done`.
+        LeRobot's feature dictionary: the observation, `action`, `next.reward`, `next.success`, `next.done`,
+        `next.truncated`.
 
     Raises:
         ValueError: the space is not such a Dict, or a list of names has the wrong length.
@@ -88,6 +92,7 @@ def demonstration_features(
     features[REWARD] = _scalar_feature("float32")
     features[SUCCESS] = _scalar_feature("bool")
     features[DONE] = _scalar_feature("bool")
+    features[TRUNCATED] = _scalar_feature("bool")
     return features
 
 
@@ -99,9 +104,13 @@ def stream_features(
 ) -> Features:
     """Features of a recorded training stream: those of `demonstration_features` and `STREAM_COLUMNS`.
 
+    No frame is `next.done`: a stream never ends. The last frame of a finished segment is `next.truncated`; the
+    observation that followed it is not recorded.
+
     - `cronos.stream_id`: which of the parallel streams.
     - `cronos.step`: control steps of this stream before this one, from 0, without a gap.
     - `cronos.segment_index`: pieces of this stream before this one; a task switch or a divergence ends one.
+    - `cronos.position`: task switches since the stream's last scene reset.
     - `cronos.intervention`: an `Intervention`, what happened between the frame before and this one.
     - `cronos.stream_interventions`, `cronos.total_interventions`: interventions that count (scene and
       heuristic resets) so far, those right before this frame included, of this stream and of all together.

@@ -2,23 +2,30 @@
 
 import numpy as np
 import pandas as pd
+from lerobot.utils.constants import DONE
 
 from cronos_lerobot.data.schema import (
     INTERVENTION,
+    POSITION,
     SEGMENT_INDEX,
     STEP,
     STREAM_ID,
     STREAM_INTERVENTIONS,
     TOTAL_INTERVENTIONS,
+    TRUNCATED,
 )
 from cronos_lerobot.protocol.config import COUNTED_INTERVENTIONS
 from cronos_lerobot.protocol.interventions import Intervention
 
 COLUMNS = (
-    "index", "episode_index", "frame_index", STREAM_ID, STEP, SEGMENT_INDEX, INTERVENTION, STREAM_INTERVENTIONS,
-    TOTAL_INTERVENTIONS,
+    "index", "episode_index", "frame_index", STREAM_ID, STEP, SEGMENT_INDEX, POSITION, INTERVENTION,
+    STREAM_INTERVENTIONS, TOTAL_INTERVENTIONS, DONE, TRUNCATED,
 )  # fmt: skip
 """What a check reads of every frame."""
+
+
+SCENE_RESETS = (Intervention.INITIAL, Intervention.SCENE_RESET, Intervention.DIVERGENCE)
+"""After these the whole scene is new."""
 
 
 class StreamError(ValueError):
@@ -32,6 +39,8 @@ def check(frames: pd.DataFrame, total_frames: int, total_episodes: int) -> None:
     - The steps of each stream go from 0 up by 1, its segments too.
     - An intervention stands on the first frame of every segment and on no other, INITIAL on step 0 alone.
     - The counts of interventions never fall, and rise where an intervention that counts stands.
+    - The last frame of a segment that another one follows is truncated, no other is, and none is done.
+    - The position is 0 after a scene reset and rises by 1 at every other segment.
 
     Args:
         frames: the columns `COLUMNS` of a whole recording, in LeRobot's order; a filtered one has gaps.
@@ -79,6 +88,15 @@ def _check_stream(frames: pd.DataFrame) -> None:
         frames, (kind != Intervention.NONE) == first, "intervention {cronos.intervention} on frame {frame_index}"
     )
     _expect(frames, (kind == Intervention.INITIAL) == (before == 0), "intervention {cronos.intervention}")
+    last = first.shift(-1, fill_value=False)
+    # The recording may end with a segment or inside one.
+    is_cut = frames[TRUNCATED].astype(bool)
+    _expect(frames, (is_cut == last) | (before == len(frames) - 1), "next.truncated is {next.truncated}")
+    _expect(frames, ~frames[DONE].astype(bool), "next.done is {next.done}, a stream never ends")
+    new = kind.isin(SCENE_RESETS)
+    rise = frames[POSITION].diff()
+    holds = new & (frames[POSITION] == 0) | ~new & ((rise == 1) & first | (rise == 0) & ~first)
+    _expect(frames, holds, "cronos.position is {cronos.position}")
     for name in (STREAM_INTERVENTIONS, TOTAL_INTERVENTIONS):
         rise = frames[name].diff().fillna(0)
         # Several kinds may come together; the frame carries the strongest. Other streams count at any time.

@@ -15,17 +15,20 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.utils.constants import DEFAULT_FEATURES, DONE
+from lerobot.utils.constants import DEFAULT_FEATURES
 from tqdm import tqdm
 
+from cronos_lerobot.data.origin import write_origin
 from cronos_lerobot.data.schema import (
     INTERVENTION,
     POLICY_VERSION,
+    POSITION,
     SEGMENT_INDEX,
     STEP,
     STREAM_ID,
     SUCCESS,
     SUCCESS_FRAME,
+    TRUNCATED,
 )
 from cronos_lerobot.data.stats import Stats, episode_stats
 from cronos_lerobot.data.storage import INCOMPLETE, Shard, stats_of_row
@@ -138,6 +141,7 @@ def filter_streams(
         "frames_after_success": frames_after_success,
     }
     (partial / PROVENANCE).write_text(json.dumps(provenance, indent=2))
+    write_origin(partial, source.origin)
     os.replace(partial, root)
     return len(segments)
 
@@ -162,7 +166,7 @@ class _Writer:
         clips = {key: self._source.clip(segment, key) for key in self._meta.video_keys}
         if length < segment.length:
             clips = {key: Clip(clip.path, clip.start, length) for key, clip in clips.items()}
-            rows = _end_with_done(rows.slice(0, length))
+            rows = _end_with_cut(rows.slice(0, length))
             stats = self._stats(rows, clips)
         shard = self._shard_for(clips, length)
         task_index = self._tasks.setdefault(segment.task, len(self._tasks))
@@ -222,10 +226,10 @@ def _length(segment: Segment, frames_after_success: int | None) -> int:
     return min(segment.length, segment.success_frame + 1 + frames_after_success)
 
 
-def _end_with_done(rows: pa.Table) -> pa.Table:
-    done = np.zeros(rows.num_rows, bool)
-    done[-1] = True
-    return rows.set_column(rows.schema.get_field_index(DONE), rows.schema.field(DONE), pa.array(done))
+def _end_with_cut(rows: pa.Table) -> pa.Table:
+    cut = np.zeros(rows.num_rows, bool)
+    cut[-1] = True
+    return rows.set_column(rows.schema.get_field_index(TRUNCATED), rows.schema.field(TRUNCATED), pa.array(cut))
 
 
 def _metadata(segment: Segment) -> dict[str, Any]:
@@ -233,6 +237,7 @@ def _metadata(segment: Segment) -> dict[str, Any]:
     return {
         STREAM_ID: segment.stream,
         SEGMENT_INDEX: segment.index,
+        POSITION: segment.position,
         STEP: segment.step,
         INTERVENTION: int(segment.intervention),
         POLICY_VERSION: segment.policy_version,

@@ -26,24 +26,24 @@ import pyarrow.parquet as pq
 from huggingface_hub import HfFileSystem
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
+from cronos_lerobot.data.origin import read_origin
 from cronos_lerobot.data.schema import (
     INTERVENTION,
     POLICY_VERSION,
+    POSITION,
     SEGMENT_INDEX,
     STEP,
     STREAM_COLUMNS,
     STREAM_ID,
     SUCCESS,
     SUCCESS_FRAME,
+    TRUNCATED,
 )
 from cronos_lerobot.data.stream_check import COLUMNS, check
 from cronos_lerobot.data.video import Clip, read_frames
 from cronos_lerobot.protocol.interventions import Intervention
 
-SCENE_RESETS = (Intervention.INITIAL, Intervention.SCENE_RESET, Intervention.DIVERGENCE)
-"""After these the whole scene is new."""
-
-_SUMMARY = (STREAM_ID, SEGMENT_INDEX, STEP, INTERVENTION, POLICY_VERSION, SUCCESS, SUCCESS_FRAME)
+_SUMMARY = (STREAM_ID, SEGMENT_INDEX, POSITION, STEP, INTERVENTION, POLICY_VERSION, SUCCESS, SUCCESS_FRAME)
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class StreamDataset:
             downloading the rest; `dataset` is then out of reach.
 
     Raises:
-        ValueError: the dataset has no recorded streams.
+        ValueError: the dataset has no recorded streams, or another version of the environment made it.
     """
 
     def __init__(
@@ -126,9 +126,12 @@ class StreamDataset:
         self.repo_id = repo_id
         self._dataset = None if streaming else LeRobotDataset(repo_id, root=root, revision=revision)
         self.meta = self._dataset.meta if self._dataset else LeRobotDatasetMetadata(repo_id, root, revision)
-        lacking = [name for name in STREAM_COLUMNS if name not in self.meta.features]
-        if lacking:
-            raise ValueError(f"{repo_id} has no recorded streams: it lacks the columns {lacking}")
+        if STREAM_ID not in self.meta.features:
+            raise ValueError(f"{repo_id} has no recorded streams: it lacks the columns {list(STREAM_COLUMNS)}")
+        self.origin = read_origin(self.meta.root, self.meta.features, f"dataset {repo_id}")
+        """Where it comes from."""
+        if lacking := [name for name in (*STREAM_COLUMNS, TRUNCATED) if name not in self.meta.features]:
+            raise ValueError(f"{repo_id} has lost columns of a recorded stream: {lacking}")
         # Metadata that came from the Hub lies in LeRobot's cache, without the data.
         is_local = (self.meta.root / "data").is_dir()
         self._files: Any = fsspec.filesystem("file") if is_local else HfFileSystem()
@@ -147,11 +150,7 @@ class StreamDataset:
         rows = self._episodes()
         # In the order of the steps, not of the segments' numbers, which `check` verifies.
         rows = rows.sort_values([STREAM_ID, STEP], kind="stable")
-        segments: list[Segment] = []
-        for row in rows.to_dict("records"):
-            before = segments[-1] if segments and segments[-1].stream == row[STREAM_ID] else None
-            segments.append(_segment(row, before))
-        return segments
+        return [_segment(row) for row in rows.to_dict("records")]
 
     @cached_property
     def streams(self) -> list[int]:
@@ -287,17 +286,15 @@ def to_array(column: pa.ChunkedArray) -> np.ndarray:
     return column.to_numpy()
 
 
-def _segment(row: dict[str, Any], before: Segment | None) -> Segment:
-    intervention = Intervention(int(row[INTERVENTION]))
-    is_new = before is None or intervention in SCENE_RESETS
+def _segment(row: dict[str, Any]) -> Segment:
     return Segment(
         stream=int(row[STREAM_ID]),
         index=int(row[SEGMENT_INDEX]),
         step=int(row[STEP]),
         length=int(row["length"]),
         task=str(row["tasks"][0]),
-        intervention=intervention,
-        position=0 if is_new or before is None else before.position + 1,
+        intervention=Intervention(int(row[INTERVENTION])),
+        position=int(row[POSITION]),
         success_frame=int(row[SUCCESS_FRAME]) if row[SUCCESS_FRAME] >= 0 else None,
         policy_version=int(row[POLICY_VERSION]),
         episode=int(row["episode_index"]),

@@ -9,6 +9,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -20,9 +21,11 @@ from lerobot.datasets.utils import INFO_PATH
 from lerobot.utils.constants import DEFAULT_FEATURES
 
 from cronos_lerobot.data.drawing import UndrawnFrames
+from cronos_lerobot.data.origin import Origin, check_same, marked, read_origin, write_origin
 from cronos_lerobot.data.schema import Features, frame_format
 from cronos_lerobot.data.storage import INCOMPLETE, Shard, next_shard_index, truncate
 from cronos_lerobot.data.video import MAX_FILE_DURATION_S, VideoFile, fast_encoder
+from cronos_lerobot.locks import FolderLock
 
 FLUSH_INTERVAL_S = 20.0
 """Age of the oldest segment not on disk at which all are written [s]. A full queue takes a few seconds more to
@@ -73,6 +76,7 @@ class SegmentWriter:
         encoder: RGBEncoderConfig | None = None,
         max_pending_bytes: int = 256 * 2**20,
         flush_interval_s: float = FLUSH_INTERVAL_S,
+        origin: Origin | None = None,
     ) -> None:
         """Start a new dataset.
 
@@ -85,16 +89,23 @@ class SegmentWriter:
             encoder: of the videos; `fast_encoder()` when None.
             max_pending_bytes: segments waiting for the encoder; `add_segment` blocks when it is exceeded.
             flush_interval_s: the longest that a segment waits for a flush [s].
+            origin: where it comes from; what appends to it later has to be of the same.
 
         Raises:
             FileExistsError: `root` exists.
-            OSError: it cannot be made.
+            OSError: it cannot be made, or another process writes to it.
         """
         has_video = any(feature["dtype"] == "video" for feature in features.values())
-        meta = LeRobotDatasetMetadata.create(
-            repo_id, fps, features, robot_type=robot_type, root=Path(root), use_videos=has_video
-        )
-        self._start(meta, encoder, max_pending_bytes, flush_interval_s)
+        with ExitStack() as on_failure:
+            self._lock = on_failure.enter_context(FolderLock(root))
+            meta = LeRobotDatasetMetadata.create(
+                repo_id, fps, features if origin is None else marked(features, origin), robot_type=robot_type,
+                root=Path(root), use_videos=has_video,
+            )  # fmt: skip
+            if origin is not None:
+                write_origin(meta.root, origin)
+            self._start(meta, encoder, max_pending_bytes, flush_interval_s)
+            on_failure.pop_all()
 
     @classmethod
     def resume(
@@ -106,6 +117,8 @@ class SegmentWriter:
         encoder: RGBEncoderConfig | None = None,
         max_pending_bytes: int = 256 * 2**20,
         flush_interval_s: float = FLUSH_INTERVAL_S,
+        origin: Origin | None = None,
+        may_differ: tuple[str, ...] = (),
     ) -> Self:
         """Go on with the dataset in `root` as it was at `state`; what was written after it is dropped.
 
@@ -116,17 +129,26 @@ class SegmentWriter:
             encoder: as for a new dataset; it must match, LeRobot assumes one encoding per camera.
             max_pending_bytes: as for a new dataset.
             flush_interval_s: as for a new dataset.
+            origin: of what is to be appended.
+            may_differ: flags of the origin that may be others than they were.
 
         Raises:
             FileNotFoundError: there is no dataset in `root`.
-            ValueError: the dataset holds fewer episodes than `state`.
+            ValueError: the dataset holds fewer episodes than `state`, or is of another origin.
+            FolderInUseError: another process writes to it.
         """
         if not (Path(root) / INFO_PATH).is_file():
             raise FileNotFoundError(f"no LeRobotDataset to resume in {root}")
-        meta = LeRobotDatasetMetadata(repo_id, root=Path(root))
-        truncate(meta, meta.info.total_episodes if state is None else state["num_episodes"])
         writer = cls.__new__(cls)
-        writer._start(meta, encoder, max_pending_bytes, flush_interval_s)
+        with ExitStack() as on_failure:
+            writer._lock = on_failure.enter_context(FolderLock(root))
+            meta = LeRobotDatasetMetadata(repo_id, root=Path(root))
+            if origin is not None:
+                there = read_origin(meta.root, meta.features, f"the dataset in {root}")
+                check_same(there, origin, f"the dataset in {root}", may_differ)
+            truncate(meta, meta.info.total_episodes if state is None else state["num_episodes"])
+            writer._start(meta, encoder, max_pending_bytes, flush_interval_s)
+            on_failure.pop_all()
         return writer
 
     @property
@@ -199,6 +221,7 @@ class SegmentWriter:
     def finalize(self) -> None:
         """Flush, stop the thread, and accept no more segments. Idempotent."""
         if not self._thread.is_alive():
+            self._lock.release()
             self._check_failure()
             return
         try:
@@ -206,6 +229,7 @@ class SegmentWriter:
         finally:
             self._queue.put(None)
             self._thread.join()
+            self._lock.release()
         shutil.rmtree(self.root / INCOMPLETE, ignore_errors=True)
 
     def __enter__(self) -> Self:

@@ -195,6 +195,8 @@ class Step:
     """(N,) bool, this is the last frame of its uncut piece."""
     piece: np.ndarray
     """(N,) index of that piece within its stream."""
+    segments_since_reset: np.ndarray
+    """(N,) finished segments since the last scene reset."""
     preceded_by: np.ndarray
     """(N,) Intervention between the step before and this one."""
     interventions: np.ndarray

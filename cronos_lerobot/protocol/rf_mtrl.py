@@ -83,6 +83,7 @@ def _describe(
         diverged=info["diverged"],
         cut=cut_t,
         piece=loop.piece.copy(),
+        segments_since_reset=loop.segments_since_reset.copy(),
         preceded_by=loop.preceded_by,
         interventions=loop.stream_interventions,
         policy_version=loop.updates,

@@ -12,7 +12,6 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lerobot.configs import parser
 from lerobot.datasets.utils import INFO_PATH
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
@@ -23,9 +22,17 @@ from lerobot_env_cronos.config import CronosEnvConfig
 from lerobot_env_cronos.episodic import find_task
 from tqdm import tqdm
 
-from cronos_lerobot.data.demos import DemoCollector, DemoConfig
+from cronos_lerobot.data.demos import DemoCollector, DemoConfig, ExpertError
+from cronos_lerobot.data.origin import DEMONSTRATIONS, flags_of, origin_of
 from cronos_lerobot.data.schema import demonstration_features, feature_names
-from cronos_lerobot.data.writer import SegmentWriter
+from cronos_lerobot.data.writer import RecordingError, SegmentWriter
+from cronos_lerobot.locks import FolderLock
+from cronos_lerobot.scripts.errors import error_line, parse_command_line, stop
+
+MAY_DIFFER = ("resume", "num_envs", "env.num_threads", "dataset.repo_id", "dataset.num_episodes")
+"""Flags that need not be those of the dataset that is resumed."""
+EVALUATION_ONLY = {"suite": "independent", "split": "train", "advance": "window", "end_effector_reset": False}
+"""Flags of the environment that say how to evaluate, with their defaults."""
 
 
 @dataclass
@@ -40,7 +47,7 @@ class DemoDatasetConfig:
     """Episodes to have in the end, all tasks together."""
     video: bool = True
     """Store pixels as mp4; with `false` as PNG in the data files: exact, about twice as large, and faster for
-    `lerobot-train` to read at random (2 times, or 5 to 10 where it decodes videos with PyAV)."""
+    `lerobot-train` to read at random (docs/data.md)."""
     overwrite: bool = False
     """Delete a dataset that is already there."""
 
@@ -61,8 +68,22 @@ class RecordDemosConfig(DemoConfig):
 
     def __post_init__(self) -> None:
         """Check what draccus cannot."""
+        super().__post_init__()
         if not isinstance(self.env, CronosEnvConfig):
             raise ValueError(f"the scripted expert needs --env.type=cronos, got {self.env.type!r}")
+        for name, value in EVALUATION_ONLY.items():
+            if getattr(self.env, name) != value:
+                raise ValueError(
+                    f"--env.{name}={getattr(self.env, name)} is of evaluations; demonstrations begin from training"
+                    " configurations or random layouts, one task each"
+                )
+        for name, value, least in (
+            ("dataset.num_episodes", self.dataset.num_episodes, 1),
+            ("num_envs", self.num_envs, 1),
+            ("seed", self.seed, 0),
+        ):
+            if value < least:
+                raise ValueError(f"--{name} must be at least {least}, got {value}")
         if not self.dataset.repo_id:
             raise ValueError("--dataset.repo_id is required, e.g. --dataset.repo_id=me/kitchen_demos")
         if self.resume and self.dataset.overwrite:
@@ -71,17 +92,31 @@ class RecordDemosConfig(DemoConfig):
             self.dataset.root = HF_LEROBOT_HOME / self.dataset.repo_id
 
 
-@parser.wrap()
 def record_demos(cfg: RecordDemosConfig) -> None:
-    """Record the demonstrations; Ctrl-C ends early and keeps what is there."""
-    from lerobot_env_cronos.expert.expert import ScriptedExpert
+    """Record the demonstrations; Ctrl-C ends early and keeps what is there.
 
+    Raises:
+        ExpertError: the expert cannot do what was asked for.
+        RecordingError: the dataset can no longer be written.
+        OSError: see `open_writer`.
+        ValueError: see `open_writer`.
+    """
+    _collect(cfg, *_open(cfg))
+
+
+def _open(cfg: RecordDemosConfig) -> tuple[CronosVectorEnv, SegmentWriter]:
     assert isinstance(cfg.env, CronosEnvConfig)
     env = CronosVectorEnv(cfg.num_envs, cfg.env.scene, **cfg.env.gym_kwargs)
-    task = find_task(cfg.env.scene, cfg.env.task)
+    return env, open_writer(cfg, env)
+
+
+def _collect(cfg: RecordDemosConfig, env: CronosVectorEnv, writer: SegmentWriter) -> None:
+    from lerobot_env_cronos.expert.expert import ScriptedExpert
+
+    task = find_task(env.scene.name, cfg.env.task)
     start = time.perf_counter()
     try:
-        with open_writer(cfg, env) as writer:
+        with writer:
             before = writer.num_episodes
             expert = ScriptedExpert(env, seed=cfg.seed)
             collector = DemoCollector(
@@ -114,17 +149,21 @@ def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv) -> SegmentWriter:
 
     Raises:
         FileExistsError: the folder exists and neither flag is set.
-        ValueError: the dataset to resume stores pixels in the other way.
+        FileNotFoundError: there is nothing to resume.
+        FolderInUseError: another process writes to it.
+        ValueError: the dataset to resume was recorded in another scene or with other flags.
     """
     root = cfg.dataset.root
     assert root is not None
+    origin = origin_of(env, DEMONSTRATIONS, flags_of(cfg))
     if cfg.resume:
-        writer = SegmentWriter.resume(cfg.dataset.repo_id, root)
-        other = "image" if cfg.dataset.video else "video"
-        if any(feature["dtype"] == other for feature in writer.features.values()):
+        writer = SegmentWriter.resume(cfg.dataset.repo_id, root, origin=origin, may_differ=MAY_DIFFER)
+        if writer.num_episodes > cfg.dataset.num_episodes:
             writer.finalize()
-            recorded = str(not cfg.dataset.video).lower()
-            raise ValueError(f"{root} was recorded with --dataset.video={recorded}: resume it with the same flag")
+            raise ValueError(
+                f"{root} has {writer.num_episodes} episodes already, more than"
+                f" --dataset.num_episodes={cfg.dataset.num_episodes}"
+            )
         return writer
     if root.exists():
         if not cfg.dataset.overwrite:
@@ -133,18 +172,25 @@ def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv) -> SegmentWriter:
             )
         if any(root.iterdir()) and not (root / INFO_PATH).is_file():
             raise FileExistsError(f"{root} exists and is not a LeRobotDataset: not overwriting it")
-        shutil.rmtree(root)
+        with FolderLock(root):
+            shutil.rmtree(root)
     names = feature_names(env)
     features = demonstration_features(env.single_observation_space, video=cfg.dataset.video, **names)
     fps = int(env.metadata["render_fps"])
-    return SegmentWriter(cfg.dataset.repo_id, root, features, fps, robot_type="widowx")
+    return SegmentWriter(cfg.dataset.repo_id, root, features, fps, robot_type="widowx", origin=origin)
 
 
 def main() -> None:
     """Entry point of `cronos-record-demos`."""
     init_logging()
-    register_third_party_plugins()
-    record_demos()  # ty: ignore[missing-argument]  # the parser fills in `cfg`
+    with error_line():
+        register_third_party_plugins()
+        cfg = parse_command_line(RecordDemosConfig)
+        opened = _open(cfg)
+    try:
+        _collect(cfg, *opened)
+    except (ExpertError, RecordingError) as error:
+        stop(error)
 
 
 if __name__ == "__main__":

@@ -27,10 +27,12 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 
+from cronos_lerobot.agents.base import ActionSample
 from cronos_lerobot.data.drawing import LateCamera
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.video import fast_encoder
 from cronos_lerobot.protocol.interventions import Intervention
+from cronos_lerobot.protocol.loop_state import Step
 
 SIZES = {"128 x 128": (64, 128, 128), "640 x 480": (4, 480, 640)}
 """Streams, height and width [px] of the frames to write."""
@@ -81,15 +83,17 @@ class Recording:
     def write(self, recorder: StreamRecorder, *, drawn: bool = True) -> None:
         """Hand all steps to a recorder, as the training loop does; if not `drawn`, states in place of pictures."""
         n = self.env.num_envs
-        zeros, numbers = np.zeros(n, np.float32), np.zeros(n, np.int64)
+        zeros, numbers, no = np.zeros(n, np.float32), np.zeros(n, np.int64), np.zeros(n, np.bool_)
         for t, (observation, action, reward, success) in enumerate(self.steps):
             if not drawn:
                 observation = observation | {"pixels": dict.fromkeys(observation["pixels"], self.positions[t])}
             recorder.on_step(
-                observation, self.env.instructions, action, reward, success, zeros, zeros, 0,
-                interventions=np.full(n, Intervention.NONE if t else Intervention.INITIAL),
-                stream_interventions=numbers, total_interventions=0, steps=np.full(n, t), segments=numbers,
-                segment_ends=np.full(n, t == len(self.steps) - 1),
+                Step(
+                    t, observation, self.env.instructions, ActionSample(action, numbers[:, None], zeros, zeros),
+                    reward, success, diverged=no, cut=np.full(n, t == len(self.steps) - 1), piece=numbers,
+                    segments_since_reset=numbers, interventions=numbers, policy_version=0,
+                    preceded_by=np.full(n, Intervention.NONE if t else Intervention.INITIAL),
+                )
             )  # fmt: skip
         recorder.close()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,11 +13,14 @@ from lerobot.envs.utils import parse_camera_names
 from lerobot_env_cronos import CronosEnvConfig
 
 from cronos_lerobot.data.drawing import LateCamera
+from cronos_lerobot.data.origin import flags_of
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.writer import RecordingError
 from cronos_lerobot.protocol.loop_state import Step
 from cronos_lerobot.training.config import CronosTrainConfig
 
+MADE_WITH = ("env", "num_envs", "seed", "protocol", "algorithm", "policy")
+"""Parts of the run's config that its datasets repeat."""
 FILM = "film"
 """Key of the filmed streams' states in an observation, from which the writer draws; policies never see it."""
 
@@ -94,6 +98,7 @@ class StreamObserver:
         common: dict[str, Any] = {
             "segment_length": config.protocol.task_switch_interval,
             "flush_interval_s": record.flush_interval_s,
+            "flags": flags_of(config, only=MADE_WITH),
         }
         camera = ""
         if "streams" not in stopped:
@@ -135,26 +140,11 @@ class StreamObserver:
             logging.warning(f"The recording {name!r} of this run is not complete: {reason}")
 
     def _record(self, recorder: StreamRecorder, name: str, step: Step) -> None:
-        observation = step.observation
         if name == FILM:
-            observation = {key: value for key, value in observation.items() if key not in ("pixels", FILM)}
+            observation = {key: value for key, value in step.observation.items() if key not in ("pixels", FILM)}
             observation["pixels"] = {self._camera: step.observation[FILM]}
-        recorder.on_step(
-            observation,
-            step.instructions,
-            step.action.action,
-            step.reward,
-            step.success,
-            step.action.log_prob,
-            step.action.value,
-            step.policy_version,
-            interventions=step.preceded_by,
-            stream_interventions=step.interventions,
-            total_interventions=int(step.interventions.sum()),
-            steps=np.full(len(step.reward), step.t),
-            segments=step.piece,
-            segment_ends=step.cut,
-        )
+            step = replace(step, observation=observation)
+        recorder.on_step(step)
 
     def _try(self, name: str, use: Callable[[StreamRecorder], Any]) -> Any:
         """Use a recorder; if it fails, do without it from now on."""

@@ -3,10 +3,14 @@
 import numpy as np
 from synthetic_segments import FPS, STATE_DIM, images, observation_space
 
+from cronos_lerobot.agents.base import ActionSample
+from cronos_lerobot.data.origin import STREAMS as STREAMS_KIND
+from cronos_lerobot.data.origin import Origin
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.schema import stream_features
 from cronos_lerobot.data.writer import SegmentWriter
 from cronos_lerobot.protocol.interventions import Intervention
+from cronos_lerobot.protocol.loop_state import Step
 
 K = 4
 STREAMS = 3
@@ -31,34 +35,54 @@ def success(stream: int, t: int) -> bool:
     return (stream + k) % 2 == 0 and (t % K >= 2 or stream == 2)
 
 
+ORIGIN = Origin(STREAMS_KIND, "lerobot_env_cronos/kitchen_2x2-v1", "0123456789abcdef")
+
+
+def make_step(t, *, actions, log_prob, value, **changes) -> Step:
+    """A step of the main loop of n streams; what is not given is nothing in particular."""
+    n = len(actions)
+    action = ActionSample(actions, np.zeros((n, 7), np.int64), log_prob, value)
+    zeros, no = np.zeros(n, np.int64), np.zeros(n, np.bool_)
+    rest = {
+        "instructions": ["task"] * n, "reward": zeros, "success": no, "diverged": no, "cut": no, "piece": zeros,
+        "segments_since_reset": zeros, "preceded_by": zeros, "interventions": zeros, "policy_version": 0,
+    }  # fmt: skip
+    return Step(t, action=action, **(rest | changes))
+
+
 def step(recorder: StreamRecorder, t: int) -> None:
     streams = np.arange(STREAMS)
     code = 1000 * streams + t
     resets = (t // RESET) * np.ones(STREAMS, int)
     recorder.on_step(
-        {
-            "pixels": {"front": PICTURES[(streams + t) % 7]},
-            "agent_pos": np.repeat(code[:, None], STATE_DIM, axis=1).astype(np.float32),
-        },
-        [TASKS[(i + t // K) % 2] for i in streams],
-        np.repeat(code[:, None], 7, axis=1).astype(np.float32) / 2,
-        code / 4,
-        np.array([success(i, t) for i in streams]),
-        -code / 8,
-        code / 16,
-        t // UPDATE,
-        interventions=np.full(STREAMS, intervention(t)),
-        stream_interventions=resets,
-        total_interventions=int(resets.sum()),
-        steps=np.full(STREAMS, t),
-        segments=np.full(STREAMS, t // K),
-        segment_ends=np.full(STREAMS, t % K == K - 1),
+        make_step(
+            t,
+            observation={
+                "pixels": {"front": PICTURES[(streams + t) % 7]},
+                "agent_pos": np.repeat(code[:, None], STATE_DIM, axis=1).astype(np.float32),
+            },
+            instructions=[TASKS[(i + t // K) % 2] for i in streams],
+            actions=np.repeat(code[:, None], 7, axis=1).astype(np.float32) / 2,
+            reward=code / 4,
+            success=np.array([success(i, t) for i in streams]),
+            log_prob=-code / 8,
+            value=code / 16,
+            policy_version=t // UPDATE,
+            preceded_by=np.full(STREAMS, intervention(t)),
+            interventions=resets,
+            piece=np.full(STREAMS, t // K),
+            segments_since_reset=np.full(STREAMS, t % RESET // K),
+            cut=np.full(STREAMS, t % K == K - 1),
+        )
     )
 
 
-def record(root, *, flush_at=(), skip=(), steps=STEPS, repo_id="me/stream") -> None:
+def record(
+    root, *, flush_at=(), skip=(), steps=STEPS, repo_id="me/stream", origin: Origin | None = ORIGIN
+) -> None:
     """Record the streams; `skip` leaves out segments (stream, number)."""
-    writer = SegmentWriter(repo_id, root, stream_features(observation_space(environment_state=None)), FPS)
+    features = stream_features(observation_space(environment_state=None))
+    writer = SegmentWriter(repo_id, root, features, FPS, origin=origin)
     recorder = StreamRecorder(writer, num_envs=STREAMS, segment_length=K)
     add_segment = writer.add_segment
 

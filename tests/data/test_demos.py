@@ -72,6 +72,7 @@ def test_successful_episodes_of_every_task_in_balance(env, tmp_path):
         assert episode["next.success"][-3:].all()
         assert not episode["next.success"][0]
         assert episode["next.done"].tolist() == [False] * (len(episode["index"]) - 1) + [True]
+        assert not episode["next.truncated"].any()
         assert episode["next.reward"].sum() == pytest.approx(1.0)  # "difference": the level reached
 
 
@@ -183,6 +184,9 @@ def test_failures_are_dropped_unless_asked_for(env, tmp_path):
         env, tmp_path / "d", DemoConfig(max_steps=3, keep_failures=True), 4, expert=Idle()
     )
     assert dataset.meta.episodes["length"] == [3] * 4
+    rows = dataset.hf_dataset.with_format("numpy")[:]
+    assert rows["next.truncated"].tolist() == [False, False, True] * 4
+    assert not rows["next.done"].any()
     assert (collector.successes, collector.finished) == (0, 4)
     with pytest.raises(RuntimeError, match="failed 200 times in a row"):
         collect(env, tmp_path / "e", DemoConfig(max_steps=1), 1, expert=Idle())
@@ -238,7 +242,7 @@ def test_the_command_records_resumes_and_overwrites(tmp_path, caplog):
 def test_lerobot_train_reads_demonstrations_stored_as_images(tmp_path):
     root = tmp_path / "d"
     record_demos(command(root, 2, video=False))
-    with pytest.raises(ValueError, match=r"was recorded with --dataset\.video=false"):
+    with pytest.raises(ValueError, match=r"was recorded with --dataset\.video=false, not true: resume it with"):
         record_demos(command(root, 3, resume=True))
     record_demos(command(root, 3, resume=True, video=False))
     dataset = LeRobotDataset("me/demos", root=root)

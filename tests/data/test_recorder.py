@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset
 from synthetic_segments import FPS, STATE_DIM, images, observation_space
+from synthetic_streams import make_step
 
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.schema import stream_features
@@ -29,25 +30,24 @@ class Loop:
         code = 1000 * streams + t
         preceded = SWITCH[(t // K) % 3] if t else Intervention.INITIAL
         arguments = {
-            "obs": {
+            "observation": {
                 "pixels": {"front": self.pictures[(streams + t) % 7]},
                 "agent_pos": np.repeat(code[:, None], STATE_DIM, axis=1).astype(np.float32),
             },
             "instructions": [f"task {(i + t // K) % 3}" for i in streams],
             "actions": np.repeat(code[:, None], 7, axis=1).astype(np.float32) / 2,
-            "rewards": code / 4,
+            "reward": code / 4,
             "success": (streams + t) % 5 == 0,
             "log_prob": -code / 8,
             "value": code / 16,
             "policy_version": t // (2 * K),
-            "interventions": np.full(self.n, preceded if t % K == 0 else Intervention.NONE),
-            "stream_interventions": streams + t // K,
-            "total_interventions": 7 * t,
-            "steps": np.full(self.n, t),
-            "segments": np.full(self.n, t // K),
-            "segment_ends": np.full(self.n, t % K == K - 1),
+            "preceded_by": np.full(self.n, preceded if t % K == 0 else Intervention.NONE),
+            "interventions": streams + t // K,
+            "piece": np.full(self.n, t // K),
+            "segments_since_reset": np.full(self.n, 5 + t // K),
+            "cut": np.full(self.n, t % K == K - 1),
         }
-        recorder.on_step(**(arguments | overrides))
+        recorder.on_step(make_step(t, **(arguments | overrides)))
         self.t += 1
 
 
@@ -62,7 +62,7 @@ def streams_of(dataset: LeRobotDataset) -> dict[int, dict[str, np.ndarray]]:
     return streams
 
 
-def assert_whole(dataset: LeRobotDataset, num_streams: int, steps: int):
+def assert_whole(dataset: LeRobotDataset, num_streams: int, steps: int, num_envs: int | None = None):
     streams = streams_of(dataset)
     assert list(streams) == list(range(num_streams))
     t = np.arange(steps)
@@ -78,8 +78,11 @@ def assert_whole(dataset: LeRobotDataset, num_streams: int, steps: int):
         np.testing.assert_array_equal(stream["cronos.value"], code / 16)
         np.testing.assert_array_equal(stream["cronos.policy_version"], t // (2 * K))
         np.testing.assert_array_equal(stream["cronos.stream_interventions"], i + t // K)
-        np.testing.assert_array_equal(stream["cronos.total_interventions"], 7 * t)
-        np.testing.assert_array_equal(stream["next.done"], t % K == K - 1)
+        n = num_envs or num_streams
+        np.testing.assert_array_equal(stream["cronos.total_interventions"], n * (n - 1) // 2 + n * (t // K))
+        np.testing.assert_array_equal(stream["cronos.position"], 5 + t // K)
+        np.testing.assert_array_equal(stream["next.truncated"], t % K == K - 1)
+        assert not stream["next.done"].any()
         kinds = np.where(t % K == 0, [SWITCH[k % 3] for k in t // K], 0)
         kinds[0] = Intervention.INITIAL
         np.testing.assert_array_equal(stream["cronos.intervention"], kinds)
@@ -122,7 +125,7 @@ def test_records_only_the_first_streams(tmp_path):
     for _ in range(K):
         loop.step(recorder)
     recorder.close()
-    assert_whole(LeRobotDataset("me/stream", root=tmp_path / "d"), 2, K)
+    assert_whole(LeRobotDataset("me/stream", root=tmp_path / "d"), 2, K, num_envs=5)
 
 
 @pytest.mark.parametrize("checkpoint_at", [2 * K, 2 * K + 3], ids=["between segments", "inside one"])
@@ -164,7 +167,7 @@ def test_buffers_are_copies(tmp_path):
     pictures = loop.pictures[:1].copy()
     for t in range(K):
         state[:] = t
-        loop.step(recorder, obs={"pixels": {"front": pictures}, "agent_pos": state})
+        loop.step(recorder, observation={"pixels": {"front": pictures}, "agent_pos": state})
     recorder.close()
     rows = LeRobotDataset("me/stream", root=tmp_path / "d").hf_dataset.with_format("numpy")[:]
     np.testing.assert_array_equal(rows["observation.state"][:, 0], np.arange(K))
@@ -173,11 +176,11 @@ def test_buffers_are_copies(tmp_path):
 @pytest.mark.parametrize(
     ("at", "overrides", "message"),
     [
-        (0, {"interventions": np.array([0, 0])}, "intervention NONE on frame 0"),
-        (2, {"interventions": np.array([0, 4])}, "stream 1, step 2: intervention SCENE_RESET on frame 2"),
+        (0, {"preceded_by": np.array([0, 0])}, "intervention NONE on frame 0"),
+        (2, {"preceded_by": np.array([0, 4])}, "stream 1, step 2: intervention SCENE_RESET on frame 2"),
         (2, {"instructions": ["task 0", "other"]}, "instruction changed"),
-        (3, {"segment_ends": np.array([False, False])}, None),
-        (1, {"rewards": np.zeros(3)}, "next.reward has leading dimension 3"),
+        (3, {"cut": np.array([False, False])}, None),
+        (1, {"reward": np.zeros(3)}, "next.reward has leading dimension 3"),
     ],
 )
 def test_a_loop_that_breaks_the_contract_is_told(tmp_path, at, overrides, message):
@@ -189,7 +192,7 @@ def test_a_loop_that_breaks_the_contract_is_told(tmp_path, at, overrides, messag
         loop.step(recorder, **overrides)
         message, overrides = (
             "longer than 4",
-            {"interventions": np.zeros(2, int), "instructions": ["task 0", "task 1"]},
+            {"preceded_by": np.zeros(2, int), "instructions": ["task 0", "task 1"]},
         )
     with pytest.raises(ValueError, match=message):
         loop.step(recorder, **overrides)

@@ -76,7 +76,7 @@ def test_a_filtered_dataset_is_an_ordinary_one(source, tmp_path):
                 "cronos.step",
                 "cronos.log_prob",
                 "next.reward",
-                "next.done",
+                "next.truncated",
                 "timestamp",
             ):
                 np.testing.assert_array_equal(mine[key], theirs[key], err_msg=key)
@@ -98,7 +98,9 @@ def test_cut_after_the_success(source, tmp_path):
         (0, 0, 3, 2), (0, 1, 4, None), (1, 0, 4, None), (1, 1, 3, 2),
     ]  # fmt: skip
     first = cut.segments_of(0)[0]
-    np.testing.assert_array_equal(cut.columns(first)["next.done"], [False, False, True])
+    np.testing.assert_array_equal(cut.columns(first)["next.truncated"], [False, False, True])
+    assert not cut.columns(first)["next.done"].any()
+    assert cut.origin == source.origin
     pixels = cut.pixels(first, FRONT)
     np.testing.assert_array_equal(pixels, source.pixels(source.segments_of(0)[0], FRONT, slice(0, 3)))
     frames = [cut.dataset[i] for i in range(len(cut.dataset))]
@@ -106,6 +108,15 @@ def test_cut_after_the_success(source, tmp_path):
     assert cut.dataset.meta.stats["action"]["count"] == 14
     rows = np.concatenate([cut.pixels(s, FRONT) for s in sorted(cut.segments, key=lambda s: s.episode)])
     np.testing.assert_allclose(cut.dataset.meta.stats[FRONT]["mean"], image_stats(rows)["mean"], atol=0.01)
+
+
+def test_a_kept_segment_keeps_its_place_since_the_scene_reset(source, tmp_path):
+    # Of stream 0 the segments 2, 3, 5 and 7; the scene was reset before segment 4.
+    wanted = [2, 3, 5, 7]
+    record(tmp_path / "some", skip=[(0, k) for k in range(8) if k not in wanted])
+    filter_streams(StreamDataset("me/some", tmp_path / "some"), SegmentFilter(streams=[0]), "me/d", tmp_path / "d")
+    kept = StreamDataset("me/d", tmp_path / "d").segments_of(0)
+    assert [(s.index, s.position) for s in kept] == [(2, 2), (3, 3), (5, 1), (7, 3)]
 
 
 def test_files_that_would_grow_too_long_are_split(source, tmp_path, monkeypatch):

@@ -46,12 +46,12 @@ def test_segments_come_in_the_order_of_their_stream(streams):
 
 
 def test_a_stream_is_whole(streams):
-    columns = streams.stream_columns(2, ["cronos.step", "action", "observation.state", "next.done"])
+    columns = streams.stream_columns(2, ["cronos.step", "action", "observation.state", "next.truncated"])
     t = np.arange(STEPS)
     np.testing.assert_array_equal(columns["cronos.step"], t)
     np.testing.assert_array_equal(columns["action"], np.repeat((2000 + t)[:, None] / 2, 7, axis=1))
     np.testing.assert_array_equal(columns["observation.state"][:, 4], 2000 + t)
-    np.testing.assert_array_equal(columns["next.done"], t % K == K - 1)
+    np.testing.assert_array_equal(columns["next.truncated"], t % K == K - 1)
     streams.check()
 
 
@@ -141,6 +141,11 @@ def test_what_is_missing_is_named(tmp_path, skip, message):
         ("cronos.intervention", 12, 6, "stream 0, step 4: intervention 6"),
         ("cronos.segment_index", 5, 9, "stream 1, step 1: segment 9 begins inside episode 1"),
         ("cronos.stream_interventions", 48, 0, "stream 0, step 16: cronos.stream_interventions is 0, not what"),
+        ("next.done", 9, True, "stream 2, step 1: next.done is True, a stream never ends"),
+        ("next.truncated", 10, True, "stream 2, step 2: next.truncated is True"),
+        ("next.truncated", 11, False, "stream 2, step 3: next.truncated is False"),
+        ("cronos.position", 48, 4, "stream 0, step 16: cronos.position is 4"),
+        ("cronos.position", 12, 0, "stream 0, step 4: cronos.position is 0"),
         ("index", 7, 8, "stream 1, step 3: its index is not its row, 8"),
     ],
 )
@@ -168,7 +173,12 @@ def test_a_segment_that_is_there_twice_is_named(root, tmp_path):
         }
         pixels = {FRONT: streams.pixels(again, FRONT)}
         metadata = {"cronos.stream_id": 2, "cronos.segment_index": 5, "cronos.step": 20, "cronos.intervention": 2}
-        metadata |= {"cronos.policy_version": 2, "next.success": False, "cronos.success_frame": -1}
+        metadata |= {
+            "cronos.position": 1,
+            "cronos.policy_version": 2,
+            "next.success": False,
+            "cronos.success_frame": -1,
+        }
         writer.add_segment(frames | scalars | pixels, again.task, episode_metadata=metadata)
     with pytest.raises(StreamError, match="stream 2, step 20: it is there twice"):
         StreamDataset("me/stream", tmp_path / "d", streaming=True).check()

@@ -13,12 +13,14 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from safetensors.torch import load_file
 
+from cronos_lerobot.agents.base import ActionSample
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.data.drawing import LateCamera
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.data.video import read_frames
 from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.protocol.loop_state import Step
 from cronos_lerobot.scripts import train as script
 from cronos_lerobot.studies.kill_test import KillTest
 from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
@@ -171,9 +173,12 @@ def test_filmed_streams_are_a_dataset_of_their_own(tmp_path):
         }
         next_obs, reward, *_, info = filmed.step(action)
         recorder.on_step(
-            observation, env.instructions, action, reward, info["is_success"], np.zeros(3), np.zeros(3), 0,
-            interventions=np.full(3, 0 if t else 6), stream_interventions=np.zeros(3, int), total_interventions=0,
-            steps=np.full(3, t), segments=np.zeros(3, int), segment_ends=np.full(3, t == 4),
+            Step(
+                t, observation, env.instructions, ActionSample(action, action, np.zeros(3), np.zeros(3)), reward,
+                info["is_success"], info["diverged"], cut=np.full(3, t == 4), piece=np.zeros(3, int),
+                segments_since_reset=np.zeros(3, int), preceded_by=np.full(3, 0 if t else 6),
+                interventions=np.zeros(3, int), policy_version=0,
+            )
         )  # fmt: skip
         obs = next_obs
     recorder.close()

@@ -1,0 +1,152 @@
+"""A dataset knows its scene, version and flags, and is gone on with only by what is the same."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
+from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos.config import CronosEnvConfig
+from synthetic_streams import ORIGIN, record
+
+from cronos_lerobot.data.origin import check_same, read_origin
+from cronos_lerobot.data.perturbations import NoiseConfig
+from cronos_lerobot.data.recorder import StreamRecorder
+from cronos_lerobot.data.stream_filter import SegmentFilter, filter_streams
+from cronos_lerobot.data.streams import StreamDataset
+from cronos_lerobot.locks import FolderInUseError
+from cronos_lerobot.scripts.record_demos import (
+    DemoDatasetConfig,
+    RecordDemosConfig,
+    main,
+    open_writer,
+    record_demos,
+)
+
+STATE = "environment_state_agent_pos"
+
+
+def command(root, num_episodes=2, scene="kitchen_2x2", **options) -> RecordDemosConfig:
+    environment = CronosEnvConfig(scene=scene, obs_type=STATE, num_threads=1)
+    dataset = DemoDatasetConfig("me/demos", root, num_episodes)
+    return RecordDemosConfig(env=environment, dataset=dataset, num_envs=2, **options)
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    root = tmp_path_factory.mktemp("demos") / "d"
+    record_demos(command(root, noise=NoiseConfig(share=0.5), seed=7))
+    return root
+
+
+def test_demonstrations_say_how_they_were_made(demos):
+    origin = read_origin(demos, LeRobotDataset("me/demos", root=demos).meta.features, "it")
+    assert (origin.kind, origin.scene) == ("demonstrations", "kitchen_2x2")
+    assert origin.environment == "lerobot_env_cronos/kitchen_2x2-v1"
+    env = CronosVectorEnv(1, obs_type=STATE)
+    assert origin.benchmark == env.benchmark.fingerprint
+    env.close()
+    flags = {"noise.share": 0.5, "noise.scale": 0.6, "misses.share": 0, "seed": 7, "start.layouts": "train"}
+    assert flags.items() <= origin.flags.items()
+    assert str(demos.parent) not in json.dumps(origin.flags), "a dataset is published: no folders of its maker"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scene": "playroom_2x2"}, "was recorded in lerobot_env_cronos/kitchen_2x2-v1, not in .*playroom_2x2-v1"),
+        ({"noise": NoiseConfig(share=0.75)}, r"was recorded with --noise.share=0.5, not 0.75: resume it with"),
+        ({"seed": 8}, "was recorded with --seed=7, not 8"),
+        ({"num_episodes": 1}, "has 2 episodes already, more than --dataset.num_episodes=1"),
+    ],
+)
+def test_demonstrations_are_resumed_as_they_were_begun(demos, changes, message):
+    before = {path: path.read_bytes() for path in demos.rglob("*") if path.is_file()}
+    config = command(
+        demos, resume=True, **({"noise": NoiseConfig(share=0.5), "seed": 7, "num_episodes": 4} | changes)
+    )
+    with pytest.raises(ValueError, match=message):
+        record_demos(config)
+    assert {path: path.read_bytes() for path in demos.rglob("*") if path.is_file()} == before
+
+
+def test_a_dataset_has_one_writer(demos):
+    config = command(demos, resume=True, noise=NoiseConfig(share=0.5), seed=7)
+    env = CronosVectorEnv(2, obs_type=STATE)
+    with open_writer(config, env), pytest.raises(FolderInUseError, match="is being written by process"):
+        open_writer(config, env)
+    open_writer(config, env).finalize()
+    env.close()
+
+
+def test_a_stream_is_not_gone_on_with_in_another_scene(tmp_path):
+    kitchen, playroom = (CronosVectorEnv(2, name, obs_type=STATE) for name in ("kitchen_2x2", "playroom_2x2"))
+    recorder = StreamRecorder.open(kitchen, "me/s", tmp_path / "s", segment_length=4)
+    state = recorder.state_dict()
+    recorder.close()
+    with pytest.raises(ValueError, match=r"kitchen_2x2-v1, not in lerobot_env_cronos/playroom_2x2-v1"):
+        StreamRecorder.open(playroom, "me/s", tmp_path / "s", segment_length=4, state=state)
+    StreamRecorder.open(kitchen, "me/s", tmp_path / "s", segment_length=4, state=state).close()
+    for env in (kitchen, playroom):
+        env.close()
+
+
+def test_lerobots_tools_keep_scene_and_version_but_lose_the_flags(demos, tmp_path):
+    edited = delete_episodes(LeRobotDataset("me/demos", root=demos), [0], tmp_path / "d", "me/edited")
+    assert not (tmp_path / "d/meta/cronos.json").exists()
+    origin = read_origin(edited.root, edited.meta.features, "it")
+    assert (origin.kind, origin.scene, origin.flags) == ("demonstrations", "kitchen_2x2", {})
+    with pytest.raises(ValueError, match="does not say how it was made: LeRobot's tools have edited it"):
+        check_same(origin, replace(origin, flags={"seed": 7}), "it")
+
+
+def test_lerobot_does_not_merge_two_versions_or_benchmarks(tmp_path):
+    record(tmp_path / "a", steps=4)
+    record(tmp_path / "b", steps=4, origin=replace(ORIGIN, benchmark="f" * 16))
+    both = [LeRobotDataset("me/stream", root=tmp_path / name) for name in "ab"]
+    with pytest.raises(ValueError, match="Same features is expected"):
+        merge_datasets(both, "me/both", tmp_path / "both")
+    merged = merge_datasets([both[0], both[0]], "me/twice", tmp_path / "twice")
+    assert read_origin(merged.root, merged.meta.features, "it").benchmark == ORIGIN.benchmark
+
+
+def test_what_version_0_recorded_is_refused(tmp_path):
+    record(tmp_path / "d", steps=4, origin=None)
+    message = (
+        "does not say which version of the environment made it; this is version 1, .*: record it anew, or use"
+    )
+    with pytest.raises(ValueError, match=message):
+        StreamDataset("me/stream", tmp_path / "d", streaming=True)
+    record(tmp_path / "e", steps=4, origin=replace(ORIGIN, environment="lerobot_env_cronos/kitchen_2x2-v0"))
+    with pytest.raises(ValueError, match="was made with lerobot_env_cronos/kitchen_2x2-v0; this is version 1"):
+        StreamDataset("me/stream", tmp_path / "e", streaming=True)
+
+
+def test_a_filtered_dataset_says_where_its_segments_come_from(tmp_path):
+    record(tmp_path / "d", steps=8)
+    source = StreamDataset("me/stream", tmp_path / "d")
+    filter_streams(source, SegmentFilter(streams=[1]), "me/some", tmp_path / "some")
+    assert StreamDataset("me/some", tmp_path / "some").origin == source.origin == ORIGIN
+
+
+@pytest.mark.parametrize(
+    ("flags", "line"),
+    [
+        (["--dataset.num_episodes=-3"], "error: --dataset.num_episodes must be at least 1, got -3"),
+        (["--env.scene=garage"], "error: unknown scene 'garage'; "),
+        (["--env.split=held_out"], "error: --env.split=held_out is of evaluations; "),
+        (["--resume=true"], "error: no LeRobotDataset to resume in "),
+    ],
+)
+def test_an_error_is_one_line(tmp_path, monkeypatch, flags, line):
+    dataset = ["--dataset.repo_id=me/d", f"--dataset.root={tmp_path / 'd'}"]
+    monkeypatch.setattr(
+        "sys.argv", ["cronos-record-demos", "--env.type=cronos", f"--env.obs_type={STATE}", *dataset, *flags]
+    )
+    with pytest.raises(SystemExit) as ended:
+        main()
+    # Python prints the reason, and no traceback, where it is a string.
+    assert isinstance(ended.value.code, str)
+    assert ended.value.code.startswith(line)
+    assert "\n" not in ended.value.code
