@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, OBS_IMAGES, REWARD
 from lerobot_env_cronos import CronosVectorEnv
-from lerobot_env_cronos.simulation.observations import AGENT_POS_NAMES, environment_state_names
+from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS, agent_pos_names, environment_state_names
 from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 
 from cronos_lerobot.agents.processing import VECTOR_KEYS
@@ -139,8 +139,11 @@ def with_cameras(space: gymnasium.Space, cameras: Mapping[str, tuple[int, int]])
 
 def feature_names(env: CronosVectorEnv) -> dict[str, Sequence[str]]:
     """The names of `env`'s state dimensions, as keyword arguments of `demonstration_features`."""
+    space = cast(gymnasium.spaces.Dict, env.single_observation_space)
+    size = (space["agent_pos"].shape or (0,))[0]
+    names = [agent_pos_names(env.scene, option) for option in TASK_OBSERVATIONS]
     return {
-        "state_names": AGENT_POS_NAMES,
+        "state_names": next(n for n in names if len(n) == size),
         "environment_state_names": environment_state_names(env.scene),
     }
 

@@ -215,6 +215,8 @@ class CronosEvalConfig:
             "scene", "obs_type", "privileged_state", "observation_height", "observation_width", "camera_name"
         )  # fmt: skip
         own = {}
+        if env.task_observation != "none":
+            own["task_observation"] = env.task_observation
         if env.renderer != "classic" and env.obs_type == "pixels_agent_pos":
             own["renderer"] = env.renderer
         return own | {

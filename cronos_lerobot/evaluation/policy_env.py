@@ -9,10 +9,11 @@ from typing import Any
 
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from lerobot_env_cronos import CronosEnvConfig
 from lerobot_env_cronos.scene.model import CAMERAS
 from lerobot_env_cronos.scene.scenes import SCENES
+from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS
 
 
 def observations_of(policy: PreTrainedConfig) -> dict[str, Any]:
@@ -47,6 +48,7 @@ def check_observations(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
     Raises:
         ValueError: it does not; the sentence has the flag that would.
     """
+    check_task_observation(policy, env)
     given = {env.features_map[name]: feature for name, feature in env.features.items()}
     for name, taken in (policy.input_features or {}).items():
         feature = given.get(name)
@@ -56,7 +58,7 @@ def check_observations(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
             raise ValueError(f"the policy takes {name}, which the environment does not give: {flag} does")
         if taken.type is FeatureType.VISUAL or tuple(taken.shape) == tuple(feature.shape):
             continue
-        sizes = {scene: _state_size(name, scene, env) for scene in SCENES}
+        sizes = {scene: _state_size(name, scene, env, env.task_observation) for scene in SCENES}
         fitting = [f"--env.scene={scene}" for scene, size in sizes.items() if (size,) == tuple(taken.shape)]
         raise ValueError(
             f"the policy takes {name} of {taken.shape[0]} numbers, {env.scene} gives {feature.shape[0]}: it was "
@@ -64,6 +66,23 @@ def check_observations(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
         )
 
 
-def _state_size(name: str, scene: str, env: CronosEnvConfig) -> int:
-    other = replace(env, scene=scene, benchmark=None, task=None)
+def check_task_observation(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
+    """Check that a policy is told its task in the state if it was so in training, and only then.
+
+    Raises:
+        ValueError: it is not so; the sentence has the flag.
+    """
+    state = (policy.input_features or {}).get(OBS_STATE)
+    if state is None or tuple(state.shape) == tuple(env.features["agent_pos"].shape):
+        return
+    for other in TASK_OBSERVATIONS:
+        if (_state_size(OBS_STATE, env.scene, env, other),) == tuple(state.shape):
+            raise ValueError(
+                f"the policy takes {OBS_STATE} of {state.shape[0]} numbers, as with --env.task_observation={other}"
+                f": give it here, too; the environment has --env.task_observation={env.task_observation}"
+            )
+
+
+def _state_size(name: str, scene: str, env: CronosEnvConfig, task_observation: str) -> int:
+    other = replace(env, scene=scene, benchmark=None, task=None, task_observation=task_observation)
     return next(other.features[key].shape[0] for key, feature in other.features_map.items() if feature == name)

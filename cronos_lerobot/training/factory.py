@@ -11,6 +11,7 @@ from lerobot.utils.constants import OBS_ENV_STATE
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, SequentialVectorEnv, get_scene
 
 from cronos_lerobot.agents.base import check_trainable
+from cronos_lerobot.evaluation.policy_env import check_task_observation
 from cronos_lerobot.training.config import CronosTrainConfig
 
 
@@ -76,6 +77,7 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
     if OBS_ENV_STATE in (policy_config.input_features or {}) and not env_config.privileged_state:
         env_config.privileged_state = True
         env_config.__post_init__()
+    check_task_observation(policy_config, env_config)
     if not (policy_config.pretrained_path or getattr(policy_config, "checkpoint", None)):
         logging.warning("Training a policy from scratch: its states are not normalised, its success starts at 0.")
     policy = make_policy(policy_config, env_cfg=env_config)

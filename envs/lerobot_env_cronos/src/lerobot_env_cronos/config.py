@@ -19,7 +19,12 @@ from lerobot_env_cronos.benchmark.version import gymnasium_id
 from lerobot_env_cronos.episodic import EpisodicVectorEnv, IndependentVectorEnv, LazyVectorEnv
 from lerobot_env_cronos.scene.scenes import CONTROL_HZ, get_scene
 from lerobot_env_cronos.sequential import ADVANCES, SequentialVectorEnv
-from lerobot_env_cronos.simulation.observations import AGENT_POS_NAMES, OBS_TYPES, environment_state_names
+from lerobot_env_cronos.simulation.observations import (
+    OBS_TYPES,
+    TASK_OBSERVATIONS,
+    agent_pos_names,
+    environment_state_names,
+)
 from lerobot_env_cronos.simulation.rendering import RENDERERS
 from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 
@@ -53,6 +58,9 @@ class CronosEnvConfig(EnvConfig):
     """Send the arm home between the tasks of a chain."""
     obs_type: str = "pixels_agent_pos"
     """pixels_agent_pos, or environment_state_agent_pos for the privileged state in place of pixels."""
+    task_observation: str = "none"
+    """one_hot appends which object and which receptacle is meant to observation.state, for policies that read no
+    instructions (ACT, Diffusion); none does not."""
     privileged_state: bool = False
     """Add observation.environment_state to pixel observations, for an asymmetric critic."""
     observation_height: int = 128
@@ -88,6 +96,7 @@ class CronosEnvConfig(EnvConfig):
         _check("advance", self.advance, ADVANCES)
         _check("obs_type", self.obs_type, OBS_TYPES)
         _check("renderer", self.renderer, RENDERERS)
+        _check("task_observation", self.task_observation, TASK_OBSERVATIONS)
         if self.fps != CONTROL_HZ:
             raise ValueError(f"env.fps is fixed at {CONTROL_HZ} Hz by the protocol, got {self.fps}")
         if self.num_threads < 0:
@@ -100,7 +109,9 @@ class CronosEnvConfig(EnvConfig):
         self._chosen()
         pixels = self.obs_type == "pixels_agent_pos"
         self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),))}
-        self.features["agent_pos"] = PolicyFeature(FeatureType.STATE, (len(AGENT_POS_NAMES),))
+        self.features["agent_pos"] = PolicyFeature(
+            FeatureType.STATE, (len(agent_pos_names(scene, self.task_observation)),)
+        )
         self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE}
         if self.privileged_state or not pixels:
             size = len(environment_state_names(scene))
@@ -128,6 +139,7 @@ class CronosEnvConfig(EnvConfig):
         names = (
             "obs_type", "privileged_state", "observation_height", "observation_width", "camera_name",
             "render_size", "renderer", "num_threads", "benchmark",
+            "task_observation",
         )  # fmt: skip
         return {name: getattr(self, name) for name in names}
 

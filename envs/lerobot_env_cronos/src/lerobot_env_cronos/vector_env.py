@@ -41,8 +41,11 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             observations and of `render()`.
         benchmark: where the configurations come from: `<owner>/<repository>[@<revision>]` of a dataset on the Hub,
             or a folder; None for this package's.
+        task_observation: `one_hot` appends which object and which receptacle is meant to `agent_pos`, for policies
+            that read no instructions; `none` does not.
 
     Attributes:
+        agent_pos_names: one for each number of `agent_pos`.
         timer: called with `physics`, `observe` or `reset`, returns the context in which that work is done; a
             training run hangs its stopwatch here.
     """
@@ -69,6 +72,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         render_size: tuple[int, int] = (480, 640),
         renderer: str = "classic",
         benchmark: str | None = None,
+        task_observation: str = "none",
     ):
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
@@ -85,8 +89,9 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         self.simulation = Simulation(self.scene, num_envs, num_threads)
         self._observations = ObservationBuilder(
             self.simulation, obs_type, privileged_state, observation_height, observation_width, camera_name,
-            render_size, renderer,
+            render_size, renderer, task_observation,
         )  # fmt: skip
+        self.agent_pos_names = self._observations.agent_pos_names
         self.single_observation_space = self._observations.space
         self.single_action_space = gym.spaces.Box(
             ACTION_LOW.astype(np.float32), ACTION_HIGH.astype(np.float32), dtype=np.float32
@@ -154,7 +159,8 @@ class CronosVectorEnv(gym.vector.VectorEnv):
     def observe(self, ids: np.ndarray | None = None) -> dict[str, Any]:
         """The observation now, under the current tasks: of all streams, or with one row for each of `ids`."""
         with self.timer("observe"):
-            return self._observations.observe(self._all if ids is None else np.asarray(ids))
+            chosen = self._all if ids is None else np.asarray(ids)
+            return self._observations.observe(chosen, [self.tasks[i] for i in chosen])
 
     def _info(self) -> dict[str, np.ndarray]:
         return {"is_success": self.is_success.copy(), "is_grasped": self.is_grasped.copy()}

@@ -1,5 +1,6 @@
 """Observations: pixels, proprioception and the privileged state, in Gymnasium's and LeRobot's raw format."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -7,7 +8,7 @@ import numpy as np
 from lerobot.envs.utils import parse_camera_names
 
 from lerobot_env_cronos.scene.model import CAMERAS
-from lerobot_env_cronos.scene.scenes import Scene
+from lerobot_env_cronos.scene.scenes import Scene, Task
 from lerobot_env_cronos.simulation.rendering import RENDERERS, BatchRenderer, make_renderer
 from lerobot_env_cronos.simulation.simulation import Simulation
 
@@ -23,6 +24,9 @@ AGENT_POS_NAMES = (
 (0 closed, 1 open), and the commanded minus the measured position [m]."""
 
 
+TASK_OBSERVATIONS = ("none", "one_hot")
+"""How a policy that reads no instructions is told its task: not at all, or in `agent_pos`."""
+
 STATE_LIMIT = 10.0
 """Bound of every state observation; a body further away than this has left the room [m]."""
 
@@ -35,6 +39,20 @@ def environment_state_names(scene: Scene) -> tuple[str, ...]:
         *(f"from_ee.{axis}" for axis in "xyz"),
     )
     return tuple(f"{body}.{part}".replace(" ", "_") for body in scene.bodies for part in parts)
+
+
+def agent_pos_names(scene: Scene, task_observation: str = "none") -> tuple[str, ...]:
+    """Names of `agent_pos`: `AGENT_POS_NAMES` and, with `one_hot`, which object and which receptacle is meant.
+
+    Of each block one number is 1, the others are 0. The table is the receptacle of the reset tasks.
+    """
+    if task_observation not in TASK_OBSERVATIONS:
+        raise ValueError(f"unknown task_observation {task_observation!r}; valid values: {list(TASK_OBSERVATIONS)}")
+    if task_observation == "none":
+        return AGENT_POS_NAMES
+    bodies = [f"task.object.{name}" for name in scene.objects]
+    bodies += [f"task.receptacle.{name}" for name in (*scene.receptacles, "table")]
+    return AGENT_POS_NAMES + tuple(name.replace(" ", "_") for name in bodies)
 
 
 class ObservationBuilder:
@@ -50,6 +68,7 @@ class ObservationBuilder:
         camera_name: str,
         render_size: tuple[int, int],
         renderer: str = "classic",
+        task_observation: str = "none",
     ):
         if obs_type not in OBS_TYPES:
             raise ValueError(f"unknown obs_type {obs_type!r}; valid obs_types: {list(OBS_TYPES)}")
@@ -61,6 +80,8 @@ class ObservationBuilder:
             if camera not in CAMERAS:
                 raise ValueError(f"unknown camera {camera!r}; valid cameras: {sorted(CAMERAS)}")
         self.simulation = simulation
+        self.agent_pos_names = agent_pos_names(simulation.scene, task_observation)
+        self.tells_task = task_observation == "one_hot"
         self.pixels = obs_type == "pixels_agent_pos"
         self.privileged = privileged_state or not self.pixels
         self.size, self.render_size = (height, width), tuple(render_size)
@@ -71,7 +92,7 @@ class ObservationBuilder:
         def box(n: int) -> gym.spaces.Box:
             return gym.spaces.Box(-STATE_LIMIT, STATE_LIMIT, (n,), np.float32)
 
-        spaces: dict[str, gym.Space] = {"agent_pos": box(len(AGENT_POS_NAMES))}
+        spaces: dict[str, gym.Space] = {"agent_pos": box(len(self.agent_pos_names))}
         if self.privileged:
             spaces["environment_state"] = box(len(environment_state_names(self.simulation.scene)))
         if self.pixels:
@@ -79,10 +100,13 @@ class ObservationBuilder:
             spaces["pixels"] = gym.spaces.Dict(dict.fromkeys(self.cameras, image))
         return gym.spaces.Dict(spaces)
 
-    def observe(self, ids: np.ndarray) -> dict[str, Any]:
-        """Observation of simulations `ids`, leading dimension k; arrays are fresh at every call."""
+    def observe(self, ids: np.ndarray, tasks: Sequence[Task]) -> dict[str, Any]:
+        """Observation of simulations `ids` (k,) under their `tasks`, (k, ...); every array is fresh."""
         p, R = self.simulation.end_effector()
-        observation: dict[str, Any] = {"agent_pos": self._agent_pos(p, R)[ids]}
+        agent_pos = self._agent_pos(p, R)[ids]
+        if self.tells_task:
+            agent_pos = np.concatenate([agent_pos, self._one_hot(tasks)], axis=1)
+        observation: dict[str, Any] = {"agent_pos": agent_pos}
         if self.privileged:
             observation["environment_state"] = self._environment_state(p)[ids]
         if self.pixels:
@@ -100,6 +124,15 @@ class ObservationBuilder:
         sim = self.simulation
         columns = (p, R[:, :, 0], R[:, :, 1], sim.gripper_opening()[:, None], sim.target_position() - p)
         return np.concatenate(columns, axis=1, dtype=np.float32).clip(-STATE_LIMIT, STATE_LIMIT)
+
+    def _one_hot(self, tasks: Sequence[Task]) -> np.ndarray:
+        scene = self.simulation.scene
+        receptacles = (*scene.receptacles, None)
+        vectors = np.zeros((len(tasks), len(scene.objects) + len(receptacles)), dtype=np.float32)
+        for vector, task in zip(vectors, tasks, strict=True):
+            vector[scene.objects.index(task.object)] = 1.0
+            vector[len(scene.objects) + receptacles.index(task.receptacle)] = 1.0
+        return vectors
 
     def _environment_state(self, p: np.ndarray) -> np.ndarray:
         position = self.simulation.body_poses()[..., :3]
