@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from cronos_lerobot.experiments.jobs import Job, changed_flags
+from cronos_lerobot.experiments.jobs import Job, changes
 from cronos_lerobot.experiments.runner import BLOCKED, CHANGED, DONE, FAILED
 
 TAIL_LINES = 20
@@ -35,8 +35,8 @@ def describe(job: Job, what: str) -> str:
         return f"{job.name}: FAILED, the end of {job.log}:\n{log_tail(job)}"
     if what == CHANGED:
         return (
-            f"{job.name}: NOT REUSED, {job.output} was made by another command. Delete it, or choose another"
-            f" --root. What differs:\n    " + "\n    ".join(changed_flags(job))
+            f"{job.name}: NOT REUSED, {job.output} was made by another command or version. Delete it, choose"
+            f" another --root, or go back to what made it. What differs:\n    " + "\n    ".join(changes(job))
         )
     if what == BLOCKED:
         return f"{job.name}: blocked, it needs a job that is not done"

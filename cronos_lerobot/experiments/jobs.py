@@ -8,8 +8,13 @@ import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
+
+from cronos_lerobot.provenance import git_commit, package_versions
+
+RUNNING, STOPPED = "running", "stopped"
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,8 @@ class Job:
     resume: Callable[[], list[str] | None] = lambda: None
     """The command that goes on with an unfinished `output`, None if there is nothing to go on with."""
     progress: Callable[[], Progress | None] = lambda: None
+    environment: str = ""
+    """Id of the environment that the command works in, with its version."""
     work: int = 0
     """Interaction steps, for the time that all jobs together may still take."""
 
@@ -65,22 +72,76 @@ class Job:
 
 
 def read_record(job: Job) -> dict[str, Any]:
-    """Return `command`, `status` (running, done, failed, stopped), `seconds`, `starts`; {} before its start."""
-    return json.loads(job.record.read_text()) if job.record.is_file() else {}
+    """Return what `write_record` wrote; {} before the job's start, and where the note is damaged.
+
+    `command`, `status` (running, done, failed, stopped), `seconds`, `starts`, `made_by` (see there) and
+    `commits`, those that it was started at.
+    """
+    return {} if _damage(job) else json.loads(job.record.read_text()) if job.record.is_file() else {}
+
+
+def _damage(job: Job) -> str | None:
+    """What is wrong with the note, None if nothing is or there is none."""
+    if not job.record.is_file():
+        return None
+    try:
+        record = json.loads(job.record.read_text())
+    except ValueError as error:
+        return f"{job.record} is damaged ({error})"
+    complete = isinstance(record, dict) and {"command", "status", "seconds", "starts"} <= record.keys()
+    return None if complete else f"{job.record} is damaged (it is no note of a job)"
 
 
 def write_record(job: Job, record: dict[str, Any]) -> None:
-    """Replace the note in one step, so that a kill leaves the old one or the new one."""
+    """Replace the note in one step, on disk once this returns: a kill or a power cut leaves the old or the new."""
     job.record.parent.mkdir(parents=True, exist_ok=True)
     partial = job.record.with_name(f".{job.record.name}")
-    partial.write_text(json.dumps(record, indent=2))
+    with partial.open("w") as file:
+        file.write(json.dumps(record, indent=2))
+        file.flush()
+        os.fsync(file.fileno())
     partial.replace(job.record)
 
 
+@cache
+def this_version() -> dict[str, str]:
+    """The versions of the packages that make what is started now."""
+    return package_versions()
+
+
+@cache
+def this_commit() -> str | None:
+    """The commit of the checkout that this process runs from."""
+    return git_commit()
+
+
+def status(job: Job) -> str | None:
+    """What became of a job: running, done, failed or stopped; None before its start.
+
+    Where its runner was killed, the note says `running` for ever: with nobody who holds the claim it was stopped.
+    """
+    found = read_record(job).get("status")
+    if found != RUNNING:
+        return found
+    claim = lock(job)
+    if claim is None:
+        return RUNNING
+    os.close(claim)
+    return STOPPED
+
+
 def is_done(job: Job) -> bool:
-    """Whether this very command has run to its end and its output is still there."""
-    record = read_record(job)
-    return record.get("status") == "done" and not changed_flags(job) and job.output.exists()
+    """Whether this very command has run to its end, in this version, and its output is still there."""
+    return read_record(job).get("status") == "done" and not changes(job) and job.output.exists()
+
+
+def changes(job: Job) -> list[str]:
+    """Why `output` is not the job's: `changed_flags`, `changed_versions`, or a damaged note; empty if it is."""
+    if not job.output.exists():
+        return []
+    if damage := _damage(job):
+        return [damage]
+    return changed_flags(job) + changed_versions(job)
 
 
 def changed_flags(job: Job) -> list[str]:
@@ -93,6 +154,31 @@ def changed_flags(job: Job) -> list[str]:
         return []
     differing = [f"-{flag}" for flag in old if flag not in new] + [f"+{flag}" for flag in new if flag not in old]
     return differing or ["another order of the flags"]
+
+
+def changed_versions(job: Job) -> list[str]:
+    """How what made `output` differs from what would make it now, such as `mujoco 3.2 there, 3.3 here`."""
+    record = read_record(job)
+    if not record or not job.output.exists():
+        return []
+    if "made_by" not in record:
+        return ["its note does not say which versions made it, as those of version 0"]
+    old, new = record["made_by"], made_by(job)
+    return [
+        f"{name} {old.get(name, 'none')} there, {new.get(name, 'none')} here"
+        for name in dict.fromkeys((*old, *new))
+        if old.get(name) != new.get(name)
+    ]
+
+
+def made_by(job: Job) -> dict[str, str]:
+    """What decides a job's output besides its command: versions of packages, and the id of the environment."""
+    return this_version() | {"environment": job.environment}
+
+
+def other_commits(job: Job) -> list[str]:
+    """The commits that a job was started at, without this process's own."""
+    return [commit for commit in read_record(job).get("commits", []) if commit != this_commit()]
 
 
 def lock(job: Job) -> int | None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from cronos_lerobot.experiments import plots, tables
 from cronos_lerobot.experiments.definitions import Experiment, Row
+from cronos_lerobot.experiments.jobs import this_commit
 from cronos_lerobot.experiments.results import ExperimentResult, RowResult, collect, paper_results
 from cronos_lerobot.experiments.specs import Options, base_policy
 from cronos_lerobot.protocol.metrics import Summary
@@ -77,7 +78,8 @@ def _settings(result: ExperimentResult) -> dict[str, Any]:
             for row in result.rows
             for seed in row.seeds
         ],
-        "made_by_another_command": result.changed,
+        "left_out": result.changed,
+        "made_at_another_commit": result.commits,
     }
 
 
@@ -233,6 +235,7 @@ def _unfinished(result: ExperimentResult) -> list[str]:
             if not seed.finished:
                 lines.append(
                     f"- {seed.spec.name}: {seed.run.last['interaction_steps']:,} of {seed.spec.steps:,} steps"
+                    f" ({seed.status or 'no note of its start'})"
                 )
         missing = row.wanted - len(row.seeds)
         if missing:
@@ -247,7 +250,11 @@ def _unfinished(result: ExperimentResult) -> list[str]:
             *lines,
         ]
     if result.changed:
-        lines += ["", "## Left out: made by another command", "", *(f"- {text}" for text in result.changed)]
+        lines += ["", "## Left out: made by another command or version, or damaged", ""]
+        lines += [f"- {text}" for text in result.changed]
+    if result.commits:
+        lines += ["", f"## Made at another commit than {this_commit() or 'this one'}", ""]
+        lines += ["The versions are the same, so they count.", "", *(f"- {text}" for text in result.commits)]
     return lines
 
 

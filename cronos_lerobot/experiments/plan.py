@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from lerobot_env_cronos import gymnasium_id
 
 from cronos_lerobot.experiments.definitions import (
     CURRICULUM_INTERVAL,
@@ -71,8 +73,9 @@ def base_jobs(scene: str, options: Options) -> list[Job]:
     else:
         clone += ["--num_workers=0"]
     name = f"base/{folder.name}"
-    demos = Job(f"{name}/demos", tuple(record), folder / "demos")
-    return [demos, Job(f"{name}/clone", tuple(clone), folder / "clone", needs=(demos.name,))]
+    demos = Job(f"{name}/demos", tuple(record), folder / "demos", environment=gymnasium_id(scene))
+    clone_job = Job(f"{name}/clone", tuple(clone), folder / "clone", needs=(demos.name,))
+    return [demos, replace(clone_job, environment=demos.environment)]
 
 
 def train_flags(spec: RunSpec) -> list[str]:
@@ -134,6 +137,7 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
         needs=(base,) if base else (),
         resume=resume,
         progress=lambda: train_progress(spec.train_folder, spec.steps),
+        environment=gymnasium_id(spec.scene),
         work=spec.steps,
     )
 
@@ -153,6 +157,11 @@ def _env_flags(flags: Iterable[str]) -> list[str]:
 
 def evaluation_jobs(spec: RunSpec, evaluation: CheckpointEvaluation) -> list[Job]:
     """`cronos-eval` of a run's last checkpoint or of all, one job for each checkpoint and split."""
+    return [job for job, _ in checkpoint_evaluations(spec, evaluation)]
+
+
+def checkpoint_evaluations(spec: RunSpec, evaluation: CheckpointEvaluation) -> list[tuple[Job, int]]:
+    """`evaluation_jobs`, each with its checkpoint [interaction steps]."""
     jobs = []
     for checkpoint in spec.checkpoints if evaluation.every_checkpoint else [spec.steps]:
         for split in evaluation.splits:
@@ -161,7 +170,9 @@ def evaluation_jobs(spec: RunSpec, evaluation: CheckpointEvaluation) -> list[Job
             policy = str(spec.policy(checkpoint))
             command = eval_command(policy, spec.scene, evaluation.suite, split, folder, spec.options, videos)
             command = _with_flags(command, _env_flags(spec.row.flags), _env_flags(spec.options.extra))
-            jobs.append(_eval_job(f"{spec.name}/{folder.name}", command, folder, spec.name))
+            jobs.append(
+                (_eval_job(f"{spec.name}/{folder.name}", command, folder, spec.name, spec.scene), checkpoint)
+            )
     return jobs
 
 
@@ -174,7 +185,7 @@ def base_evaluation_jobs(scene: str, options: Options, evaluation: CheckpointEva
         folder = base_evaluation_folder(scene, evaluation.suite, split, options)
         command = eval_command(base_policy(scene, options), scene, evaluation.suite, split, folder, options)
         command = _with_flags(command, _env_flags(options.extra))
-        jobs.append(_eval_job(f"base/{folder.parent.name}/{folder.name}", command, folder, needed))
+        jobs.append(_eval_job(f"base/{folder.parent.name}/{folder.name}", command, folder, needed, scene))
     return jobs
 
 
@@ -198,6 +209,7 @@ def eval_command(
     return [*command, "--eval.n_episodes=1", "--eval.orderings=1"] if options.scale.smoke else command
 
 
-def _eval_job(name: str, command: list[str], folder: Path, needed: str | None) -> Job:
+def _eval_job(name: str, command: list[str], folder: Path, needed: str | None, scene: str) -> Job:
     # cronos-eval goes on with what it finds in its folder.
-    return Job(name, tuple(command), folder, needs=(needed,) if needed else (), resume=lambda: command)
+    needs = (needed,) if needed else ()
+    return Job(name, tuple(command), folder, needs=needs, resume=lambda: command, environment=gymnasium_id(scene))

@@ -14,9 +14,10 @@ import numpy as np
 
 from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.experiments.definitions import INTERVENTIONS, CheckpointEvaluation, Experiment, Row
-from cronos_lerobot.experiments.jobs import changed_flags, read_record
-from cronos_lerobot.experiments.plan import train_job
-from cronos_lerobot.experiments.specs import Options, RunSpec, base_evaluation_folder, run_specs
+from cronos_lerobot.experiments.jobs import Job, changes, other_commits, status
+from cronos_lerobot.experiments.plan import base_evaluation_jobs, checkpoint_evaluations, train_job
+from cronos_lerobot.experiments.runner import DONE
+from cronos_lerobot.experiments.specs import Options, RunSpec, run_specs
 from cronos_lerobot.protocol.metrics import Gap, Summary, performance_gap, success_at, summarise
 from cronos_lerobot.report.runs import Group, TrainingRun, read_training_run
 from cronos_lerobot.training.logging import METRICS
@@ -45,9 +46,15 @@ class SeedResult:
 
     spec: RunSpec
     run: TrainingRun
-    finished: bool
+    status: str | None
+    """Of its job, see `jobs.status`."""
     evaluations: dict[tuple[str, str], dict[int, dict[str, Any]]] = field(default_factory=dict)
     """What cronos-eval found: by suite and split, then by checkpoint [interaction steps], the base policy at 0."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run came to its end."""
+        return self.status == DONE
 
     def curve(self, split: str, task: str | None = None) -> list[Point]:
         """Success of a task, or of all together, over the run: its own evaluations, or else cronos-eval's."""
@@ -122,7 +129,9 @@ class ExperimentResult:
     options: Options
     rows: list[RowResult]
     changed: list[str]
-    """Runs that were made by another command than the experiment's, which are left out."""
+    """Runs and evaluations that another command or version made, or that cannot be read; they are left out."""
+    commits: list[str] = field(default_factory=list)
+    """Runs that were made at another commit than this one, in the same versions; they count."""
 
     @property
     def tasks(self) -> list[str]:
@@ -136,37 +145,51 @@ class ExperimentResult:
 
 def collect(experiment: Experiment, rows: Iterable[Row], options: Options) -> ExperimentResult:
     """Read every run of an experiment that has written a record."""
-    results, changed = [], []
+    result = ExperimentResult(experiment, options, [], [])
     for row in rows:
-        seeds = []
-        for spec in run_specs(experiment, options, [row]):
-            metrics = spec.train_folder / METRICS
-            if not metrics.is_file() or not metrics.read_bytes().count(b"\n"):
-                continue
-            if flags := _changed(spec):
-                changed.append(f"{spec.name}: {' '.join(flags)}")
-                continue
-            seeds.append(_read_seed(spec, experiment.evaluations))
-        results.append(RowResult(row, seeds, len(options.seeds)))
-    return ExperimentResult(experiment, options, results, changed)
-
-
-def _changed(spec: RunSpec) -> list[str]:
-    return changed_flags(train_job(spec, None))
-
-
-def _read_seed(spec: RunSpec, evaluations: Iterable[CheckpointEvaluation]) -> SeedResult:
-    finished = read_record(train_job(spec, None)).get("status") == "done"
-    result = SeedResult(spec, read_training_run(spec.train_folder), finished)
-    for evaluation in evaluations:
-        for split in evaluation.splits:
-            found = result.evaluations.setdefault((evaluation.suite, split), {})
-            folders = {n: spec.evaluation_folder(evaluation.suite, split, n) for n in spec.checkpoints}
-            folders[0] = base_evaluation_folder(spec.scene, evaluation.suite, split, spec.options)
-            for checkpoint, folder in folders.items():
-                if (folder / RESULTS).is_file():
-                    found[checkpoint] = read_results(folder)[evaluation.suite][split]
+        found = (_read_seed(spec, result) for spec in run_specs(experiment, options, [row]))
+        result.rows.append(RowResult(row, [seed for seed in found if seed], len(options.seeds)))
     return result
+
+
+def _read_seed(spec: RunSpec, result: ExperimentResult) -> SeedResult | None:
+    """What there is of a run; None if that is nothing, or if it is not the experiment's."""
+    job, metrics = train_job(spec, None), spec.train_folder / METRICS
+    if not metrics.is_file() or not metrics.read_bytes().count(b"\n"):
+        return None
+    if found := changes(job):
+        result.changed.append(f"{spec.name}: {'; '.join(found)}")
+        return None
+    try:
+        seed = SeedResult(spec, read_training_run(spec.train_folder), status(job))
+    except ValueError as error:
+        result.changed.append(f"{spec.name}: {error}")
+        return None
+    result.commits += [f"{spec.name}: {commit}" for commit in other_commits(job)]
+    for evaluation in result.experiment.evaluations:
+        for job in base_evaluation_jobs(spec.scene, spec.options, evaluation):
+            _read_evaluation(job, 0, evaluation, seed, result)
+        for job, checkpoint in checkpoint_evaluations(spec, evaluation):
+            _read_evaluation(job, checkpoint, evaluation, seed, result)
+    return seed
+
+
+def _read_evaluation(
+    job: Job, checkpoint: int, evaluation: CheckpointEvaluation, seed: SeedResult, result: ExperimentResult
+) -> None:
+    """Add what an evaluation of a checkpoint, or of the base policy, found on its splits, if it is there."""
+    if not (job.output / RESULTS).is_file():
+        return
+    try:
+        if found := changes(job):
+            raise ValueError("; ".join(found))
+        splits = read_results(job.output)[evaluation.suite]
+    except ValueError as error:
+        text = f"{job.name}: {error}"
+        result.changed += [text] if text not in result.changed else []
+        return
+    for split, numbers in splits.items():
+        seed.evaluations.setdefault((evaluation.suite, split), {})[checkpoint] = numbers
 
 
 def _point(steps: int, interventions: int, record: dict[str, Any], task: str | None) -> Point:

@@ -14,14 +14,27 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol
 
-from cronos_lerobot.experiments.jobs import Job, changed_flags, is_done, lock, read_record, write_record
+from cronos_lerobot.experiments.jobs import (
+    RUNNING,
+    STOPPED,
+    Job,
+    changes,
+    is_done,
+    lock,
+    made_by,
+    read_record,
+    this_commit,
+    write_record,
+)
 
 POLL_S = 0.5
 """How often the running jobs are looked at [s]."""
 GRACE_S = 15.0
 """How long a job may take to end after it was asked to [s]."""
 ELSEWHERE = "is being run by another process: waiting for it"
-DONE, FAILED, CHANGED, BLOCKED, STOPPED = "done", "failed", "changed", "blocked", "stopped"
+DONE, FAILED, CHANGED, BLOCKED = "done", "failed", "changed", "blocked"
+ENDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
+"""Those that end the runner as Ctrl-C does; the second is a closed terminal's."""
 
 
 class Display(Protocol):
@@ -45,8 +58,8 @@ class _Child:
 class Runner:
     """Runs jobs whose needs are done, at most `parallel` at a time.
 
-    Jobs that are done are skipped, unfinished ones resumed, those that were made by another command left alone and
-    reported. What needs a job that is not done is blocked; everything else goes on.
+    Jobs that are done are skipped, unfinished ones resumed, those that were made by another command or
+    version left alone and reported. What needs a job that is not done is blocked; everything else goes on.
 
     Args:
         jobs: each name once; needs come before those who need them.
@@ -74,9 +87,10 @@ class Runner:
         """Run until nothing can run any more; returns the state of every job by name.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C or SIGTERM; the running jobs have been stopped and can be resumed.
+            KeyboardInterrupt: Ctrl-C, SIGTERM or a closed terminal; the running jobs have been stopped and can be
+                resumed.
         """
-        previous = _raise_on_sigterm()
+        previous = _raise_on_signals()
         try:
             for job in self.jobs.values():
                 self._look_up(job)
@@ -87,13 +101,13 @@ class Runner:
                 time.sleep(POLL_S)
         finally:
             self._stop()
-            if previous is not None:
-                signal.signal(signal.SIGTERM, previous)
+            for number, handler in previous.items():
+                signal.signal(number, handler)
         self.display.update(self.states, [])
         return self.states
 
     def _look_up(self, job: Job) -> None:
-        if changed_flags(job):
+        if changes(job):
             self._finish(job, CHANGED)
         elif is_done(job):
             self.states[job.name] = DONE
@@ -128,8 +142,9 @@ class Runner:
             gone = [name for name, state in self.states.items() if state == DONE and not is_done(self.jobs[name])]
             for name in gone:
                 del self.states[name]
-            record = {"command": list(job.command), "seconds": 0.0, "starts": 0}
-        record |= {"status": "running", "starts": record["starts"] + 1}
+            record = {"command": list(job.command), "seconds": 0.0, "starts": 0, "made_by": made_by(job)}
+        commits = [*record.get("commits", []), *filter(None, [this_commit()])]
+        record |= {"status": RUNNING, "starts": record["starts"] + 1, "commits": list(dict.fromkeys(commits))}
         write_record(job, record)
         command = resumed or list(job.command)
         # A session of its own: Ctrl-C reaches us alone, and we stop it and whatever it has started.
@@ -173,8 +188,11 @@ class Runner:
             deadline = time.monotonic() + GRACE_S
             while any(child.process.poll() is None for child in self._children) and time.monotonic() < deadline:
                 time.sleep(0.05)
-        for child in list(self._children):
+        stopped = list(self._children)
+        for child in stopped:
             self._end(child, STOPPED, {"returncode": child.process.wait()})
+        # A terminal that is gone cannot be written to: the notes come first.
+        for child in stopped:
             self.display.event(child.job, STOPPED)
 
 
@@ -189,12 +207,16 @@ def _program(name: str) -> str:
     return sys.executable if name == "python" else str(Path(sys.executable).with_name(name))
 
 
-def _raise_on_sigterm() -> Any:
-    """Let SIGTERM end this process as Ctrl-C does; returns the handler before."""
+def _raise_on_signals() -> dict[signal.Signals, Any]:
+    """Let ENDING_SIGNALS end this process as Ctrl-C does; returns the handlers before."""
     if threading.current_thread() is not threading.main_thread():
-        return None
+        return {}
 
     def interrupt(number: int, frame: FrameType | None) -> None:
+        # A closing terminal sends it more than once; the children are to be stopped in peace.
+        signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    return signal.signal(signal.SIGTERM, interrupt)
+    # nohup has SIGHUP ignored, and means it.
+    caught = [number for number in ENDING_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+    return {number: signal.signal(number, interrupt) for number in caught}

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Experiment, Row, find_rows
 from cronos_lerobot.experiments.display import make_display
-from cronos_lerobot.experiments.jobs import Job, changed_flags, is_done
+from cronos_lerobot.experiments.jobs import RUNNING, Job, changes, is_done, other_commits, status
 from cronos_lerobot.experiments.runner import DONE, Runner
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
 from cronos_lerobot.scripts.pipeline import command_line
@@ -224,10 +224,16 @@ def print_plan(jobs: list[Job]) -> None:
     """Print every command, those that are done as comments."""
     for job in jobs:
         if is_done(job):
-            print(f"# {job.name}: done ({job.output})")
+            commits = "".join(f", made at commit {commit}" for commit in other_commits(job))
+            print(f"# {job.name}: done ({job.output}){commits}")
             continue
-        if flags := changed_flags(job):
-            print(f"# {job.name}: NOT REUSED, made by another command ({job.output}): {' '.join(flags)}")
+        if found := changes(job):
+            print(
+                f"# {job.name}: NOT REUSED, made by another command or version ({job.output}): {'; '.join(found)}"
+            )
+            continue
+        if status(job) == RUNNING:
+            print(f"# {job.name}: is being run by another process")
             continue
         resumed = job.resume() if job.output.exists() else None
         print(f"# {job.name}{': goes on' if resumed else ''}")

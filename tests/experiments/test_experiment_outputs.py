@@ -13,7 +13,7 @@ from synthetic_runs import INSTRUCTIONS, write_training_run
 
 from cronos_lerobot.experiments import plots, tables
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, LONG, SHORT
-from cronos_lerobot.experiments.jobs import write_record
+from cronos_lerobot.experiments.jobs import made_by, write_record
 from cronos_lerobot.experiments.outputs import write_outputs
 from cronos_lerobot.experiments.plan import train_job
 from cronos_lerobot.experiments.results import collect
@@ -40,7 +40,8 @@ def make_run(options, name, row, seed, successes, status="done", updates=8):
         spec.train_folder, seed=seed, interval=spec.row.interval, successes=successes, updates=updates
     )
     job = train_job(spec, None)
-    write_record(job, {"command": list(job.command), "status": status, "seconds": 1.0, "starts": 1})
+    record = {"command": list(job.command), "status": status, "seconds": 1.0, "starts": 1}
+    write_record(job, record | {"made_by": made_by(job)})
     return spec
 
 
@@ -166,6 +167,19 @@ def test_run_of_another_command_is_named_and_left_out(options):
     assert "+--algorithm.target_kl=0.02" in text
     row = by_row(tables.main_rows(result))["t80"]
     assert (row["seeds"], row["success_train_mean"]) == (0, None)
+
+
+def test_results_of_version_0_are_named_and_left_out(options):
+    spec = make_run(options, "figure4", "t80", 1, (2, 4, 6))
+    folder = spec.evaluation_folder("independent", "held_out", 10_240)
+    write_results(folder, "independent", "held_out", evaluation(0.5))
+    old = {"format": 1, "benchmark": {"environment": "lerobot_env_cronos/kitchen_2x2-v0"}}
+    (folder / "results.json").write_text(json.dumps(old))
+    result = results(options, "figure4")
+    (text,) = result.changed
+    assert "kitchen_2x2-v0; this is version 1" in text
+    row = by_row(tables.main_rows(result))["t80"]
+    assert (row["success_train_mean"], row["success_held_out_mean"]) == (0.75, None)
 
 
 def test_run_that_its_reset_budget_ended_early_counts(options):

@@ -9,12 +9,24 @@ import subprocess
 import sys
 import textwrap
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from cronos_lerobot.experiments.display import LineDisplay
-from cronos_lerobot.experiments.jobs import Job, Progress, changed_flags, is_done, lock, read_record
+from cronos_lerobot.experiments.jobs import (
+    Job,
+    Progress,
+    changed_flags,
+    changes,
+    is_done,
+    lock,
+    made_by,
+    other_commits,
+    read_record,
+    status,
+)
 from cronos_lerobot.experiments.runner import Runner
 
 
@@ -171,6 +183,50 @@ def test_job_of_another_process_is_waited_for(tmp_path):
     assert release.wait() == 0
 
 
+@pytest.mark.parametrize("text", ["", '{"command": ["pyth', "[]", '{"status": "done"}'])
+def test_damaged_note_is_said_and_nothing_is_deleted_for_it(tmp_path, text, capsys):
+    job = count_job(tmp_path, "a")
+    run([job])
+    job.record.write_text(text)
+    assert (read_record(job), status(job), is_done(job)) == ({}, None, False)
+    assert Runner([job], 1, LineDisplay([])).run() == {"a": "changed"}
+    assert f"{job.record} is damaged" in capsys.readouterr().out
+    assert (tmp_path / "a/n").read_text() == "x"
+    # Without an output it is as if the job had not been started.
+    shutil.rmtree(tmp_path / "a")
+    assert run([job])[0] == {"a": "done"}
+    assert (status(job), (tmp_path / "a/n").read_text()) == ("done", "x")
+
+
+def test_output_of_another_version_is_not_taken_for_done(tmp_path, monkeypatch, capsys):
+    job = count_job(tmp_path, "a", environment="lerobot_env_cronos/kitchen_2x2-v1")
+    run([job])
+    assert is_done(job)
+    here = made_by(job)
+    monkeypatch.setattr("cronos_lerobot.experiments.jobs.this_version", lambda: here | {"mujoco": "99.0"})
+    newer = replace(job, environment="lerobot_env_cronos/kitchen_2x2-v7")
+    mujoco = f"mujoco {here['mujoco']} there, 99.0 here"
+    assert changes(job) == [mujoco]
+    assert changes(newer) == [mujoco, f"environment {job.environment} there, {newer.environment} here"]
+    assert Runner([job], 1, LineDisplay([])).run() == {"a": "changed"}
+    out = capsys.readouterr().out
+    assert mujoco in out
+    assert "Delete it, choose another --root, or go back" in out
+    # A note of version 0 has no versions at all.
+    record = read_record(job)
+    del record["made_by"]
+    job.record.write_text(json.dumps(record))
+    assert changes(job) == ["its note does not say which versions made it, as those of version 0"]
+
+
+def test_another_commit_alone_is_only_noted(tmp_path, monkeypatch):
+    monkeypatch.setattr("cronos_lerobot.experiments.runner.this_commit", lambda: "0123abc")
+    job = count_job(tmp_path, "a")
+    run([job])
+    monkeypatch.setattr("cronos_lerobot.experiments.jobs.this_commit", lambda: "4567def")
+    assert (is_done(job), other_commits(job)) == (True, ["0123abc"])
+
+
 def test_two_jobs_of_one_name(tmp_path):
     with pytest.raises(ValueError, match="same name"):
         Runner([count_job(tmp_path, "a"), count_job(tmp_path, "a")], 1, Tape())
@@ -194,12 +250,15 @@ except KeyboardInterrupt:
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_stop_the_children_and_theirs(tmp_path, number):
-    # Some shells start background commands with SIGINT ignored; the test wants it as a terminal has it.
+    def as_a_terminal_has_it():
+        # Some shells start background commands with SIGINT ignored, nohup with SIGHUP.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
     process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(RUNNER), str(tmp_path)],
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        [sys.executable, "-c", textwrap.dedent(RUNNER), str(tmp_path)], preexec_fn=as_a_terminal_has_it
     )
     pid = tmp_path / "a/pid"
     deadline = time.monotonic() + 60
@@ -224,6 +283,7 @@ def test_child_of_a_killed_runner_keeps_its_claim(tmp_path):
     job = Job("a", ("python",), tmp_path / "a")
     try:
         assert lock(job) is None
+        assert status(job) == "running"
     finally:
         # The child leads a group of its own, its `sleep` is in it.
         os.killpg(os.getpgid(int(pid.read_text())), signal.SIGKILL)
@@ -232,6 +292,8 @@ def test_child_of_a_killed_runner_keeps_its_claim(tmp_path):
         time.sleep(0.05)
     assert claim is not None
     os.close(claim)
+    # The note still says that it runs, but nobody has the claim.
+    assert (read_record(job)["status"], status(job)) == ("running", "stopped")
 
 
 def _raise_if_gone(pid):
