@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import sys
 from argparse import ArgumentError
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager, redirect_stderr
+from pathlib import Path
 from typing import Any, NoReturn
 
 from draccus.utils import ParsingError
@@ -47,18 +48,26 @@ def reason(error: Exception | str) -> str:
     return text or type(error).__name__
 
 
-def parse_command_line(config_class: type[Any]) -> Any:
+def parse_command_line(config_class: type[Any], types: Mapping[str, str] | None = None) -> Any:
     """Return the config that the command line describes, read as `lerobot-train` reads it.
 
     `--<field>.path`, `--config_path` and `--<field>.discover_packages_path` are understood. An unknown flag ends
     the program with status 2 and one line. Errors are those of USER_ERRORS, so it stands within `error_line`.
+
+    Args:
+        config_class: of the config.
+        types: types of choice fields by name, for a command line that sets their fields without `--<field>.type`.
     """
 
     def keep(config: Any) -> Any:
         return config
 
     keep.__annotations__["config"] = config_class
-    said = io.StringIO()
+    given, said = sys.argv, io.StringIO()
+    config_path = parser.parse_arg("config_path", given[1:])
+    if config_path is not None and not Path(config_path).exists():
+        raise FileNotFoundError(f"--config_path={config_path}: no such file or folder")
+    sys.argv = [*given, *_missing_types(given, types or {})]
     try:
         with redirect_stderr(said):
             config = parser.wrap()(keep)()  # ty: ignore[missing-argument]  (it reads the command line)
@@ -76,5 +85,16 @@ def parse_command_line(config_class: type[Any]) -> Any:
     except BaseException:
         sys.stderr.write(said.getvalue())
         raise
+    finally:
+        sys.argv = given
     sys.stderr.write(said.getvalue())
     return config
+
+
+def _missing_types(arguments: list[str], types: Mapping[str, str]) -> list[str]:
+    """draccus wants the type of a choice whenever one of its fields is set; its help says what they are."""
+    asks = "--help" in arguments or "-h" in arguments
+    if parser.parse_arg("config_path", arguments) is not None:
+        return []
+    fields = [field for field in types if asks or any(a.startswith(f"--{field}.") for a in arguments)]
+    return [f"--{field}.type={types[field]}" for field in fields if parser.get_type_arg(field, arguments) is None]

@@ -3,7 +3,8 @@
 checkpoints/
   0102400/
     pretrained_model/   config.json, model.safetensors, processors, train_config.json: what LeRobot loads
-    training_state/     optimizer, RNGs, loop.json, env_state.npz, observers.pt, training_step.json
+    training_state/     optimizer, RNGs, loop.json, env_state.npz, observers.pt, training_step.json, run.json;
+                        rollout.pt if a budget ended the run between two updates
   last -> 0102400
 
 Of a run on many processes it holds the streams and random numbers of all of them, written by the first one.
@@ -16,10 +17,13 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -28,23 +32,32 @@ from lerobot.optim import load_optimizer_state, save_optimizer_state
 from lerobot.utils.constants import (
     CHECKPOINTS_DIR,
     LAST_CHECKPOINT_LINK,
+    OPTIMIZER_STATE,
     PRETRAINED_MODEL_DIR,
     TRAINING_STATE_DIR,
 )
 from lerobot.utils.random_utils import deserialize_rng_state, load_rng_state, save_rng_state, serialize_rng_state
 from lerobot.utils.utils import flatten_dict, unflatten_dict
+from safetensors import SafetensorError
 from safetensors.torch import load_file, load_model, save_file
 
 from cronos_lerobot.agents.ppo.ppo import PPO
+from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
 from cronos_lerobot.processes import Processes
 from cronos_lerobot.protocol.loop_state import LoopState
 from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.resume import RUN, check_resumed, describe_run, set_optimizer
 from cronos_lerobot.training.seeding import NamedGenerators
+
+DAMAGE = (ValueError, RuntimeError, KeyError, EOFError, BadZipFile, UnpicklingError, SafetensorError)
+"""What the readers of the files raise for a truncated one."""
 
 BASE_POLICY = "base_policy.safetensors"
 ENV_STATE = "env_state.npz"
 LOOP = "loop.json"
 OBSERVERS = "observers.pt"
+ROLLOUT = "rollout.pt"
+"""Transitions that no update has learned from yet."""
 PROCESS_RNG = "rng_state_process_{rank}.safetensors"
 """State of Python's, NumPy's and PyTorch's own generators of the processes after the first."""
 PARTIAL = ".partial_"
@@ -56,6 +69,7 @@ class RunState:
     """What a run is made of, beside its config."""
 
     ppo: PPO
+    buffer: RolloutBuffer
     loop: LoopState
     generators: NamedGenerators
     env: Any
@@ -82,6 +96,7 @@ def save_checkpoint(
     folder = Path(config.output_dir) / CHECKPOINTS_DIR
     final = folder / get_step_identifier(run.loop.n, config.total_steps)
     generators = _merge(run.processes.gather(run.generators.state_dict()))
+    rollout = _join(run.buffer.state_dict(), run.processes)
     other_rngs = run.processes.gather(serialize_rng_state())[1:]
     if not run.processes.is_main:
         return final
@@ -90,9 +105,13 @@ def save_checkpoint(
     partial = Path(tempfile.mkdtemp(prefix=PARTIAL, dir=folder))
     try:
         _write_model(run, config, partial / PRETRAINED_MODEL_DIR)
-        _write_training_state(run, partial / TRAINING_STATE_DIR, observers, env_state, generators)
+        state_dir = partial / TRAINING_STATE_DIR
+        _write_training_state(run, state_dir, observers, env_state, generators)
+        _save_tensors(rollout, state_dir / ROLLOUT)
+        about = describe_run(config, run.loop.n, run.loop.b)
+        (state_dir / RUN).write_text(json.dumps(about, indent=2))
         for rank, rng in enumerate(other_rngs, start=1):
-            save_file(flatten_dict(rng), partial / TRAINING_STATE_DIR / PROCESS_RNG.format(rank=rank))
+            save_file(flatten_dict(rng), state_dir / PROCESS_RNG.format(rank=rank))
         partial.chmod(0o755)
         _flush_to_disk(partial)
         if final.exists():
@@ -109,34 +128,33 @@ def save_checkpoint(
     return final
 
 
-def load_checkpoint(run: RunState, folder: Path) -> dict[str, Any]:
-    """Bring `run` to where `save_checkpoint` found it; returns the observers' states.
+def load_checkpoint(run: RunState, config: CronosTrainConfig, folder: Path) -> dict[str, Any]:
+    """Bring `run` to where it was saved, but for what `config` changes; returns the observers' states.
 
     Raises:
         NotADirectoryError: `folder` is no checkpoint of a run.
-        ValueError: the run has another number of streams or tasks.
+        ValueError: `config` has what a resumed run refuses, or a file is damaged; it is named.
     """
+    about = check_resumed(config, folder)
     state_dir = folder / TRAINING_STATE_DIR
-    if not state_dir.is_dir():
-        raise NotADirectoryError(f"{folder} is no checkpoint of a run: it has no {TRAINING_STATE_DIR}.")
-    state = json.loads((state_dir / LOOP).read_text())
-    for name in ("num_streams", "num_tasks", "num_reset_tasks"):
-        if state["loop"][name] != getattr(run.loop, name):
-            raise ValueError(
-                f"The checkpoint has {name}={state['loop'][name]}, this run {getattr(run.loop, name)}."
-            )
+    with _reading(state_dir / LOOP) as path:
+        state = json.loads(path.read_text())
     _warn_of_other_count(folder, run.processes)
-    load_model(run.ppo.policy, str(folder / PRETRAINED_MODEL_DIR / "model.safetensors"))
-    load_optimizer_state(run.ppo.optimizer, state_dir)
+    with _reading(folder / PRETRAINED_MODEL_DIR / "model.safetensors") as path:
+        load_model(run.ppo.policy, str(path))
+    with _reading(state_dir / OPTIMIZER_STATE):
+        load_optimizer_state(run.ppo.optimizer, state_dir)
+    set_optimizer(run.ppo.optimizer, config, about)
     if run.ppo.base_policy is not None:
         run.ppo.base_policy.load(load_file(state_dir / BASE_POLICY))
     run.ppo.num_updates = state["num_updates"]
     run.loop.__dict__.update(vars(LoopState.from_state_dict(state["loop"])))
     run.generators.load_state_dict(state["generators"])
-    with np.load(state_dir / ENV_STATE) as arrays:
+    with _reading(state_dir / ENV_STATE) as path, np.load(path) as arrays:
         run.env.set_state(dict(arrays))
+    run.buffer.load_state_dict(_load_tensors(state_dir / ROLLOUT), run.processes.share_of(run.loop.num_streams))
     _load_rng_state(state_dir, run.processes.rank)
-    return _map_leaves(torch.load(state_dir / OBSERVERS), torch.Tensor, lambda tensor: tensor.numpy())
+    return _load_tensors(state_dir / OBSERVERS)
 
 
 def list_checkpoints(folder: Path) -> list[Path]:
@@ -165,14 +183,42 @@ def _write_training_state(
     if run.ppo.base_policy is not None:
         save_file(run.ppo.base_policy.parameters, folder / BASE_POLICY)
     np.savez(folder / ENV_STATE, allow_pickle=False, **env_state)
-    # As tensors, which torch reads back without executing anything.
-    torch.save(_map_leaves(observers, np.ndarray, torch.from_numpy), folder / OBSERVERS)
+    _save_tensors(observers, folder / OBSERVERS)
     state = {
         "loop": run.loop.state_dict(),
         "num_updates": run.ppo.num_updates,
         "generators": generators,
     }
     (folder / LOOP).write_text(json.dumps(state))
+
+
+def _save_tensors(tree: dict[str, Any], path: Path) -> None:
+    """Write nested dicts with arrays: as tensors, which torch reads back without executing anything."""
+    torch.save(_map_leaves(tree, np.ndarray, torch.from_numpy), path)
+
+
+def _load_tensors(path: Path) -> dict[str, Any]:
+    with _reading(path):
+        return _map_leaves(torch.load(path), torch.Tensor, lambda tensor: tensor.numpy())
+
+
+@contextmanager
+def _reading(path: Path) -> Generator[Path]:
+    """Name the file that cannot be read."""
+    try:
+        yield path
+    except DAMAGE as error:
+        raise ValueError(f"{path} is damaged, or is of another policy: {error}") from error
+
+
+def _join(rollout: dict[str, Any], processes: Processes) -> dict[str, Any]:
+    """The rollouts of all processes as one, in the first of them; they number instructions each in its own way."""
+    if not rollout:
+        return {}
+    texts = sorted(set().union(*processes.gather(rollout["instructions"])))
+    numbers = np.array([texts.index(text) for text in rollout["instructions"]])
+    rollout = rollout | {"instruction_ids": numbers[rollout["instruction_ids"]]}
+    return _map_leaves(rollout, np.ndarray, processes.collect) | {"instructions": texts}
 
 
 def _merge(states: list[dict[str, Any]]) -> dict[str, Any]:

@@ -10,13 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import WandBConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.datasets.utils import INFO_PATH
 from lerobot.envs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
-from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import OBS_ENV_STATE, PRETRAINED_MODEL_DIR
+from lerobot_env_cronos import CronosEnvConfig, load_benchmark
 from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
 
 from cronos_lerobot.agents.ppo.config import PPOConfig
@@ -24,6 +26,7 @@ from cronos_lerobot.data.writer import FLUSH_INTERVAL_S
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.resets import check_extra_resets
 from cronos_lerobot.protocol.task_orders import check_task_order
+from cronos_lerobot.training.resume import check_resumed, check_types
 
 
 @dataclass
@@ -115,6 +118,8 @@ class PeriodicEvaluationConfig:
             raise ValueError(f"eval.temperature must be >= 0, got {self.temperature}.")
         if self.batch_size < 1:
             raise ValueError(f"eval.batch_size must be >= 1, got {self.batch_size}.")
+        if self.seed < 0:
+            raise ValueError(f"eval.seed must be >= 0, got {self.seed}.")
 
 
 @dataclass
@@ -170,11 +175,12 @@ class CronosTrainConfig:
         for name in ("steps", "num_envs", "log_freq"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be >= 1, got {getattr(self, name)}.")
-        for name in ("eval_freq", "save_freq"):
+        for name in ("eval_freq", "save_freq", "seed"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}.")
-        if self.keep_checkpoints is not None and self.keep_checkpoints < 1:
-            raise ValueError(f"keep_checkpoints must be >= 1 or null, got {self.keep_checkpoints}.")
+        for name in ("keep_checkpoints", "torch_threads"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise ValueError(f"{name} must be >= 1 or null, got {value}.")
         check_task_order(self.protocol.task_order)
         check_extra_resets(self.protocol.extra_resets)
 
@@ -195,24 +201,42 @@ class CronosTrainConfig:
             ValueError: the policy, the environment or, when resuming, the checkpoint is missing.
             OSError: the output folder exists and the run is not a resumed one, or recording would fail.
         """
-        if self.env is None:
-            raise ValueError("Choose an environment: --env.type=cronos --env.scene=kitchen_2x2.")
-        if not isinstance(self.algorithm, PPOConfig):
-            raise ValueError(f"--algorithm.type must be ppo or ppo_paper, got {self.algorithm.type!r}.")
         if self.resume:
             self._resolve_checkpoint()
-        elif path := parser.get_path_arg("policy"):
+        if self.env is None:
+            raise ValueError("Choose an environment: --env.type=cronos --env.scene=kitchen_2x2.")
+        if not isinstance(self.env, CronosEnvConfig):
+            raise ValueError(f"--env.type must be cronos to train in, got {self.env.type!r}.")
+        if not isinstance(self.algorithm, PPOConfig):
+            raise ValueError(f"--algorithm.type must be ppo or ppo_paper, got {self.algorithm.type!r}.")
+        self._pin_benchmark(self.env)
+        if not self.resume and (path := parser.get_path_arg("policy")):
             overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
-            self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
-            self.policy.pretrained_path = Path(path)
+            self.policy = load_policy_config(path, overrides)
         if self.policy is None:
             raise ValueError("Choose a policy: --policy.path=<checkpoint or Hub id>, or --policy.type=<name>.")
+        self._show_what_the_policy_reads(self.env, self.policy)
         self.job_name = self.job_name or f"{self.env.type}_{self.policy.type}"
         if self.output_dir is None:
             self.output_dir = Path("outputs/train") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_{self.job_name}"
         if not self.resume and Path(self.output_dir).exists():
             raise FileExistsError(f"{self.output_dir} exists; choose another --output_dir or --resume=true.")
+        if self.checkpoint_path is not None:
+            check_resumed(self, self.checkpoint_path)
         self.record.check(Path(self.output_dir), self.num_envs, resume=self.resume)
+
+    @staticmethod
+    def _pin_benchmark(env: CronosEnvConfig) -> None:
+        """A benchmark of the Hub stays what it was when the run began."""
+        if env.benchmark is not None and not Path(env.benchmark).is_dir():
+            env.benchmark = load_benchmark(env.benchmark, env.scene).source
+
+    @staticmethod
+    def _show_what_the_policy_reads(env: CronosEnvConfig, policy: PreTrainedConfig) -> None:
+        """A policy that reads the privileged state (a critic may) is shown it."""
+        if OBS_ENV_STATE in (policy.input_features or {}) and OBS_ENV_STATE not in env.features_map.values():
+            env.privileged_state = True
+            env.__post_init__()
 
     def _resolve_checkpoint(self) -> None:
         given = parser.parse_arg("config_path")
@@ -221,8 +245,15 @@ class CronosTrainConfig:
                 f"Resuming needs --config_path=<run>/checkpoints/last/{PRETRAINED_MODEL_DIR}/{TRAIN_CONFIG_NAME}."
             )
         if given is not None:
-            folder = Path(given) if Path(given).is_dir() else Path(given).parent
-            self.checkpoint_path = folder.resolve().parent
+            self.checkpoint_path = _checkpoint_of(given)
+            run_folder = self.checkpoint_path.parents[1]
+            output_dir = parser.parse_arg("output_dir")
+            if output_dir is not None and Path(output_dir).resolve() != run_folder:
+                raise ValueError(
+                    f"--output_dir={output_dir}, but the run that is resumed is {run_folder}, and stays there."
+                )
+            if self.output_dir is None or Path(self.output_dir).resolve() != run_folder:
+                self.output_dir = run_folder
         assert self.checkpoint_path is not None
         if self.policy is not None:
             self.policy.pretrained_path = self.checkpoint_path / PRETRAINED_MODEL_DIR
@@ -242,6 +273,8 @@ class CronosTrainConfig:
         file = Path(path) / TRAIN_CONFIG_NAME if Path(path).is_dir() else Path(path)
         if not file.is_file():
             raise FileNotFoundError(f"No training config at {file}.")
+        if parser.parse_arg("resume", cli_args or []) == "true":
+            check_types(_checkpoint_of(file), cli_args or [])
         with draccus.config_type("json" if file.suffix == ".json" else "yaml"):
             return draccus.parse(cls, file, args=cli_args or [])
 
@@ -258,3 +291,30 @@ class CronosTrainConfig:
     # What lerobot's WandBLogger asks of a training config.
     is_reward_model_training = False
     dataset = None
+
+
+def load_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
+    """Return the config of the policy that `--policy.path` names.
+
+    Raises:
+        ValueError: there is no such folder or repository, or what it has is damaged.
+    """
+    folder = Path(path)
+    if folder.is_dir() and not (folder / CONFIG_NAME).is_file():
+        raise ValueError(f"--policy.path={path} has no {CONFIG_NAME}: give a checkpoint's pretrained_model.")
+    try:
+        config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    except (json.JSONDecodeError, draccus.ParsingError) as error:
+        raise ValueError(f"{folder / CONFIG_NAME} is damaged, or --policy.* does not fit it: {error}") from error
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            f"--policy.path={path}: no such folder, and no such policy on the Hub ({type(error).__name__})."
+        ) from error
+    config.pretrained_path = folder
+    return config
+
+
+def _checkpoint_of(config_path: str | Path) -> Path:
+    """The checkpoint that a train_config.json, or the folder it lies in, belongs to."""
+    path = Path(config_path)
+    return (path if path.is_dir() else path.parent).resolve().parent

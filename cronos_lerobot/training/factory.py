@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 from typing import Any
 
+from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
+from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.policies import make_policy, make_pre_post_processors
-from lerobot.utils.constants import OBS_ENV_STATE
+from lerobot.utils.constants import ACTION
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, SequentialVectorEnv, get_scene
+from safetensors import SafetensorError
 
 from cronos_lerobot.agents.base import check_trainable
 from cronos_lerobot.evaluation.policy_env import check_task_observation
@@ -66,25 +70,54 @@ def _env_options(env_config: CronosEnvConfig, local_processes: int) -> dict[str,
 def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any]:
     """Return the config's policy on its device, its preprocessor and its postprocessor.
 
-    A policy that reads the privileged state (a critic may) turns it on in the environment.
+    Raises:
+        ValueError: the policy cannot be trained by reinforcement, was made for other observations or actions, or
+            its files are damaged.
+    """
+    policy_config, env_config = config.policy, _cronos(config)
+    assert policy_config is not None
+    check_task_observation(policy_config, env_config)
+    check_features(policy_config, env_config)
+    path = policy_config.pretrained_path
+    if not (path or getattr(policy_config, "checkpoint", None)):
+        logging.warning("Training a policy from scratch: its states are not normalised, its success starts at 0.")
+    try:
+        policy = make_policy(policy_config, env_cfg=env_config)
+        _check_trainable(policy)
+        if path is None:
+            return policy, *make_pre_post_processors(policy_config)
+        # Like lerobot-train: the checkpoint's processors, on the device of this run.
+        device = {"device_processor": {"device": policy_config.device}}
+        return policy, *make_pre_post_processors(policy_config, str(path), preprocessor_overrides=device)
+    except SafetensorError as error:
+        raise ValueError(f"{path}/{SAFETENSORS_SINGLE_FILE} or a processor's file is damaged: {error}") from error
+    except json.JSONDecodeError as error:
+        raise ValueError(f"a configuration of a processor in {path} is damaged: {error}") from error
+
+
+def _check_trainable(policy: Any) -> None:
+    try:
+        check_trainable(policy)
+    except TypeError as error:
+        raise ValueError(str(error)) from error
+
+
+def check_features(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
+    """Check that the environment shows what the policy reads and takes the actions that it gives.
 
     Raises:
-        TypeError: the policy cannot be trained by reinforcement.
+        ValueError: it does not; the message names the feature, both sizes, and the flag that may be wrong.
     """
-    policy_config, env_config = config.policy, config.env
-    assert policy_config is not None
-    assert isinstance(env_config, CronosEnvConfig)
-    if OBS_ENV_STATE in (policy_config.input_features or {}) and not env_config.privileged_state:
-        env_config.privileged_state = True
-        env_config.__post_init__()
-    check_task_observation(policy_config, env_config)
-    if not (policy_config.pretrained_path or getattr(policy_config, "checkpoint", None)):
-        logging.warning("Training a policy from scratch: its states are not normalised, its success starts at 0.")
-    policy = make_policy(policy_config, env_cfg=env_config)
-    check_trainable(policy)
-    path = policy_config.pretrained_path
-    if path is None:
-        return policy, *make_pre_post_processors(policy_config)
-    # Like lerobot-train: the checkpoint's processors, on the device of this run.
-    device = {"device_processor": {"device": policy_config.device}}
-    return policy, *make_pre_post_processors(policy_config, str(path), preprocessor_overrides=device)
+    shown = {env.features_map[name]: feature for name, feature in env.features.items()}
+    for name, feature in ((policy.input_features or {}) | (policy.output_features or {})).items():
+        if name not in shown:
+            raise ValueError(
+                f"the policy reads {name}, which is not shown with --env.obs_type={env.obs_type} and "
+                f"--env.camera_name={env.camera_name}; that shows {sorted(shown.keys() - {ACTION})}."
+            )
+        size, own = feature.shape, shown[name].shape
+        if feature.type is not FeatureType.VISUAL and tuple(size) != tuple(own):
+            raise ValueError(
+                f"the policy was made for {name} of {size[0]} numbers, {env.scene} has {own[0]}: it is of another "
+                "scene, robot or --env.task_observation."
+            )

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from cronos_lerobot.protocol.loop_state import LoopState
 from cronos_lerobot.provenance import git_commit, package_versions
 from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.resume import describe_environment
 from cronos_lerobot.training.rollout import Count
 
 METRICS = "metrics.jsonl"
@@ -28,10 +29,19 @@ class MetricsFile:
     Args:
         path: of the file; made if it is not there.
         offset: bytes to keep of an existing file, those that a checkpoint knows of; None keeps nothing.
+
+    Raises:
+        ValueError: the file has fewer bytes than that, or is gone.
     """
 
     def __init__(self, path: Path, offset: int | None = None) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
+        size = path.stat().st_size if path.is_file() else 0
+        if size < (offset or 0):
+            raise ValueError(
+                f"{path} has {size} bytes, {offset} when the checkpoint was made: it was cut or replaced. Put it "
+                "back, or begin a new run with the checkpoint as --policy.path."
+            )
         self._file = path.open("ab")
         self._file.truncate(offset or 0)
         self._file.seek(0, os.SEEK_END)
@@ -162,7 +172,7 @@ def write_manifest(config: CronosTrainConfig, num_processes: int = 1) -> None:
     assert config.output_dir is not None
     path = Path(config.output_dir) / MANIFEST
     path.parent.mkdir(parents=True, exist_ok=True)
-    starts = json.loads(path.read_text())["starts"] if path.exists() else []
+    starts = read_starts(path) if path.exists() else []
     start = {
         "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "seed": config.seed,
@@ -174,8 +184,30 @@ def write_manifest(config: CronosTrainConfig, num_processes: int = 1) -> None:
         "renderer": os.environ.get("MUJOCO_GL"),
         "policy_device": config.policy.device if config.policy else None,
         "config": config.to_dict(),
-    }
-    path.write_text(json.dumps({"starts": [*starts, start]}, indent=2))
+    } | describe_environment(config.env)
+    write_whole(path, json.dumps({"starts": [*starts, start]}, indent=2))
+
+
+def read_starts(path: Path) -> list[dict[str, Any]]:
+    """Read the starts of a run from its manifest.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    try:
+        return json.loads(path.read_text())["starts"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file so that a kill leaves the old one or the new one, on disk once this returns."""
+    partial = path.with_name(f".{path.name}.partial")
+    with partial.open("w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
 
 
 def _jsonable(value: Any) -> Any:

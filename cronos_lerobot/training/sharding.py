@@ -131,12 +131,16 @@ class ShardedEnv:
             return self._processes.concatenate(array)
 
 
-def whole_step(step: Step, processes: Processes) -> Step:
-    """Return `step` with the observations and actions of all N streams in the first process, which records it.
+def whole_step(step: Step, processes: Processes, num_recorded: int) -> Step:
+    """Return `step` with the observations and actions of the recorded streams in the first process.
 
-    Films are that process's own.
+    Those are the first `num_recorded` of all N. If they are the first process's own, no observations are sent: the
+    step has that process's only. Films are always its own.
     """
+    own = len(step.action.action)
     action = ActionSample(**{name: processes.collect(array) for name, array in vars(step.action).items()})
+    if num_recorded <= own:
+        return replace(step, action=action)
     seen = {name: value for name, value in step.observation.items() if name != FILM}
     observation = step.observation | _map_arrays(seen, processes.collect)
     return replace(step, observation=observation, action=action)

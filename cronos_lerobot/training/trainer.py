@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -78,8 +79,11 @@ class Trainer:
         self.agent = PPOAgent(ppo, buffer, actions, self.stopwatch, mine)
         self.loop = self.task_set.new_loop(config.num_envs)
         self._last_evaluation = 0
+        recorded = config.record.num_streams
+        self._num_recorded = config.num_envs if isinstance(recorded, str) else recorded
+        self._observers: dict[str, Any] = {}
         self.run_state = RunState(
-            ppo, self.loop, self.generators, self.env, preprocessor, postprocessor, self.processes
+            ppo, buffer, self.loop, self.generators, self.env, preprocessor, postprocessor, self.processes
         )
         self.statistics = RolloutStatistics([t.instruction for t in self.task_set.all], len(self.task_set.tasks))
         self._smoothed = SmoothedSuccess(config.protocol, len(self.task_set.tasks))
@@ -88,13 +92,29 @@ class Trainer:
         task_rng = self.generators.for_numpy("task_order")
         self._task_order = make_task_order(config.protocol.task_order, task_rng, self.task_set)
 
+    def load(self) -> None:
+        """Go on from the config's checkpoint, if it has one.
+
+        Raises:
+            NotADirectoryError: it is no checkpoint of a run.
+            ValueError: it does not fit the config, or is damaged.
+        """
+        if self.config.checkpoint_path is None:
+            return
+        self._observers = load_checkpoint(self.run_state, self.config, self.config.checkpoint_path)
+        self._last_evaluation = self._observers["last_evaluation"]
+        self.statistics.load_state_dict(self._observers["statistics"])
+        budget = self.config.protocol.reset_budget
+        if self.loop.n >= self.config.total_steps:
+            logging.warning(f"The run has done its {self.loop.n} steps: --steps=<more> goes on.")
+        elif budget is not None and self.loop.b >= budget:
+            logging.warning(f"The run has spent its {self.loop.b} interventions: --protocol.reset_budget=<more>.")
+
     def train(self) -> None:
         """Run to the last step or the end of the budget, from the start or from the config's checkpoint."""
-        observers: dict[str, Any] = {}
-        if self.config.checkpoint_path is not None:
-            observers = load_checkpoint(self.run_state, self.config.checkpoint_path)
-            self._last_evaluation = observers.get("last_evaluation", self.loop.n)
-        self._open_observers(observers)
+        if not self._observers:
+            self.load()
+        self._open_observers(self._observers)
         try:
             if self.loop.t == 0:
                 self._evaluate()
@@ -108,8 +128,8 @@ class Trainer:
         self.logger: RunLogger | SilentLogger = SilentLogger()
         self.recorder = StreamObserver(None)
         if self.processes.is_main:
-            write_manifest(self.config, self.processes.count)
             self.logger = RunLogger(self.config, self.loop, states.get("logger", {}).get("offset"))
+            write_manifest(self.config, self.processes.count)
             self.recorder = StreamObserver.open(
                 self.config, self.env, states.get("recorder"), lambda why: self.logger.log("recording", why)
             )
@@ -117,16 +137,19 @@ class Trainer:
     def _run(self) -> None:
         last_save = self.loop.n
         updated = False
+        env_state: dict[str, np.ndarray] | None = None
         self.stopwatch.lap()
         for event in self._events():
             self._observe(event)
             updated |= isinstance(event, Update)
-            if not (updated and isinstance(event, SegmentEnd)):
+            if not isinstance(event, SegmentEnd):
+                continue
+            # Reading the simulations' state wakes sleeping bodies, so it is done at every switch: the run must
+            # not depend on how often it is saved, nor on where its budget ended.
+            env_state = self.env.get_state()
+            if not updated:
                 continue
             updated = False
-            # Reading the simulations' state wakes sleeping bodies, so it is done at every update: the run
-            # must not depend on how often it is saved.
-            env_state = self.env.get_state()
             self._check_processes()
             self._log_update()
             if _due(self.loop.n, self._last_evaluation, self.config.eval_freq):
@@ -137,7 +160,7 @@ class Trainer:
         if self._last_evaluation < self.loop.n:
             self._evaluate()
         if self.config.save_checkpoint and (last_save < self.loop.n or not self._has_checkpoint()):
-            self._save(self.env.get_state())
+            self._save(self.env.get_state() if env_state is None else env_state)
 
     def _events(self) -> Any:
         record = self.config.record
@@ -158,7 +181,7 @@ class Trainer:
         if isinstance(event, Step):
             with self.stopwatch("record"):
                 if self.config.record.repo_id is not None:
-                    event = whole_step(event, self.processes)
+                    event = whole_step(event, self.processes, self._num_recorded)
                 self.recorder.on_step(event)
         elif isinstance(event, Update):
             self._update_metrics = event.metrics
@@ -213,6 +236,7 @@ class Trainer:
             "logger": self.logger.state_dict(),
             "recorder": self.recorder.state_dict(),
             "last_evaluation": self._last_evaluation,
+            "statistics": self.statistics.state_dict(),
         }
         self.logger.log_checkpoint(save_checkpoint(self.run_state, self.config, observers, env_state))
         self.stopwatch.lap()

@@ -14,6 +14,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig
 from safetensors.torch import load_file
 
+from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.scripts import train as script
 
 SMALL = (
@@ -84,8 +85,9 @@ def test_strategy_and_order_of_the_docs(tmp_path):
         "--protocol.scene_reset_interval=null", "--protocol.heuristic_reset=true", f"--output_dir={output}",
         "--steps=48",
     ]  # fmt: skip
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     script = str(Path(sys.executable).with_name(command[0]))
-    subprocess.run([script, *command[1:]], check=True, env=os.environ | {"PYTHONPATH": str(tmp_path)})
+    subprocess.run([script, *command[1:]], check=True, env=os.environ | {"PYTHONPATH": path})
     last = json.loads((output / "metrics.jsonl").read_text().splitlines()[-1])
     # Two streams of 24 steps: six segments, all failed, so that the fourth switch resets both.
     assert last["interventions_by_kind"]["scene_reset"] == 2
@@ -94,8 +96,68 @@ def test_strategy_and_order_of_the_docs(tmp_path):
 
 
 def test_policy_of_another_kind_is_refused(tmp_path, monkeypatch):
-    with pytest.raises(TypeError, match="sample_actions"):
+    with pytest.raises(SystemExit, match=r"^error: .*sample_actions"):
         cronos_train(
             monkeypatch, "--policy.type=act", "--policy.device=cpu", "--policy.pretrained_backbone_weights=null",
             "--env.type=cronos", "--num_envs=2", f"--output_dir={tmp_path / 'run'}",
         )  # fmt: skip
+
+
+def test_what_cannot_be_is_one_line(tmp_path, monkeypatch):
+    """A finished run, resumed or begun from in ways that do not fit it."""
+    run = tmp_path / "run"
+    cronos_train(monkeypatch, *SMALL, *OBSERVATIONS["state"], f"--output_dir={run}", "--steps=16")
+    last = run / "checkpoints/last/pretrained_model"
+    (start,) = json.loads((run / "manifest.json").read_text())["starts"]
+    assert start["environment"] == "lerobot_env_cronos/kitchen_2x2-v1"
+    assert len(start["benchmark"]["fingerprint"]) == 16
+    assert "--algorithm.type=ppo" not in start["command"]
+
+    def refused(message, *arguments):
+        with pytest.raises(SystemExit, match=message) as ended:
+            cronos_train(monkeypatch, *arguments)
+        assert str(ended.value).startswith("error: ")
+        assert "\n" not in str(ended.value)
+
+    resume = ("--resume=true", f"--config_path={last}/train_config.json", "--steps=32")
+    scene = "--env.scene=playroom_2x2"
+    refused(f"{scene}, but the run that is resumed has kitchen_2x2", *resume, scene)
+    refused("--policy.type=act, but .* has pocketvla", *resume, "--policy.type=act")
+    refused("--policy.path=/other, but", *resume, "--policy.path=/other")
+    refused("--algorithm.type=ppo_paper, but .* has ppo ", *resume, "--algorithm.type=ppo_paper")
+    refused("--output_dir=.*/elsewhere, but", *resume, f"--output_dir={tmp_path / 'elsewhere'}")
+    with FolderLock(run):
+        refused("run is being written by process", *resume)
+
+    begin = (
+        f"--policy.path={last}", "--policy.device=cpu", *OBSERVATIONS["state"], "--env.type=cronos",
+        "--num_envs=2", f"--output_dir={tmp_path / 'new'}",
+    )  # fmt: skip
+    refused("environment_state of 48 numbers, kitchen_3x3 has 72", *begin, "--env.scene=kitchen_3x3")
+    config = last / "config.json"
+    text = config.read_text()
+    content = json.loads(text)
+    content["output_features"]["action"]["shape"] = [6]
+    config.write_text(json.dumps(content))
+    refused("the policy was made for action of 6 numbers, kitchen_2x2 has 7", *begin)
+    config.write_text(text[:50])
+    refused("pretrained_model/config.json is damaged", *begin)
+    config.write_text(text)
+    (last / "model.safetensors").write_bytes(b"short")
+    refused("model.safetensors", *begin)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_budget_between_two_updates_is_no_end(tmp_path, monkeypatch):
+    """T = K: the budget of one reset of both streams is spent after half a rollout."""
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    common = (*SMALL, *OBSERVATIONS["state"], "--protocol.scene_reset_interval=4")
+    cronos_train(monkeypatch, *common, f"--output_dir={whole}")
+    cronos_train(monkeypatch, *common, f"--output_dir={stopped}", "--protocol.reset_budget=2")
+    last = (stopped / "checkpoints/last").resolve()
+    assert last.name == "000008"
+    cronos_train(
+        monkeypatch, "--resume=true", f"--config_path={last}/pretrained_model", "--protocol.reset_budget=null"
+    )
+    for name, tensor in weights(whole).items():
+        assert torch.equal(tensor, weights(stopped)[name]), name

@@ -203,7 +203,7 @@ def test_checkpoint_of_another_run_is_refused(tmp_path):
     train(config(tmp_path / "run", steps=STEPS_PER_UPDATE))
     other = config(tmp_path / "other", num_envs=6)
     other.checkpoint_path = tmp_path / "run/checkpoints/last"
-    with pytest.raises(ValueError, match="num_streams=4, this run 6"):
+    with pytest.raises(ValueError, match="--num_envs=6, but the run that is resumed has 4"):
         make_trainer(other, env=DummyEnv(6)).train()
 
 

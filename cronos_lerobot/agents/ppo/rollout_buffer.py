@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from cronos_lerobot.agents.base import ActionSample, Columns
 from cronos_lerobot.agents.ppo.gae import compute_gae
+
+STORED = ("rewards", "values", "log_probs", "boundaries", "bootstrap_values", "instruction_ids", "tokens")
+"""Arrays of a buffer that are filled as the streams go on."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,36 @@ class RolloutBuffer:
     def __len__(self) -> int:
         """Transitions in the buffer, over all streams."""
         return self.rows * self.num_streams
+
+    def state_dict(self) -> dict[str, Any]:
+        """The transitions in use, stream by stream: arrays (N, rows, ...) of their types; {} if there are none."""
+        if not self.rows:
+            return {}
+        stored = {name: getattr(self, name) for name in STORED} | {"observations": self.observations}
+        used = _map_arrays(stored, lambda array: np.ascontiguousarray(array[: self.rows].swapaxes(0, 1)))
+        return used | {"instructions": list(self._instructions), "capacity": self.num_rows}
+
+    def load_state_dict(self, state: dict[str, Any], streams: slice = slice(None)) -> None:
+        """Go on from `state_dict`, with those of its streams that are this buffer's.
+
+        If U has changed since, there is room for what is there and U rows more.
+        """
+        self.clear()
+        if not state:
+            return
+        rows = state["rewards"].shape[1]
+        if state["capacity"] != self.num_rows:
+            self.__init__(rows + self.num_rows, self.num_streams)
+
+        def restore(array: np.ndarray) -> np.ndarray:
+            whole = np.zeros((self.num_rows, self.num_streams, *array.shape[2:]), array.dtype)
+            whole[:rows] = array[streams].swapaxes(0, 1)
+            return whole
+
+        restored = _map_arrays({name: state[name] for name in (*STORED, "observations")}, restore)
+        vars(self).update(restored)
+        self.rows = rows
+        self._instructions = list(state["instructions"])
 
     def add(
         self,
@@ -179,3 +213,7 @@ class RolloutBuffer:
         if text not in self._instructions:
             self._instructions.append(text)
         return self._instructions.index(text)
+
+
+def _map_arrays(tree: dict[str, Any], convert: Callable[[np.ndarray], np.ndarray]) -> dict[str, Any]:
+    return {name: _map_arrays(v, convert) if isinstance(v, dict) else convert(v) for name, v in tree.items()}

@@ -1,0 +1,188 @@
+"""What a resumed run takes from the command line: every flag is followed or refused, by one table."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs import parser
+from lerobot.utils.constants import TRAINING_STATE_DIR
+from lerobot_env_cronos import CronosEnvConfig, check_environment_id, gymnasium_id, load_benchmark
+from torch.optim import Optimizer
+
+FOLLOWED, REFUSED = "followed", "refused"
+
+RUN = "run.json"
+"""What a checkpoint says of its run: its config, environment and benchmark, how far it is."""
+
+_TABLE = {
+    "": {
+        FOLLOWED: "resume steps job_name eval_freq save_checkpoint save_freq keep_checkpoints log_freq "
+        "tensorboard torch_threads wandb.*",
+        REFUSED: "output_dir seed num_envs",
+    },
+    "env.": {
+        FOLLOWED: "num_threads",
+        REFUSED: "type scene benchmark obs_type privileged_state task_observation observation_height "
+        "observation_width camera_name renderer render_size task suite split advance end_effector_reset fps "
+        "max_parallel_tasks disable_env_checker features features_map",
+    },
+    "policy.": {FOLLOWED: "push_to_hub repo_id private tags license", REFUSED: "path *"},
+    "protocol.": {
+        FOLLOWED: "update_interval scene_reset_interval curriculum end_effector_reset heuristic_reset "
+        "extra_resets reset_budget task_order num_configurations",
+        REFUSED: "task_switch_interval learned_reset reward",
+    },
+    "algorithm.": {
+        FOLLOWED: "epochs value_epochs value_warmup_updates minibatch_size grad_accumulation clip gamma "
+        "gae_lambda normalize_advantage entropy_coef value_coef value_loss huber_delta value_clip policy_lr "
+        "value_lr lr_schedule target_kl kl_stop_factor lr_factor policy_lr_min policy_lr_max max_grad_norm "
+        "value_max_grad_norm beta1 "
+        "beta2 weight_decay",
+        REFUSED: "type kl_base_coef temperature",
+    },
+    "record.": {FOLLOWED: "flush_interval_s", REFUSED: "repo_id root streams filmed_streams"},
+    "eval.": {FOLLOWED: "n_episodes split temperature batch_size seed"},
+}
+FLAGS = {
+    group + name: rule
+    for group, rules in _TABLE.items()
+    for rule, names in rules.items()
+    for name in names.split()
+}
+"""Every flag of cronos-train: FOLLOWED or REFUSED by a resumed run. `group.*` stands for the group's others."""
+
+_OWN_FOLDER = ("output_dir", "resume", "policy.pretrained_path")
+"""Always another one than the checkpoint's: the folder may have moved, the weights are the checkpoint's."""
+
+
+def rule_of(flag: str) -> str:
+    """Return what a resumed run does with `flag`, named without its dashes.
+
+    Raises:
+        KeyError: the table does not have it.
+    """
+    parts = flag.split(".")
+    groups = (".".join(parts[:length]) for length in range(len(parts), 0, -1))
+    for name in groups:
+        for key in (name, f"{name}.*"):
+            if key in FLAGS:
+                return FLAGS[key]
+    raise KeyError(flag)
+
+
+def describe_run(config: Any, interaction_steps: int, interventions: int) -> dict[str, Any]:
+    """What a checkpoint keeps to tell its run from another one, JSON-ready; see RUN."""
+    return {
+        "interaction_steps": interaction_steps,
+        "interventions": interventions,
+        "config": config.to_dict(),
+    } | describe_environment(config.env)
+
+
+def describe_environment(env: Any) -> dict[str, Any]:
+    """The environment's id with its version, and the benchmark's source and fingerprint; None of other kinds."""
+    if not isinstance(env, CronosEnvConfig):
+        return {"environment": None, "benchmark": None}
+    benchmark = load_benchmark(env.benchmark, env.scene)
+    return {
+        "environment": gymnasium_id(env.scene),
+        "benchmark": {"source": benchmark.source, "fingerprint": benchmark.fingerprint},
+    }
+
+
+def read_run(checkpoint: Path) -> dict[str, Any]:
+    """Read what a checkpoint says of its run.
+
+    Raises:
+        NotADirectoryError: it is no checkpoint of a run.
+        ValueError: another version of the environment made it, or the file is damaged.
+    """
+    folder = checkpoint / TRAINING_STATE_DIR
+    if not folder.is_dir():
+        raise NotADirectoryError(f"{checkpoint} is no checkpoint of a run: it has no {TRAINING_STATE_DIR}.")
+    path = folder / RUN
+    what = f"the run of {checkpoint}"
+    if not path.is_file():
+        check_environment_id(None, what, "begin a new run")
+    try:
+        run = json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if run["environment"] is not None:
+        check_environment_id(run["environment"], what, "begin a new run")
+    return run
+
+
+def check_types(checkpoint: Path, cli_args: list[str]) -> None:
+    """Refuse flags that cannot even be read beside the run's: another kind of environment, policy or algorithm.
+
+    Raises:
+        ValueError: as it says.
+    """
+    run = read_run(checkpoint)
+    # LeRobot's parser keeps it from `cli_args`.
+    if path := parser.get_path_arg("policy"):
+        raise ValueError(_refusal("policy.path", path, "its own policy"))
+    for name in ("env", "policy", "algorithm"):
+        given, own = parser.get_type_arg(name, cli_args), (run["config"][name] or {}).get("type")
+        if given not in (None, own):
+            raise ValueError(_refusal(f"{name}.type", given, own))
+
+
+def check_resumed(config: Any, checkpoint: Path) -> dict[str, Any]:
+    """Check that `config` asks of the run nothing but what it can follow; returns what `read_run` does.
+
+    Raises:
+        NotADirectoryError: `checkpoint` is no checkpoint of a run.
+        ValueError: a refused flag has another value than the run's, or the run is beyond its end; or the
+            benchmark or the environment has changed.
+    """
+    run = read_run(checkpoint)
+    given, own = flatten(config.to_dict()), flatten(run["config"])
+    for name in sorted(given.keys() | own.keys(), key=lambda name: "features" in name):
+        same = given.get(name) == own.get(name)
+        if not same and name not in _OWN_FOLDER and rule_of(name) == REFUSED:
+            raise ValueError(_refusal(name, given.get(name), own.get(name)))
+    if (now := describe_environment(config.env)["benchmark"]) != run["benchmark"]:
+        was = run["benchmark"]
+        raise ValueError(f"the run of {checkpoint} began with the benchmark {was}, which now is {now}.")
+    done, spent, budget = run["interaction_steps"], run["interventions"], config.protocol.reset_budget
+    if config.total_steps < done:
+        raise ValueError(f"--steps={config.steps}, but the run has done {done} steps: give {done} or more.")
+    if budget is not None and budget < spent and budget != own["protocol.reset_budget"]:
+        raise ValueError(
+            f"--protocol.reset_budget={budget}, but the run has spent {spent}: give more than {spent}, or null."
+        )
+    return run
+
+
+def set_optimizer(optimizer: Optimizer, config: Any, run: dict[str, Any]) -> None:
+    """Give a loaded optimizer what `config` changes; other learning rates stay as they have become."""
+    own, new = run["config"]["algorithm"], config.to_dict()["algorithm"]
+    for group in optimizer.param_groups:
+        name = f"{group['name']}_lr"
+        if new[name] != own[name]:
+            group["lr"] = new[name]
+        group["weight_decay"] = new["weight_decay"]
+        group["betas"] = (new["beta1"], new["beta2"])
+
+
+def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of nested dicts by their flags' names, as JSON has them."""
+    flat: dict[str, Any] = {}
+    for name, value in json.loads(json.dumps(tree)).items():
+        if isinstance(value, dict):
+            flat |= flatten(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat
+
+
+def _refusal(flag: str, given: Any, own: Any) -> str:
+    given, own = (value if isinstance(value, str) else json.dumps(value) for value in (given, own))
+    return (
+        f"--{flag}={given}, but the run that is resumed has {own} and keeps it: leave the flag out, or begin a "
+        "new run, with this one's checkpoint as --policy.path."
+    )

@@ -1,0 +1,173 @@
+"""A resumed run follows a flag or refuses it, by one table; a stop between two updates is none."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from dummies import DummyPolicyConfig
+from lerobot_env_cronos import CronosEnvConfig
+from test_trainer import STEPS_PER_UPDATE, assert_same_run, config, make_trainer, metrics, train
+
+from cronos_lerobot.agents.ppo.config import PPOConfig
+from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.training import resume
+from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
+from cronos_lerobot.training.logging import MetricsFile
+
+DOCS = Path(__file__).parents[2] / "docs/training.md"
+
+
+def flags(config_class, prefix=""):
+    """Every flag of a config and, of its parts, of the classes that cronos-train has there."""
+    parts = {"env": CronosEnvConfig, "policy": DummyPolicyConfig, "algorithm": PPOConfig}
+    for field in dataclasses.fields(config_class):
+        if not field.init:
+            continue
+        value = parts.get(prefix + field.name) or field.default_factory
+        if dataclasses.is_dataclass(value):
+            yield from flags(value, f"{prefix}{field.name}.")
+        else:
+            yield prefix + field.name
+
+
+def test_every_flag_is_followed_or_refused():
+    names = [*flags(CronosTrainConfig), "env.type", "policy.type", "policy.path", "algorithm.type"]
+    assert len(names) > 90
+    unknown = []
+    for name in names:
+        try:
+            assert resume.rule_of(name) in (resume.FOLLOWED, resume.REFUSED)
+        except KeyError:
+            unknown.append(name)
+    assert not unknown, "say in training/resume.py and docs/training.md what a resumed run does with them"
+    with pytest.raises(KeyError):
+        resume.rule_of("algorithm.no_such_flag")
+
+
+def test_the_docs_have_the_table():
+    documented = {}
+    for rule in (resume.FOLLOWED, resume.REFUSED):
+        (line,) = re.findall(rf"^\| {rule} \| (.*?) \|$", DOCS.read_text(), re.MULTILINE)
+        documented |= dict.fromkeys(re.findall(r"`--([^`]+)`", line), rule)
+    assert documented == resume.FLAGS
+
+
+def resumed(folder, **options):
+    cfg = config(folder, **options)
+    cfg.checkpoint_path = (folder / "checkpoints/last").resolve()
+    return cfg
+
+
+REFUSALS = {
+    "--seed=6, but the run that is resumed has 5": {"seed": 6},
+    "--record.repo_id=me/stream, but .* has null": {"record": RecordConfig(repo_id="me/stream")},
+    "--algorithm.kl_base_coef=0.0, but .* has 0.1": {"algorithm": PPOConfig(minibatch_size=16, policy_lr=1e-2)},
+    "--protocol.learned_reset=true, but .* has false": {
+        "protocol": ProtocolConfig(4, 8, 16, task_order="random", learned_reset=True)
+    },
+    "--steps=32, but the run has done 64 steps": {"steps": 32},
+}
+
+
+def test_what_is_refused_is_named_with_both_values(tmp_path):
+    train(config(tmp_path / "run", steps=2 * STEPS_PER_UPDATE, eval_freq=0))
+    for message, options in REFUSALS.items():
+        with pytest.raises(ValueError, match=message):
+            make_trainer(resumed(tmp_path / "run", **options)).load()
+
+
+def test_a_run_of_another_version_is_refused(tmp_path):
+    train(config(tmp_path / "run", steps=STEPS_PER_UPDATE, eval_freq=0))
+    path = tmp_path / "run/checkpoints/last/training_state" / resume.RUN
+    path.write_text(
+        json.dumps(json.loads(path.read_text()) | {"environment": "lerobot_env_cronos/kitchen_2x2-v0"})
+    )
+    with pytest.raises(ValueError, match=r"kitchen_2x2-v0; this is version 1.*begin a new run"):
+        make_trainer(resumed(tmp_path / "run")).load()
+    path.unlink()
+    with pytest.raises(ValueError, match="does not say which version"):
+        make_trainer(resumed(tmp_path / "run")).load()
+
+
+def test_a_learning_rate_that_is_given_is_the_optimizers(tmp_path):
+    """The other one stays what the run has made of it."""
+    algorithm = PPOConfig(minibatch_size=16, policy_lr=1e-2, kl_base_coef=0.1)
+    train(config(tmp_path / "run", steps=3 * STEPS_PER_UPDATE, eval_freq=0, algorithm=algorithm))
+    state = tmp_path / "run/checkpoints/last/training_state"
+    for given, expected in (({}, None), ({"policy_lr": 3e-4, "beta1": 0.5}, 3e-4)):
+        changed = dataclasses.replace(algorithm, **given)
+        trainer = make_trainer(resumed(tmp_path / "run", algorithm=changed))
+        trainer.load()
+        groups = {group["name"]: group for group in trainer.run_state.ppo.optimizer.param_groups}
+        saved = json.loads((state / "optimizer_param_groups.json").read_text())
+        before = {group["name"]: group for group in saved}
+        assert groups["policy"]["lr"] == (before["policy"]["lr"] if expected is None else expected)
+        assert groups["policy"]["betas"][0] == (0.9 if expected is None else 0.5)
+        assert groups["value"]["lr"] == 1e-3
+
+
+DAMAGED = {
+    "training_state/loop.json": "loop.json",
+    "training_state/env_state.npz": "env_state.npz",
+    "training_state/observers.pt": "observers.pt",
+    "training_state/rollout.pt": "rollout.pt",
+    "training_state/run.json": "run.json",
+    "training_state/optimizer_state.safetensors": "optimizer_state.safetensors",
+    "pretrained_model/model.safetensors": "model.safetensors",
+}
+
+
+def test_a_damaged_file_of_a_checkpoint_is_named(tmp_path):
+    train(config(tmp_path / "run", steps=STEPS_PER_UPDATE, eval_freq=0))
+    for path, name in DAMAGED.items():
+        file = tmp_path / "run/checkpoints/last" / path
+        whole = file.read_bytes()
+        file.write_bytes(whole[: len(whole) // 2])
+        with pytest.raises(ValueError, match=f"{name} is damaged"):
+            make_trainer(resumed(tmp_path / "run")).load()
+        file.write_bytes(whole)
+
+
+def budget(reset_budget):
+    """T = 12 and U = 8: the first scene reset, which spends the budget, lies between two updates."""
+    protocol = ProtocolConfig(
+        task_switch_interval=4, update_interval=8, scene_reset_interval=12, task_order="random",
+        reset_budget=reset_budget,
+    )  # fmt: skip
+    return {"protocol": protocol, "eval_freq": 0, "save_freq": 0}
+
+
+def test_a_run_that_a_budget_stopped_goes_on_as_if_it_had_not(tmp_path):
+    train(config(tmp_path / "whole", **budget(None)))
+    stopped = train(config(tmp_path / "stopped", **budget(4)))
+    assert (stopped.loop.t, stopped.loop.updates, stopped.agent.buffer.rows) == (12, 1, 4)
+    torch.manual_seed(999)
+    train(resumed(tmp_path / "stopped", **budget(None)), policy_seed=8)
+    assert_same_run(tmp_path / "whole", tmp_path / "stopped")
+    assert len(metrics(tmp_path / "stopped")) == 4
+
+
+def test_another_update_interval_after_such_a_stop_learns_from_every_transition(tmp_path):
+    train(config(tmp_path / "run", **budget(4)))
+    options = budget(None)
+    options["protocol"] = dataclasses.replace(options["protocol"], update_interval=20)
+    trainer = make_trainer(resumed(tmp_path / "run", **options))
+    lengths = []
+    update = trainer.agent.ppo.update
+    trainer.agent.ppo.update = lambda buffer: lengths.append(buffer.rows) or update(buffer)
+    trainer.train()
+    # 4 rows were left at t = 12; the next multiples of 20 are 20 and 40.
+    assert lengths == [12, 20]
+
+
+def test_a_shorter_metrics_file_is_not_filled_up(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"kind": "update"}\n')
+    with pytest.raises(ValueError, match=r"metrics\.jsonl has 19 bytes, 50 when the checkpoint was made"):
+        MetricsFile(path, 50)
+    assert path.read_text() == '{"kind": "update"}\n'
+    MetricsFile(path, 19).close()
+    assert path.stat().st_size == 19
