@@ -7,6 +7,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import ClassVar
 
+from huggingface_hub.errors import HFValidationError
+from huggingface_hub.utils import validate_repo_id
+
 from cronos_lerobot.hub.push import Target
 
 
@@ -41,6 +44,12 @@ class PublishConfig:
         """
         if not self.repo_id:
             raise ValueError("--repo_id=<owner>/<name> is required, also in a dry run: the card names it")
+        try:
+            validate_repo_id(self.repo_id)
+        except HFValidationError as error:
+            raise ValueError(f"--repo_id={self.repo_id} is no <owner>/<name>: {error}") from error
+        if self.repo_id.count("/") != 1:
+            raise ValueError(f"--repo_id={self.repo_id} is no <owner>/<name>: it lacks the owner")
         if self.revision and not self.branch:
             raise ValueError("--revision is what a new --branch starts from; there is no --branch")
         if self.dry_run != (self.output_dir is not None):

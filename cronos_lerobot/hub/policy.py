@@ -7,7 +7,10 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from lerobot.utils.constants import ACTION
+from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 from matplotlib.figure import Figure
+from safetensors import SafetensorError, safe_open
 
 from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.hub.cards import render_card
@@ -45,13 +48,37 @@ def write_policy_repository(config: PolicyConfig, folder: Path) -> str:
     for file in sorted(checkpoint.model.iterdir()):
         if file.is_file():
             shutil.copyfile(file, folder / file.name)
-    policy = json.loads((checkpoint.model / "config.json").read_text())
+    policy = _read_policy(checkpoint.model)
     run = read_run(checkpoint.run, checkpoint.step) if checkpoint.run else None
     curves = _draw_curves(run, folder) if run else []
     results = read_results(config.results) if config.results else None
     (folder / "README.md").write_text(_card(config, checkpoint, policy, run, curves, results))
     steps = f" after {run.last['interaction_steps']} interaction steps" if run else ""
     return f"{policy['type']} policy{steps}"
+
+
+def _read_policy(model: Path) -> dict[str, Any]:
+    """config.json of a policy whose files are whole and which moves this robot.
+
+    Raises:
+        ValueError: names the file that is damaged, or says what the policy is.
+    """
+    try:
+        policy = json.loads((model / "config.json").read_text())
+        actions = policy["output_features"][ACTION]["shape"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{model / 'config.json'} is no policy's configuration: {error!r}") from error
+    if list(actions) != [len(ACTION_NAMES)]:
+        raise ValueError(
+            f"the policy in {model} has actions {actions}, those of the WidowX are {len(ACTION_NAMES)}"
+        )
+    for file in sorted(model.glob("*.safetensors")):
+        try:
+            with safe_open(file, "numpy") as tensors:
+                tensors.keys()
+        except SafetensorError as error:
+            raise ValueError(f"{file} is damaged: {error}") from error
+    return policy
 
 
 def _draw_curves(run: TrainingRun, folder: Path) -> list[tuple[str, str]]:
@@ -88,6 +115,7 @@ def _card(
         "policy",
         repo_id=config.repo_id,
         policy_type=policy["type"],
+        article="An" if policy["type"][0] in "aeiou" else "A",
         inputs=policy.get("input_features") or {},
         outputs=policy.get("output_features") or {},
         run=run_facts(run) if run else None,

@@ -11,6 +11,7 @@ from huggingface_hub.errors import EntryNotFoundError
 from lerobot_env_cronos import Benchmark, gymnasium_id, load_benchmark
 from lerobot_env_cronos.benchmark.benchmark import SUITES
 
+from cronos_lerobot.evaluation.config import EXPERT
 from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.hub.benchmark import task_id
 from cronos_lerobot.hub.config import ResultsConfig
@@ -31,6 +32,7 @@ def write_results(config: ResultsConfig, folder: Path) -> str:
     if config.results is None:
         raise ValueError("--results=<results.json of cronos-eval, or its folder> is required")
     results = read_results(config.results)
+    check_policy(results, config.repo_id)
     benchmark = _load(config, results)
     entries = make_entries(results, benchmark, config)
     content = merge(_published(config), eval_result_entries_to_yaml(entries))
@@ -39,6 +41,21 @@ def write_results(config: ResultsConfig, folder: Path) -> str:
     path.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=110))
     values = ", ".join(f"{entry.task_id} {entry.value:g}" for entry in entries)
     return f"results on {benchmark.source}: {values}"
+
+
+def check_policy(results: dict[str, Any], repo_id: str) -> None:
+    """Check that results are of the policy in the repository that they go to.
+
+    Raises:
+        ValueError: they are of the scripted expert or of another policy.
+    """
+    evaluated = str(results.get("policy") or "")
+    if evaluated == EXPERT:
+        raise ValueError(f"the results are of the {EXPERT}, not of the policy {repo_id}")
+    if evaluated.partition("@")[0] != repo_id:
+        raise ValueError(
+            f"the results are of {evaluated!r}, not of {repo_id}: evaluate with --policy.path={repo_id}"
+        )
 
 
 def _load(config: ResultsConfig, results: dict[str, Any]) -> Benchmark:

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from lerobot.datasets.utils import INFO_PATH
-from lerobot_env_cronos import gymnasium_id
-from lerobot_env_cronos.scene.scenes import SCENES
 from lerobot_env_cronos.statistics import wilson_interval
 
-from cronos_lerobot.data.schema import STREAM_ID
+from cronos_lerobot.data.file_check import check_dataset
+from cronos_lerobot.data.origin import STREAMS, Origin
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.hub.cards import render_card
 from cronos_lerobot.hub.config import StreamConfig
@@ -53,11 +52,12 @@ def write_stream_repository(config: StreamConfig, folder: Path) -> str:
     A dry run copies the files; a push, whose tree is gone afterwards, links them.
 
     Raises:
-        ValueError: --root is missing or the dataset is empty.
+        ValueError: --root is missing, the dataset is empty or not ours, or a file of it is damaged.
         FileNotFoundError: there is no dataset, or --run is no run.
     """
     info = read_info(config)
     assert config.root is not None
+    origin = check_dataset(config.root)
     for name in FOLDERS:
         for file in sorted((config.root / name).rglob("*")):
             # What the recorder has not finished yet has a hidden name.
@@ -68,8 +68,8 @@ def write_stream_repository(config: StreamConfig, folder: Path) -> str:
                     shutil.copyfile(file, place)
                 else:
                     place.symlink_to(file.resolve())
-    is_stream = STREAM_ID in info["features"]
-    card = _stream_card(config, info) if is_stream else _demonstrations_card(config, info)
+    is_stream = origin.kind == STREAMS
+    card = _stream_card(config, info, origin) if is_stream else _demonstrations_card(config, info, origin)
     (folder / "README.md").write_text(card)
     kind = "streams" if is_stream else "demonstrations"
     return f"{kind}: {info['total_episodes']} episodes, {info['total_frames']} frames"
@@ -86,11 +86,13 @@ def _find_run(config: StreamConfig) -> Path | None:
     return around if (around / MANIFEST).is_file() and (around / METRICS).is_file() else None
 
 
-def _stream_card(config: StreamConfig, info: dict[str, Any]) -> str:
+def _stream_card(config: StreamConfig, info: dict[str, Any], origin: Origin) -> str:
     from cronos_lerobot.data.stream_statistics import statistics
 
     streams = StreamDataset(config.repo_id, root=config.root)
     run = _find_run(config)
+    if run and (scene := read_run(run).config["env"]["scene"]) != origin.scene:
+        raise ValueError(f"{config.root} was recorded in {origin.scene}, the run {run} is of {scene}")
     return render_card(
         "streams",
         repo_id=config.repo_id,
@@ -99,7 +101,7 @@ def _stream_card(config: StreamConfig, info: dict[str, Any]) -> str:
         missing=_missing(streams),
         run=run_facts(read_run(run)) if run else None,
         interval=wilson_interval,
-        **_common(info, run),
+        **_common(info, origin),
     )
 
 
@@ -112,12 +114,11 @@ def _missing(streams: StreamDataset) -> str | None:
     return None
 
 
-def _demonstrations_card(config: StreamConfig, info: dict[str, Any]) -> str:
-    return render_card("demonstrations", repo_id=config.repo_id, info=info, **_common(info, None))
+def _demonstrations_card(config: StreamConfig, info: dict[str, Any], origin: Origin) -> str:
+    return render_card("demonstrations", repo_id=config.repo_id, info=info, **_common(info, origin))
 
 
-def _common(info: dict[str, Any], run: Path | None) -> dict[str, Any]:
-    scene = read_run(run).config["env"]["scene"] if run else None
+def _common(info: dict[str, Any], origin: Origin) -> dict[str, Any]:
     cameras = [name for name, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
     observation = [
         f"`{name}` {feature['shape'][1]} x {feature['shape'][0]} px"
@@ -125,8 +126,9 @@ def _common(info: dict[str, Any], run: Path | None) -> dict[str, Any]:
         if name in cameras
     ] + [f"`{name}`" for name in info["features"] if name.startswith("observation.") and name not in cameras]
     return {
-        "scene": scene,
-        "environment": gymnasium_id(scene) if scene in SCENES else None,
+        "scene": origin.scene,
+        "environment": origin.environment,
+        "origin": origin,
         "observation": ", ".join(observation),
         "is_video": any(feature["dtype"] == "video" for feature in info["features"].values()),
     }

@@ -31,6 +31,7 @@ from typing import Any
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from rich.console import Console
 
+from cronos_lerobot.data.file_check import check_dataset
 from cronos_lerobot.data.stream_filter import SegmentFilter, filter_streams
 from cronos_lerobot.data.stream_statistics import make_tables, statistics
 from cronos_lerobot.data.streams import StreamDataset
@@ -125,6 +126,8 @@ def print_statistics(config: StatisticsConfig) -> None:
 def check(config: CheckConfig) -> None:
     """`cronos-streams check`."""
     streams = config.dataset.open(streaming=True)
+    if (streams.meta.root / "data").is_dir():
+        check_dataset(streams.meta.root)
     streams.check()
     frames = sum(segment.length for segment in streams.segments)
     print(f"whole: {len(streams.streams)} streams, {len(streams.segments)} segments, {frames} frames")

@@ -5,6 +5,7 @@ import json
 import pytest
 from lerobot_env_cronos.benchmark.benchmark import draw_benchmark
 from lerobot_env_cronos.scene.scenes import Task
+from safetensors.numpy import save_file
 
 from cronos_lerobot.evaluation.results import independent_results, sequential_results
 from cronos_lerobot.hub.benchmark import choose_benchmark
@@ -171,8 +172,9 @@ def test_where_a_policy_may_be(tmp_path):
 def write_clone(model, env):
     """A checkpoint of lerobot-train; without an `env` in its config, as after training on demonstrations alone."""
     model.mkdir(parents=True)
-    (model / "config.json").write_text('{"type": "cronos_mlp"}')
-    (model / "model.safetensors").touch()
+    actions = {"action": {"type": "ACTION", "shape": [7]}}
+    (model / "config.json").write_text(json.dumps({"type": "cronos_mlp", "output_features": actions}))
+    save_file({}, model / "model.safetensors")
     (model / "train_config.json").write_text(json.dumps({"env": env, "dataset": {"repo_id": "me/demos"}}))
     return model
 
