@@ -17,8 +17,9 @@ GRASP_MIN_FORCE_N, GRASP_MAX_ANGLE_RAD = 0.5, np.deg2rad(85)
 CARRIES, CARRIES_NOTHING = 0.5, 0.05
 """Shares of an object's weight: what carries it, and what does not take part in carrying it."""
 
-STILL_SPEED = 0.02
-"""Speed that no point of an object at rest exceeds [m/s]."""
+STILL_DISTANCE = 0.004
+"""No point of an object that lies still moves further in a control step: 0.02 m/s. The speed at one moment would
+not do: light objects may tremble in place [m]."""
 
 RESTING_GAP = 0.001
 """Height above its resting pose up to which a body that was put there counts as lying on the table [m]."""
@@ -33,22 +34,23 @@ class Judge:
     Args:
         scene: names the objects and receptacles.
         model: the compiled scene.
-        sensordata, qvel: live arrays (n, nsensordata) and (n, nv).
+        sensordata, qpos: live arrays (n, nsensordata) and (n, nq).
 
     Attributes:
         grasped: (n, objects) bool, both fingers press on the object.
         place: (n, objects) where the object was at the last reading: IN_HAND, grasped and borne by nothing else;
-            on what it lay still, untouched by the hand; or NOTHING.
-        confirmed: (n, objects) where it was at the last two readings, NOTHING if that differs.
+            on what it lay, untouched by the hand; or NOTHING.
+        pose: (n, objects, 7) its pose then.
+        confirmed: (n, objects) where it was at the last two readings, and still if it lay; NOTHING if neither.
         carried_to: (n, objects) what bore the object first since the hand let go of it; IN_HAND since the hand has
             carried it at two readings; NOTHING when something else has borne it since.
     """
 
-    STATE_FIELDS = ("grasped", "carried_to", "place", "confirmed")
+    STATE_FIELDS = ("grasped", "carried_to", "place", "pose", "confirmed")
 
-    def __init__(self, scene: Scene, model: mujoco.MjModel, sensordata: np.ndarray, qvel: np.ndarray):
+    def __init__(self, scene: Scene, model: mujoco.MjModel, sensordata: np.ndarray, qpos: np.ndarray):
         self.scene = scene
-        self._sensordata, self._qvel = sensordata, qvel
+        self._sensordata, self._qpos = sensordata, qpos
         objects = scene.objects
         supports = (TABLE, *scene.receptacles)
 
@@ -59,14 +61,42 @@ class Judge:
         self._fingers = np.array([[columns(grasp_sensor(side, o)) for side in ("left", "right")] for o in objects])
         self._hand = np.array([columns(hand_sensor(o))[0] for o in objects])
         self._supports = np.array([[columns(support_sensor(o, s)) for s in supports] for o in objects])
-        self._velocity = np.array([model.joint(o).dofadr[0] + np.arange(6) for o in objects])
+        self._pose = np.array([model.joint(o).qposadr[0] + np.arange(7) for o in objects])
         self._weight = np.array([model.body(o).mass[0] for o in objects]) * np.linalg.norm(model.opt.gravity)
         self._height = np.array([BODIES[o].size[2] for o in objects])
         self._radius = np.array([np.linalg.norm(BODIES[o].size) / 2 for o in objects])
         shape = (len(sensordata), len(objects))
         self.grasped = np.zeros(shape, dtype=bool)
         self.carried_to = np.full(shape, IN_HAND, dtype=np.int8)
+        # Since the last reading: looks, touches of the hand, shares of the weight that each support bore.
+        self._looks, self._touched = np.zeros(len(sensordata), dtype=int), np.zeros(shape, dtype=bool)
+        self._sum_up, self._max_up, self._max_share = (np.zeros((*shape, len(supports))) for _ in range(3))
+        self.pose = qpos[:, self._pose]
         self.place, self.confirmed = (np.full(shape, NOTHING, dtype=np.int8) for _ in range(2))
+
+    def look(self, ids: np.ndarray) -> None:
+        """Take in the contacts of simulations `ids` (k,) now, for the next reading; several times a control step.
+
+        What leans and trembles may be off the table at one moment.
+        """
+        touched, up, share = self._contacts(ids)
+        self._looks[ids] += 1
+        self._touched[ids] |= touched
+        self._sum_up[ids] += up
+        self._max_up[ids] = np.maximum(self._max_up[ids], up)
+        self._max_share[ids] = np.maximum(self._max_share[ids], share)
+
+    def forget(self, ids: np.ndarray) -> None:
+        """Forget what was looked at in simulations `ids`."""
+        for seen in (self._looks, self._touched, self._sum_up, self._max_up, self._max_share):
+            seen[ids] = 0
+
+    def _contacts(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Touched by the hand (k, objects), upward and whole force of each support (k, objects, supports) in
+        weights of the object."""
+        forces = self._sensordata[ids]
+        supports = forces[:, self._supports] / self._weight[:, None, None]
+        return forces[:, self._hand] > 0, supports[..., 2], np.linalg.norm(supports, axis=-1)
 
     def read(self, ids: np.ndarray, closing_axis: np.ndarray, *, settled: bool = False) -> None:
         """Read the contacts of simulations `ids` (k,), after a control step or an intervention.
@@ -76,26 +106,31 @@ class Judge:
             closing_axis: (k, 3) the direction in which the fingers close, world frame.
             settled: the bodies came to rest before: one reading counts as two.
         """
-        forces = self._sensordata[ids]
-        grasped = self._read_grasps(forces[:, self._fingers], closing_axis)
-        touched = forces[:, self._hand] > 0
-        supports = forces[:, self._supports] / self._weight[:, None, None]
-        up, share = supports[..., 2], np.linalg.norm(supports, axis=-1)
-
+        unseen = ids[self._looks[ids] == 0]
+        if len(unseen):
+            self.look(unseen)
+        grasped = self._read_grasps(self._sensordata[ids][:, self._fingers], closing_axis)
+        touched, up, share = self._contacts(ids)
         in_air = grasped & (share <= CARRIES_NOTHING).all(-1)
         carrier = np.where(~touched & (up.max(-1) >= CARRIES), up.argmax(-1), NOTHING)
-        table_helps = share[..., ON_TABLE] > CARRIES_NOTHING
-        receptacle_helps = (up[..., ON_TABLE + 1 :] > CARRIES_NOTHING).any(-1)
-        alone = ~np.where(carrier == ON_TABLE, receptacle_helps, table_helps)
-        place = np.where(alone & self._is_still(ids), carrier, NOTHING)
-        place = np.where(in_air, IN_HAND, place)
-        confirmed = np.where(settled | (place == self.place[ids]), place, NOTHING)
+
+        mean_up = self._sum_up[ids] / self._looks[ids][:, None, None]
+        borne = np.take_along_axis(mean_up, np.maximum(carrier, 0)[..., None], -1)[..., 0] >= CARRIES
+        table_helps = self._max_share[ids][..., ON_TABLE] > CARRIES_NOTHING
+        receptacle_helps = (self._max_up[ids][..., ON_TABLE + 1 :] > CARRIES_NOTHING).any(-1)
+        alone = borne & ~self._touched[ids] & ~np.where(carrier == ON_TABLE, receptacle_helps, table_helps)
+        place = np.where(in_air, IN_HAND, np.where(alone, carrier, NOTHING))
+        pose = self._qpos[ids][:, self._pose]
+        same = (place == self.place[ids]) & (in_air | (self._distance(pose, self.pose[ids]) <= STILL_DISTANCE))
+        confirmed = np.where(settled | same, place, NOTHING)
 
         carried_to = self.carried_to[ids]
         elsewhere = (carried_to != IN_HAND) & (carried_to != carrier)
         carried_to = np.where(carrier == NOTHING, carried_to, np.where(elsewhere, NOTHING, carrier))
         self.carried_to[ids] = np.where(confirmed == IN_HAND, IN_HAND, carried_to)
-        self.grasped[ids], self.place[ids], self.confirmed[ids] = grasped, place, confirmed
+        self.grasped[ids], self.confirmed[ids] = grasped, confirmed
+        self.place[ids], self.pose[ids] = place, pose
+        self.forget(ids)
 
     def _read_grasps(self, forces: np.ndarray, closing_axis: np.ndarray) -> np.ndarray:
         """Grasps (k, objects) from the fingers' forces (k, objects, 2, 3) [N]."""
@@ -104,10 +139,10 @@ class Judge:
         pressed = (strength >= GRASP_MIN_FORCE_N) & (along >= np.cos(GRASP_MAX_ANGLE_RAD) * strength)
         return pressed.all(-1)
 
-    def _is_still(self, ids: np.ndarray) -> np.ndarray:
-        velocity = self._qvel[ids][:, self._velocity]
-        linear, angular = np.linalg.norm(velocity[..., :3], axis=-1), np.linalg.norm(velocity[..., 3:], axis=-1)
-        return linear + self._radius * angular < STILL_SPEED
+    def _distance(self, pose: np.ndarray, before: np.ndarray) -> np.ndarray:
+        """What no point of an object moved further than between two poses (k, objects, 7): (k, objects) [m]."""
+        cosine = np.minimum(np.abs((pose[..., 3:] * before[..., 3:]).sum(-1)), 1.0)
+        return np.linalg.norm(pose[..., :3] - before[..., :3], axis=-1) + self._radius * 2 * np.arccos(cosine)
 
     def put(self, ids: np.ndarray, poses: np.ndarray) -> None:
         """Simulations `ids` (k,) were given poses (k, objects, 7): what was put counts as carried to where it is.
@@ -116,6 +151,7 @@ class Judge:
         """
         on_table = poses[..., 2] <= self._height / 2 + RESTING_GAP
         self.grasped[ids], self.carried_to[ids] = False, np.where(on_table, ON_TABLE, IN_HAND)
+        self.pose[ids] = poses
         self.place[ids] = self.confirmed[ids] = np.where(on_table, ON_TABLE, NOTHING)
 
     def put_one(self, ids: np.ndarray, body: str) -> None:

@@ -56,7 +56,7 @@ class Simulation:
         self._sensor_slice = self._find_sensors()
         self.arm_target = np.tile(HOME_QPOS, (num_sims, 1))
         self.gripper_target = np.full(num_sims, FINGER_OPEN)
-        self.judge = Judge(scene, self.model, self.sensordata, self.qvel)
+        self.judge = Judge(scene, self.model, self.sensordata, self.qpos)
 
     def _find_sensors(self) -> dict[str, slice]:
         sensors = (self.model.sensor(i) for i in range(self.model.nsensor))
@@ -86,9 +86,11 @@ class Simulation:
             last = k == RAMP_CHUNKS
             nstep = SUBSTEPS - (RAMP_CHUNKS - 1) * CHUNK_SUBSTEPS if last else CHUNK_SUBSTEPS
             broken |= self._advance(ids, nstep)
+            self.judge.look(ids)
         diverged = broken[ids] | self._is_diverged(ids)
         if diverged.any():
             self._restore(ids[diverged], before[diverged])
+            self.judge.forget(ids[diverged])
         self._read(ids)
         return diverged
 
