@@ -41,7 +41,9 @@ class DummyEnv:
 
     def __init__(self, num_envs: int, diverge_at: set[tuple[int, int]] | None = None):
         self.num_envs = num_envs
-        self.scene = SimpleNamespace(tasks=TASKS, reset_tasks=RESET_TASKS, bodies=("a", "b", "plate"))
+        self.scene = SimpleNamespace(
+            name="dummies", tasks=TASKS, reset_tasks=RESET_TASKS, bodies=("a", "b", "plate")
+        )
         self.lost: set[tuple[int, int]] = set()
         self.tasks = [TASKS[0]] * num_envs
         self.x = np.zeros(num_envs)
@@ -49,7 +51,9 @@ class DummyEnv:
         self.t = 0
         self.diverge_at = diverge_at or set()
         self.calls: list = []
-        self.benchmark = SimpleNamespace(groups=lambda suite, split: EPISODES)
+        self.benchmark = SimpleNamespace(
+            groups=lambda suite, split: EPISODES, source="dummies", fingerprint="0" * 16
+        )
         self.split, self.advance, self.window, self._sends_arm_home = "train", "window", 80, False
         self._all, self._orderings = np.arange(num_envs), [TASKS[:1]] * num_envs
         self.done, self._is_complete = np.ones(num_envs, bool), np.zeros(num_envs, bool)

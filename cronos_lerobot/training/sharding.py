@@ -43,6 +43,7 @@ class ShardedEnv:
         self.num_envs = env.num_envs * processes.count
         self.mine = processes.share_of(self.num_envs)
         self.scene = env.scene
+        self.benchmark = env.benchmark
         self.metadata = env.metadata
         self.single_observation_space = env.single_observation_space
 
