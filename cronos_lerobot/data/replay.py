@@ -76,7 +76,7 @@ def _transitions(streams: StreamDataset, state_keys: Sequence[str]) -> Iterator[
                 continue
             yield {
                 "state": {key: value[t][None] for key, value in states.items()},
-                "action": torch.from_numpy(columns[ACTION][t])[None],
+                "action": torch.tensor(columns[ACTION][t])[None],
                 "reward": float(columns[REWARD][t]),
                 "next_state": {key: value[None] for key, value in successor.items()},
                 "done": False,

@@ -141,7 +141,7 @@ def feature_names(env: CronosVectorEnv) -> dict[str, Sequence[str]]:
     """The names of `env`'s state dimensions, as keyword arguments of `demonstration_features`."""
     space = cast(gymnasium.spaces.Dict, env.single_observation_space)
     size = (space["agent_pos"].shape or (0,))[0]
-    names = [agent_pos_names(env.scene, option) for option in TASK_OBSERVATIONS]
+    names = (agent_pos_names(env.scene, option) for option in TASK_OBSERVATIONS)
     return {
         "state_names": next(n for n in names if len(n) == size),
         "environment_state_names": environment_state_names(env.scene),
