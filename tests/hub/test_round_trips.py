@@ -136,7 +136,8 @@ def test_a_policy_is_loaded_back_with_its_card(hub, run, policy, commands, tmp_p
     front = yaml.safe_load(card.split("---")[1])
     assert front["datasets"] == ["me/stream"]
     assert "base_model" not in front
-    assert f"2 training configurations of [me/bench]({hub.url}/datasets/me/bench)" in card
+    commit = hub.repositories["datasets", "me/bench"].branches["main"]
+    assert f"2 training configurations of [me/bench@{commit}]({hub.url}/datasets/me/bench)" in card
     # 32 steps are 16 of each of the 2 streams; the scene of each is reset after 8 and after 16.
     assert "Interventions that count: **4**." in card
     assert "| scene reset | 4 | yes |" in card
