@@ -14,15 +14,8 @@ import jinja2
 from matplotlib.figure import Figure
 
 from cronos_lerobot.report import clips, figures, suite_views, tables
-from cronos_lerobot.report.runs import (
-    Comparison,
-    EvaluationRun,
-    Group,
-    TrainingRun,
-    compare_evaluations,
-    compare_training,
-    group_runs,
-)
+from cronos_lerobot.report.comparisons import Comparison, compare_evaluations, compare_training
+from cronos_lerobot.report.runs import EvaluationRun, Group, TrainingRun, group_runs
 from cronos_lerobot.report.suites import SuiteRun
 
 PAGE = "index.html"
@@ -72,6 +65,8 @@ class Report:
     title: str
     suites: list[SuiteRun] = field(default_factory=list)
     """Those of `cronos-eval`."""
+    left_out: list[str] = field(default_factory=list)
+    """What could not be read, a sentence for each."""
 
     @property
     def comparisons(self) -> list[Comparison]:
@@ -118,6 +113,7 @@ def write_report(report: Report, output: Path) -> Path:
         clip_rows=_clip_rows(report, output),
         manifests=[(run.name, json.dumps(run.starts, indent=2)) for run in report.training if run.starts],
         runs=[(group, run) for group in groups for run in group.runs],
+        left_out=report.left_out,
         headline=_headline(report.comparisons),
     )
     (output / PAGE).write_text(page)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,8 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETR
 from lerobot_env_cronos.scene.scenes import SCENES
 
 from cronos_lerobot.evaluation.store import RESULTS
-from cronos_lerobot.report.statistics import Gain, Rate
-from cronos_lerobot.report.suites import SuiteRun, is_results, read_suite_runs
+from cronos_lerobot.report.statistics import Rate, sum_rates
+from cronos_lerobot.report.suites import SuiteRun, check_results, is_results, read_suite_runs
 from cronos_lerobot.training.logging import MANIFEST, METRICS
 
 EVAL_INFO = "eval_info.json"
@@ -102,32 +102,20 @@ class Group:
     runs: list[TrainingRun] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """What a training came to: success before and after, by task."""
+@dataclass
+class FoundRuns:
+    """What some folders hold."""
 
-    label: str
-    suite: str
-    tasks: dict[str, Gain]
-
-    @property
-    def overall(self) -> Gain:
-        """All tasks together."""
-        gains = self.tasks.values()
-        return Gain(sum_rates(gain.before for gain in gains), sum_rates(gain.after for gain in gains))
+    training: list[TrainingRun]
+    evaluations: list[EvaluationRun]
+    """Those of lerobot-eval."""
+    suites: list[SuiteRun]
+    """Those of cronos-eval."""
+    left_out: list[str]
+    """What could not be read, a sentence for each: crashed before its first record, damaged, of version 0."""
 
 
-def sum_rates(rates: Iterable[Rate]) -> Rate:
-    """All episodes together."""
-    total = Rate(0, 0)
-    for rate in rates:
-        total += rate
-    return total
-
-
-def find_runs(
-    folders: Iterable[Path], scene: str = "kitchen_2x2"
-) -> tuple[list[TrainingRun], list[EvaluationRun], list[SuiteRun]]:
+def find_runs(folders: Iterable[Path], scene: str = "kitchen_2x2") -> FoundRuns:
     """Read the runs of cronos-train, lerobot-eval and cronos-eval in `folders` and below them, each once.
 
     Args:
@@ -136,27 +124,40 @@ def find_runs(
 
     Raises:
         FileNotFoundError: a folder is missing or holds no run.
+        ValueError: of all that they hold nothing can be read.
     """
     training: dict[Path, TrainingRun] = {}
     evaluation: dict[Path, list[EvaluationRun]] = {}
-    suites: list[Path] = []
+    suites: dict[Path, None] = {}
+    left_out: dict[Path, str] = {}
+
+    def keep(table: dict[Path, Any], path: Path, read: Callable[[], Any]) -> None:
+        if path in table or path in left_out:
+            return
+        try:
+            table[path] = read()
+        except (ValueError, KeyError, TypeError, OSError) as error:
+            text = str(error) if str(path.parent) in str(error) else f"{path} is damaged: {error!r}"
+            left_out[path] = " ".join(text.split())
+
     for folder in folders:
-        found = False
-        for path in _files(folder, METRICS):
-            training.setdefault(path.resolve(), read_training_run(path.parent))
-            found = True
-        for path in _files(folder, EVAL_INFO):
-            evaluation.setdefault(path.resolve(), read_evaluation_runs(path.parent, scene))
-            found = True
-        results = [path for path in _files(folder, RESULTS) if is_results(path)]
-        suites += results
-        if not found and not results:
+        files = {name: [path.resolve() for path in _files(folder, name)] for name in (METRICS, EVAL_INFO, RESULTS)}
+        for path in files[METRICS]:
+            keep(training, path, lambda path=path: read_training_run(path.parent))
+        for path in files[EVAL_INFO]:
+            keep(evaluation, path, lambda path=path: read_evaluation_runs(path.parent, scene))
+        results = [path for path in files[RESULTS] if is_results(path)]
+        for path in results:
+            keep(suites, path, lambda path=path: check_results(path))
+        if not files[METRICS] and not files[EVAL_INFO] and not results:
             raise FileNotFoundError(
                 f"{folder} has no {METRICS} of cronos-train, no {RESULTS} of cronos-eval and no {EVAL_INFO} of"
                 " lerobot-eval."
             )
+    if left_out and not (training or evaluation or suites):
+        raise ValueError("; ".join(left_out.values()))
     evaluations = [run for runs in evaluation.values() for run in runs]
-    return list(training.values()), evaluations, read_suite_runs(suites)
+    return FoundRuns(list(training.values()), evaluations, read_suite_runs(suites), list(left_out.values()))
 
 
 def _files(folder: Path, name: str) -> Iterator[Path]:
@@ -165,7 +166,11 @@ def _files(folder: Path, name: str) -> Iterator[Path]:
 
 
 def read_training_run(folder: Path) -> TrainingRun:
-    """Read a run folder; a line that a kill left unfinished is skipped."""
+    """Read a run folder; a line that a kill left unfinished is skipped.
+
+    Raises:
+        ValueError: it has no record yet, its manifest is damaged, or another version of the environments made it.
+    """
     records = []
     for line in (folder / METRICS).read_text().splitlines():
         try:
@@ -175,7 +180,11 @@ def read_training_run(folder: Path) -> TrainingRun:
     if not records:
         raise ValueError(f"{folder / METRICS} has no record yet: the run has not come to its first evaluation.")
     manifest = folder / MANIFEST
-    starts = json.loads(manifest.read_text())["starts"] if manifest.is_file() else []
+    try:
+        starts = json.loads(manifest.read_text())["starts"] if manifest.is_file() else []
+    except ValueError as error:
+        raise ValueError(f"{manifest} is damaged: {error}") from error
+
     return TrainingRun(
         folder,
         _read_config(folder, starts),
@@ -290,38 +299,3 @@ def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, str]:
 def evaluation_rates(evaluation: Evaluation) -> dict[str, Rate]:
     """Success by instruction, of an evaluation that `cronos-train` logged."""
     return {task: Rate(round(r["success"] * r["n"]), r["n"]) for task, r in evaluation["per_task"].items()}
-
-
-def compare_training(groups: list[Group]) -> list[Comparison]:
-    """First and last periodic evaluation of every group, its seeds together."""
-    comparisons = []
-    for group in groups:
-        runs = [run for run in group.runs if len(run.evaluations) > 1]
-        if not runs:
-            continue
-        before = _pool([evaluation_rates(run.evaluations[0]) for run in runs])
-        after = _pool([evaluation_rates(run.evaluations[-1]) for run in runs])
-        gains = {task: Gain(before[task], after[task]) for task in before if task in after}
-        suite = f"periodic evaluation, {runs[0].evaluations[-1]['split']}"
-        comparisons.append(Comparison(group.label, suite, gains))
-    return comparisons
-
-
-def compare_evaluations(before: list[EvaluationRun], after: list[EvaluationRun]) -> list[Comparison]:
-    """Evaluations of `lerobot-eval` of the same suite, before and after."""
-    comparisons = []
-    for suite in dict.fromkeys(run.suite for run in after):
-        old = _pool([run.tasks for run in before if run.suite == suite])
-        new = _pool([run.tasks for run in after if run.suite == suite])
-        gains = {task: Gain(old[task], rate) for task, rate in new.items() if task in old}
-        if gains:
-            comparisons.append(Comparison("lerobot-eval", suite, gains))
-    return comparisons
-
-
-def _pool(tables: list[dict[str, Rate]]) -> dict[str, Rate]:
-    pooled: dict[str, Rate] = {}
-    for table in tables:
-        for task, rate in table.items():
-            pooled[task] = pooled.get(task, Rate(0, 0)) + rate
-    return pooled

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import reduce
 from math import hypot
+from operator import add
 
 from lerobot_env_cronos.statistics import wilson_interval
+
+from cronos_lerobot.protocol.metrics import summarise
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,41 @@ class Rate:
 
 
 @dataclass(frozen=True)
+class SeedRate(Rate):
+    """The episodes of several seeds together. Those of a seed are no more independent than its training."""
+
+    seeds: tuple[Rate, ...] = ()
+    """Each of them."""
+
+    @classmethod
+    def of(cls, seeds: Iterable[Rate]) -> SeedRate:
+        """The rate of some seeds."""
+        rates = tuple(seeds)
+        return cls(sum(rate.successes for rate in rates), sum(rate.n for rate in rates), rates)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % t-interval of the mean over the seeds; Wilson's of one alone."""
+        summary = summarise([rate.value for rate in self.seeds])
+        return (summary and summary.ci95) or super().interval
+
+    def __add__(self, other: Rate) -> Rate:
+        """Both sets of episodes together, seed by seed if they are of as many."""
+        if not isinstance(other, SeedRate) or len(other.seeds) != len(self.seeds):
+            return super().__add__(other)
+        return SeedRate.of(map(add, self.seeds, other.seeds))
+
+    def __str__(self) -> str:
+        return super().__str__() + (f" ({len(self.seeds)} seeds)" if len(self.seeds) > 1 else "")
+
+
+def sum_rates(rates: Iterable[Rate]) -> Rate:
+    """All episodes together."""
+    found = list(rates)
+    return reduce(add, found) if found else Rate(0, 0)
+
+
+@dataclass(frozen=True)
 class Gain:
     """Success before and after a training."""
 
@@ -48,7 +88,16 @@ class Gain:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Its 95 % interval by `newcombe_interval`."""
+        """Its 95 % interval: over the seeds where each has a before of its own, else `newcombe_interval`.
+
+        The second is of the interval over the seeds after, if there are several, and of the one before.
+        """
+        before, after = (getattr(rate, "seeds", ()) for rate in (self.before, self.after))
+        if len(before) == len(after) > 1:
+            summary = summarise([new.value - old.value for old, new in zip(before, after, strict=True)])
+            assert summary is not None
+            assert summary.ci95 is not None
+            return summary.ci95
         return newcombe_interval(self.before, self.after)
 
     def __str__(self) -> str:
@@ -57,10 +106,10 @@ class Gain:
 
 
 def newcombe_interval(before: Rate, after: Rate) -> tuple[float, float]:
-    """Return the 95 % interval of `after - before`, two independent proportions.
+    """Return the 95 % interval of `after - before`, two independent proportions or means with their intervals.
 
     Newcombe 1998, "Interval estimation for the difference between independent proportions", method 10: the
-    distances from the rates to the ends of their Wilson intervals, added in quadrature.
+    distances from the rates to the ends of their (Wilson) intervals, added in quadrature.
     """
     difference = after.value - before.value
     (low_b, high_b), (low_a, high_a) = before.interval, after.interval

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from cronos_lerobot.evaluation.store import IDENTITY as IDENTITY_FILE
 from cronos_lerobot.evaluation.store import read_results
 
 SUITES = ("independent", "sequential")
@@ -36,9 +37,21 @@ class SuiteRun:
 
 
 def is_results(path: Path) -> bool:
-    """Whether a file called results.json is one of `cronos-eval`."""
-    content = json.loads(path.read_text())
+    """Whether a file called results.json is one of `cronos-eval`, if only a damaged one."""
+    try:
+        content = json.loads(path.read_text())
+    except ValueError:
+        return (path.parent / IDENTITY_FILE).is_file()
     return isinstance(content, dict) and "format" in content and any(suite in content for suite in SUITES)
+
+
+def check_results(path: Path) -> None:
+    """Read a results.json once.
+
+    Raises:
+        ValueError: it is damaged, or of another version.
+    """
+    read_results(path)
 
 
 def read_suite_runs(files: Iterable[Path]) -> list[SuiteRun]:

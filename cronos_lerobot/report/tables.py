@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from cronos_lerobot.protocol.metrics import performance_gap, success_at, summarise
-from cronos_lerobot.report.runs import Comparison, EvaluationRun, Group, TrainingRun, evaluation_rates
+from cronos_lerobot.report.comparisons import Comparison
+from cronos_lerobot.report.runs import EvaluationRun, Group, TrainingRun, evaluation_rates
 from cronos_lerobot.report.statistics import Gain, Rate
 
 Row = dict[str, Any]
@@ -36,7 +37,9 @@ def gain_rows(comparisons: Iterable[Comparison]) -> list[Row]:
 def _gain_columns(gain: Gain) -> Row:
     low, high = gain.interval
     ends = {"gain": gain.value, "gain_ci95_low": low, "gain_ci95_high": high}
-    return rate_columns(gain.before, "before_") | rate_columns(gain.after, "after_") | ends
+    rates = rate_columns(gain.before, "before_") | rate_columns(gain.after, "after_")
+    # Of lerobot-eval there are folders and no seeds.
+    return rates | {"seeds": len(getattr(gain.after, "seeds", ())) or None} | ends
 
 
 def seed_rows(groups: Iterable[Group]) -> list[Row]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from lerobot_env_cronos.scene.scenes import SCENES
 
 from cronos_lerobot.report.page import Report, write_report
-from cronos_lerobot.report.runs import EvaluationRun, find_runs
+from cronos_lerobot.report.runs import FoundRuns, find_runs
 from cronos_lerobot.report.tables import comparison_text
 
 EPILOG = """\
@@ -69,18 +69,18 @@ def make_report(
     Raises:
         FileNotFoundError: a folder holds no run, or a video is missing.
     """
-    training, evaluations, suites = find_runs(runs, scene)
-    old, new = _evaluations(before or [], scene), _evaluations(after or [], scene)
-    paired = {run.folder.resolve() for run in old + new}
-    rest = [run for run in evaluations if run.folder.resolve() not in paired]
+    found, old, new = (
+        find_runs(folders, scene) if folders else FoundRuns([], [], [], []) for folders in (runs, before, after)
+    )
+    paired = {run.folder.resolve() for run in old.evaluations + new.evaluations}
+    rest = [run for run in found.evaluations if run.folder.resolve() not in paired]
     for video in videos or []:
         if not video.is_file():
             raise FileNotFoundError(f"No video {video}.")
-    return Report(training, rest, old, new, videos or [], title, suites)
-
-
-def _evaluations(folders: list[Path], scene: str) -> list[EvaluationRun]:
-    return find_runs(folders, scene)[1]
+    left_out = list(dict.fromkeys(found.left_out + old.left_out + new.left_out))
+    return Report(
+        found.training, rest, old.evaluations, new.evaluations, videos or [], title, found.suites, left_out
+    )
 
 
 def main() -> None:
@@ -96,6 +96,8 @@ def main() -> None:
     except (FileNotFoundError, ValueError) as error:
         sys.exit(f"error: {error}")
     page = write_report(report, args.output)
+    for text in report.left_out:
+        print(f"left out: {text}", file=sys.stderr)
     if report.comparisons:
         print(comparison_text(report.comparisons))
     print(f"Report: {page}")

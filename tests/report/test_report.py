@@ -10,12 +10,13 @@ import pytest
 from lerobot_env_cronos.scene.scenes import SCENES
 from synthetic_runs import INSTRUCTIONS, read_csv, write_evaluation, write_training_run
 
+from cronos_lerobot.report.comparisons import compare_training
 from cronos_lerobot.report.page import write_report
 from cronos_lerobot.report.runs import describe_protocol, find_runs, group_runs
 from cronos_lerobot.report.series import evaluation_curve, segment_history, segment_rates
 from cronos_lerobot.report.statistics import Gain, Rate, newcombe_interval
 from cronos_lerobot.report.tables import comparison_text, merge_statistics, seed_rows, speed_rows
-from cronos_lerobot.scripts.report import make_report
+from cronos_lerobot.scripts.report import main, make_report
 
 
 def test_newcombe_interval_of_the_paper():
@@ -41,8 +42,9 @@ def test_gain_of_nothing_covers_zero():
 def test_runs_are_found_below_a_folder_once(tmp_path):
     run = write_training_run(tmp_path / "all/train/a")
     write_evaluation(tmp_path / "all/eval/held_out", "independent_held_out")
-    training, evaluations, _ = find_runs([tmp_path / "all", run])
-    assert [r.name for r in training] == ["a"]
+    found = find_runs([tmp_path / "all", run])
+    evaluations = found.evaluations
+    assert [r.name for r in found.training] == ["a"]
     assert [(e.suite, e.overall) for e in evaluations] == [("independent_held_out", Rate(10, 32))]
     assert evaluations[0].tasks[INSTRUCTIONS[3]] == Rate(4, 8)
     with pytest.raises(FileNotFoundError, match="nothing"):
@@ -51,15 +53,73 @@ def test_runs_are_found_below_a_folder_once(tmp_path):
 
 def test_the_episodes_of_a_sequential_suite_are_named_after_their_ordering(tmp_path):
     write_evaluation(tmp_path, "sequential_held_out")
-    _, [evaluation], _ = find_runs([tmp_path])
+    (evaluation,) = find_runs([tmp_path]).evaluations
     assert list(evaluation.tasks) == ["ordering 0", "ordering 1", "ordering 2", "ordering 3"]
+
+
+def test_what_cannot_be_read_is_left_out_and_said(tmp_path, monkeypatch, capsys):
+    write_training_run(tmp_path / "whole")
+    write_training_run(tmp_path / "crashed")
+    (tmp_path / "crashed/metrics.jsonl").write_text("")
+    write_training_run(tmp_path / "cut")
+    (tmp_path / "cut/manifest.json").write_text('{"starts": [')
+    write_evaluation(tmp_path / "eval")
+    (tmp_path / "eval/eval_info.json").write_text("{}")
+    (tmp_path / "old").mkdir()
+    old = {"format": 1, "benchmark": {"environment": "lerobot_env_cronos/kitchen_2x2-v0"}, "sequential": {}}
+    (tmp_path / "old/results.json").write_text(json.dumps(old))
+    monkeypatch.setattr(sys, "argv", ["cronos-report", str(tmp_path), f"--output={tmp_path / 'out'}"])
+    main()
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("left out: ")]
+    page = (tmp_path / "out/index.html").read_text()
+    words = (
+        "crashed/metrics.jsonl has no record yet",
+        "cut/manifest.json is damaged",
+        "eval_info.json is damaged",
+    )
+    for what in (*words, "kitchen_2x2-v0; this is version 1"):
+        assert [what in line for line in said].count(True) == 1, what
+        assert what in page
+    assert len(said) == 4
+    # Where nothing is left there is no report.
+    with pytest.raises(ValueError, match="has no record yet"):
+        find_runs([tmp_path / "crashed"])
+
+
+def write_seeds(folder, policy=None):
+    """Two seeds that go from 2 of 8 successes in each task to 5 and 7."""
+    for seed, last in ((1, 5), (2, 7)):
+        manifest = write_training_run(folder / str(seed), seed=seed, successes=(2, 4, last)) / "manifest.json"
+        content = json.loads(manifest.read_text())
+        content["starts"][0]["config"]["policy"] = {"pretrained_path": policy}
+        manifest.write_text(json.dumps(content))
+    (comparison,) = compare_training(group_runs(find_runs([folder]).training))
+    return comparison.overall
+
+
+def test_one_base_evaluation_counts_once_however_many_seeds_begin_with_it(tmp_path):
+    gain = write_seeds(tmp_path, policy="base/clone")
+    assert (gain.before.successes, gain.before.n, gain.after.n, gain.value) == (8, 32, 64, 0.5)
+    # Seeds .625 and .875: t with one degree of freedom is 12.706, the standard error 1 / 8.
+    after = 12.706 / 8
+    assert gain.after.interval == (pytest.approx(0.75 - after, abs=1e-3), pytest.approx(0.75 + after, abs=1e-3))
+    # Wilson's interval of 8 in 32 is [.1325, .4211]; in quadrature as Newcombe has it.
+    low, high = 0.5 - (after**2 + 0.1711**2) ** 0.5, 0.5 + (after**2 + 0.1175**2) ** 0.5
+    assert gain.interval == (pytest.approx(low, abs=1e-3), pytest.approx(high, abs=1e-3))
+
+
+def test_seeds_from_scratch_have_a_start_each_and_their_gains_an_interval(tmp_path):
+    gain = write_seeds(tmp_path)
+    assert (gain.before.n, gain.value) == (64, 0.5)
+    # Gains .375 and .625.
+    assert gain.interval == (pytest.approx(0.5 - 12.706 / 8, abs=1e-3), pytest.approx(0.5 + 12.706 / 8, abs=1e-3))
 
 
 def test_unfinished_last_line_is_skipped(tmp_path):
     run = write_training_run(tmp_path / "a")
     with (run / "metrics.jsonl").open("a") as file:
         file.write('{"kind": "upd')
-    (read,), *_ = find_runs([run])
+    (read,) = find_runs([run]).training
     assert (len(read.updates), len(read.evaluations)) == (8, 3)
 
 
@@ -67,7 +127,7 @@ def test_groups_differ_in_more_than_the_seed_and_are_called_so(tmp_path):
     for interval in (160, 320):
         for seed in (0, 1):
             write_training_run(tmp_path / f"{interval}_{seed}", seed=seed, interval=interval)
-    groups = group_runs(find_runs([tmp_path])[0])
+    groups = group_runs(find_runs([tmp_path]).training)
     assert [group.label for group in groups] == ["T = 160", "T = 320"]
     assert [[run.seed for run in group.runs] for group in groups] == [[0, 1], [0, 1]]
 
@@ -75,7 +135,7 @@ def test_groups_differ_in_more_than_the_seed_and_are_called_so(tmp_path):
 def test_curve_of_seeds_is_their_mean_and_standard_deviation(tmp_path):
     write_training_run(tmp_path / "a", seed=0, successes=(2, 4, 6))
     write_training_run(tmp_path / "b", seed=1, successes=(2, 2, 2))
-    (group,) = group_runs(find_runs([tmp_path])[0])
+    (group,) = group_runs(find_runs([tmp_path]).training)
     curve = evaluation_curve(group, "interaction_steps")
     assert curve.x.tolist() == [0, 5120, 10240]
     assert curve.y.tolist() == [0.25, 0.375, 0.5]
@@ -87,7 +147,7 @@ def test_curve_of_seeds_is_their_mean_and_standard_deviation(tmp_path):
 
 def test_curve_of_one_run_has_its_wilson_interval(tmp_path):
     write_training_run(tmp_path / "a", successes=(2, 4, 6))
-    (group,) = group_runs(find_runs([tmp_path])[0])
+    (group,) = group_runs(find_runs([tmp_path]).training)
     curve = evaluation_curve(group, "interaction_steps")
     assert curve.low.tolist() == pytest.approx([Rate(8 * k, 32).interval[0] for k in (1, 2, 3)])
     assert not curve.is_band_over_seeds
@@ -97,7 +157,7 @@ def test_success_by_segment_of_the_last_part_and_over_the_run(tmp_path):
     run = write_training_run(tmp_path / "a", interval=320, updates=8)
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     updates = [line["rollout"]["success_by_segment"] for line in lines if line["kind"] == "update"]
-    (group,) = group_runs(find_runs([run])[0])
+    (group,) = group_runs(find_runs([run]).training)
     # The last quarter of 8 updates is 2, one whole cycle of 320 steps.
     expected = {int(k): Rate(*v) for update in updates[-2:] for k, v in update.items()}
     assert segment_rates(group) == expected
@@ -109,7 +169,7 @@ def test_success_by_segment_of_the_last_part_and_over_the_run(tmp_path):
 
 def test_speed_weighs_updates_by_their_time(tmp_path):
     run = write_training_run(tmp_path / "a")
-    (row,) = speed_rows(group_runs(find_runs([run])[0]))
+    (row,) = speed_rows(group_runs(find_runs([run]).training))
     # As many steps at 500/s as at 1000/s: the harmonic mean.
     assert row["steps_per_s"] == pytest.approx(2000 / 3)
     assert row["env share"] == pytest.approx(0.5)
@@ -172,7 +232,7 @@ def test_seeds_together_end_where_all_have_been(tmp_path):
     # The second run is killed half way.
     lines = (tmp_path / "b/metrics.jsonl").read_text().splitlines(keepends=True)
     (tmp_path / "b/metrics.jsonl").write_text("".join(lines[:6]))
-    (row,) = seed_rows(group_runs(find_runs([tmp_path])[0]))
+    (row,) = seed_rows(group_runs(find_runs([tmp_path]).training))
     assert (row["seeds"], row["interaction_steps"], row["interventions"]) == (2, 5120, 32)
     assert (row["success"], row["success ci95_low"], row["success ci95_high"]) == (0.625, 0.5, 0.75)
     # Gaps .75 to .5 and .75 to .25: on average .625 and .5, over steps and over resets alike.
@@ -194,7 +254,7 @@ def test_many_differences_of_the_protocol_are_put_as_the_paper_does(tmp_path):
         content = json.loads(manifest.read_text())
         content["starts"][0]["config"]["protocol"] |= changes
         manifest.write_text(json.dumps(content))
-    labels = [group.label for group in group_runs(find_runs([tmp_path])[0])]
+    labels = [group.label for group in group_runs(find_runs([tmp_path]).training)]
     assert labels == ["T = 160", "T = 320, EER, CL, HSR", "T = 320, EER, random order, 1 configuration(s)"]
 
 
@@ -223,8 +283,8 @@ def test_a_protocol_is_called_as_in_table_1(protocol, name):
 def test_seeds_of_one_protocol_are_called_by_it_and_a_run_by_its_name(tmp_path):
     for seed in (0, 1):
         write_training_run(tmp_path / f"mine_{seed}", seed=seed, interval=160)
-    assert [group.label for group in group_runs(find_runs([tmp_path])[0])] == ["T = 160"]
-    assert [group.label for group in group_runs(find_runs([tmp_path / "mine_1"])[0])] == ["mine_1"]
+    assert [group.label for group in group_runs(find_runs([tmp_path]).training)] == ["T = 160"]
+    assert [group.label for group in group_runs(find_runs([tmp_path / "mine_1"]).training)] == ["mine_1"]
 
 
 def test_resumed_run_stays_in_its_group(tmp_path):
@@ -237,14 +297,14 @@ def test_resumed_run_stays_in_its_group(tmp_path):
         resumed["config"]["policy"]["pretrained_path"] = "a/checkpoints/last"
         content["starts"] += [resumed] if name == "b" else []
         manifest.write_text(json.dumps(content))
-    assert len(group_runs(find_runs([tmp_path])[0])) == 1
+    assert len(group_runs(find_runs([tmp_path]).training)) == 1
 
 
 def test_of_two_runs_of_one_seed_the_longer_counts(tmp_path):
     write_training_run(tmp_path / "short", seed=1, successes=(2, 3, 4), updates=4)
     write_training_run(tmp_path / "long", seed=1, successes=(2, 4, 6))
     write_training_run(tmp_path / "other", seed=2, successes=(2, 4, 4))
-    (group,) = group_runs(find_runs([tmp_path])[0])
+    (group,) = group_runs(find_runs([tmp_path]).training)
     assert sorted(run.name for run in group.runs) == ["long", "other"]
     (row,) = seed_rows([group])
     assert row["seeds"] == 2

@@ -60,7 +60,7 @@ def test_results_of_cronos_eval(tmp_path):
     assert "eer 0010240, ordering 3, configuration 7: 2 done" in page
     content = base64.b64encode((tmp_path / "report/sequential.png").read_bytes()).decode()
     assert content in page
-    runs = find_runs([tmp_path / "e/chains", tmp_path / "greedy"])[2]
+    runs = find_runs([tmp_path / "e/chains", tmp_path / "greedy"]).suites
     assert [run.name for run in runs] == ["eer 0010240 (temperature=0.6)", "eer 0010240 (temperature=0)"]
     (tmp_path / "other").mkdir()
     (tmp_path / "other/results.json").write_text("[]")
@@ -72,7 +72,7 @@ def test_a_quick_evaluation_does_not_replace_the_whole_one(tmp_path):
     for name, successes, n in (("whole", [0.75, 0.5], 64), ("whole_quick", [0.25, 0.0], 16)):
         identity = {"identity": {"policy": "1a2b", "n_episodes": n, "orderings": 10}}
         write_results(tmp_path / name, "me/policy", {"sequential": {"train": chains(successes)}}, **identity)
-    runs = find_runs([tmp_path])[2]
+    runs = find_runs([tmp_path]).suites
     assert [(run.name, run.results["sequential"]["train"]["positions"][0]["success"]) for run in runs] == [
         ("me/policy (n_episodes=64)", 0.75), ("me/policy (n_episodes=16)", 0.25),
     ]  # fmt: skip
@@ -83,7 +83,7 @@ def test_pictures_of_another_renderer_are_another_evaluation(tmp_path):
     for name, successes, own in (("a", [0.75, 0.5], {}), ("b", [0.25, 0.0], {"renderer": "filament"})):
         content = {"sequential": {"train": chains(successes)}}
         write_results(tmp_path / name, "me/policy", content, identity=identity | own)
-    assert [run.name for run in find_runs([tmp_path])[2]] == [
+    assert [run.name for run in find_runs([tmp_path]).suites] == [
         "me/policy (renderer=classic)", "me/policy (renderer=filament)",
     ]  # fmt: skip
 

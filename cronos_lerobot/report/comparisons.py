@@ -1,0 +1,75 @@
+"""What trainings came to: success before and after."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from cronos_lerobot.report.runs import EvaluationRun, Group, TrainingRun, evaluation_rates
+from cronos_lerobot.report.statistics import Gain, Rate, SeedRate, sum_rates
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What a training came to: success before and after, by task."""
+
+    label: str
+    suite: str
+    tasks: dict[str, Gain]
+
+    @property
+    def overall(self) -> Gain:
+        """All tasks together."""
+        gains = self.tasks.values()
+        return Gain(sum_rates(gain.before for gain in gains), sum_rates(gain.after for gain in gains))
+
+
+def compare_training(groups: list[Group]) -> list[Comparison]:
+    """First and last periodic evaluation of every group, its seeds together."""
+    comparisons = []
+    for group in groups:
+        runs = [run for run in group.runs if len(run.evaluations) > 1]
+        if not runs:
+            continue
+        first, last = (
+            [evaluation_rates(run.evaluations[place]) for run in measured]
+            for place, measured in ((0, _different_starts(runs)), (-1, runs))
+        )
+        tasks = [task for task in first[0] if all(task in rates for rates in (*first, *last))]
+        gains = {
+            task: Gain(SeedRate.of(r[task] for r in first), SeedRate.of(r[task] for r in last)) for task in tasks
+        }
+        suite = f"periodic evaluation, {runs[0].evaluations[-1]['split']}"
+        comparisons.append(Comparison(group.label, suite, gains))
+    return comparisons
+
+
+def _different_starts(runs: list[TrainingRun]) -> list[TrainingRun]:
+    """Runs whose first evaluations are not of one and the same policy.
+
+    Seeds that begin with a saved policy measure it with the same episodes and random numbers: one evaluation, and
+    not one for each. Those that begin from scratch have a policy each.
+    """
+    by_policy = {
+        (run.config.get("policy") or {}).get("pretrained_path") or str(run.folder): run for run in runs[::-1]
+    }
+    return list(by_policy.values())[::-1]
+
+
+def compare_evaluations(before: list[EvaluationRun], after: list[EvaluationRun]) -> list[Comparison]:
+    """Evaluations of `lerobot-eval` of the same suite, before and after."""
+    comparisons = []
+    for suite in dict.fromkeys(run.suite for run in after):
+        old = _pool([run.tasks for run in before if run.suite == suite])
+        new = _pool([run.tasks for run in after if run.suite == suite])
+        gains = {task: Gain(old[task], rate) for task, rate in new.items() if task in old}
+        if gains:
+            comparisons.append(Comparison("lerobot-eval", suite, gains))
+    return comparisons
+
+
+def _pool(tables: list[dict[str, Rate]]) -> dict[str, Rate]:
+    pooled: dict[str, Rate] = {}
+    for table in tables:
+        for task, rate in table.items():
+            pooled[task] = pooled.get(task, Rate(0, 0)) + rate
+    return pooled
