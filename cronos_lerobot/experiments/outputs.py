@@ -101,7 +101,7 @@ def markdown(result: ExperimentResult, figures: Sequence[str]) -> str:
 
 NOTES = (
     "Numbers are mean ± standard deviation (ddof = 1) over the seeds that are finished; in brackets the 95 %"
-    " percentile bootstrap interval of the mean over seeds, of one seed alone the Wilson interval of its"
+    " t-interval of the mean over seeds, of one seed alone the Wilson interval of its"
     " evaluation. n: episodes of one seed's evaluation. D and C are the areas between the curve and 1.0 over"
     " interaction steps and over interventions (Equations 3 and 4), divided by the length of the axis: smaller is"
     " better."

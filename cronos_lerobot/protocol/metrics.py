@@ -10,17 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite, nan
+from math import isfinite, nan, sqrt
 from typing import Any
 
 import numpy as np
+from scipy.stats import t as student_t
 
 Numbers = Sequence[float] | np.ndarray
 
 OPTIMUM = 1.0
 """J of the optimal policy: it always succeeds."""
-RESAMPLES = 10_000
-"""Bootstrap samples."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,7 @@ class Summary:
     std: float | None
     """Sample standard deviation (ddof = 1); None for one seed."""
     ci95: tuple[float, float] | None
-    """95 % percentile bootstrap interval of the mean over the seeds; None for one seed."""
+    """95 % t-interval of the mean over the seeds; None for one seed."""
     n: int
     """Seeds."""
 
@@ -120,22 +119,21 @@ class Summary:
         return f"{self.mean:.3f}" if self.std is None else f"{self.mean:.3f} ± {self.std:.3f}"
 
 
-def summarise(values: Numbers, seed: int = 0) -> Summary | None:
-    """Mean, standard deviation and bootstrap interval over the seeds; None if a value is missing or none is there.
+def summarise(values: Numbers) -> Summary | None:
+    """Mean, standard deviation and t-interval over the seeds; None if a value is missing or none is there.
 
-    Seeds, not episodes, are resampled: 10,000 times, with a generator of its own, so that the same values always
-    get the same interval. With few seeds it is too narrow: five have 126 different resamples.
+    The interval is Student's, mean +- t std / sqrt(n) with n - 1 degrees of freedom. With the three to five seeds
+    of an experiment it covers what it says, where resampling three seeds covers .73 and five .84.
 
     Args:
         values: one for each seed; NaN is a missing value.
-        seed: of the generator.
     """
     numbers = np.asarray(values, float)
     if len(numbers) == 0 or not np.isfinite(numbers).all():
         return None
+    mean = float(numbers.mean())
     if len(numbers) == 1:
-        return Summary(float(numbers[0]), None, None, 1)
-    rng = np.random.default_rng(seed)
-    means = numbers[rng.integers(len(numbers), size=(RESAMPLES, len(numbers)))].mean(1)
-    low, high = np.percentile(means, [2.5, 97.5])
-    return Summary(float(numbers.mean()), float(numbers.std(ddof=1)), (float(low), float(high)), len(numbers))
+        return Summary(mean, None, None, 1)
+    std = float(numbers.std(ddof=1))
+    half = float(student_t.ppf(0.975, len(numbers) - 1)) * std / sqrt(len(numbers))
+    return Summary(mean, std, (mean - half, mean + half), len(numbers))
