@@ -243,7 +243,7 @@ def test_seeds_together_end_where_all_have_been(tmp_path):
     assert row["C / interventions"] == pytest.approx(row["D / steps"])
     assert row["D / steps std"] == pytest.approx(0.125 / 2**0.5)
     (merged,) = merge_statistics([row])
-    assert merged["success"] == "0.625 ± 0.18 [0.5, 0.75]"
+    assert merged["success"] == "0.625 ± 0.18 [-0.963, 2.21]"
     assert "success std" not in merged
 
 
