@@ -62,6 +62,7 @@ def write_training_run(folder, *, seed=0, interval=320, successes=(2, 3, 5), upd
         "protocol": {"scene_reset_interval": interval},
     }
     start = {"command": ["cronos-train"], "versions": {"mujoco": "4.0.0"}, "config": config}
+    start["environment"] = "lerobot_env_cronos/kitchen_2x2-v1"
     (folder / "manifest.json").write_text(json.dumps({"starts": [start]}))
     return folder
 

@@ -67,13 +67,26 @@ def run_independent(
     return [by_chain[chain] for chain in part.chains]
 
 
-def evaluate_independent(env: SequentialVectorEnv, *args: Any, **options: Any) -> dict[str, Any]:
+def evaluate_independent(
+    env: SequentialVectorEnv, *args: Any, seed: int, repetitions: int = 1, **options: Any
+) -> dict[str, Any]:
     """`run_independent` in numbers.
+
+    Args:
+        env: as there, and so are the others.
+        args: as there.
+        seed: of the sampling; a repetition has the next one.
+        repetitions: episodes of each task and configuration.
+        options: as there.
 
     Returns:
         `split`, `temperature`, `steps` (control steps of all episodes) and `independent_results`.
     """
-    records = chain_records(run_independent(env, *args, **options))
+    records = [
+        record
+        for repetition in range(repetitions)
+        for record in chain_records(run_independent(env, *args, seed=seed + repetition, **options))
+    ]
     groups = env.benchmark.groups("independent", options["split"])
     header = {"split": options["split"], "temperature": options["temperature"]}
     header |= {"steps": sum(record["steps"] for record in records)}

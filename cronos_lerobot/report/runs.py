@@ -10,6 +10,7 @@ from typing import Any
 
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from lerobot_env_cronos import check_environment_id
 from lerobot_env_cronos.scene.scenes import SCENES
 
 from cronos_lerobot.evaluation.store import RESULTS
@@ -184,6 +185,9 @@ def read_training_run(folder: Path) -> TrainingRun:
         starts = json.loads(manifest.read_text())["starts"] if manifest.is_file() else []
     except ValueError as error:
         raise ValueError(f"{manifest} is damaged: {error}") from error
+    # Null is an environment of another kind.
+    if starts and (made_in := starts[0].get("environment", "")) is not None:
+        check_environment_id(made_in or None, f"the run in {folder}", "train it anew")
 
     return TrainingRun(
         folder,

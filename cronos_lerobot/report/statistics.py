@@ -56,7 +56,7 @@ class SeedRate(Rate):
     def interval(self) -> tuple[float, float]:
         """95 % t-interval of the mean over the seeds; Wilson's of one alone."""
         summary = summarise([rate.value for rate in self.seeds])
-        return (summary and summary.ci95) or super().interval
+        return super().interval if summary is None or summary.ci95 is None else summary.ci95
 
     def __add__(self, other: Rate) -> Rate:
         """Both sets of episodes together, seed by seed if they are of as many."""

@@ -100,6 +100,8 @@ class PeriodicEvaluationConfig:
 
     n_episodes: int = NUM_CONFIGURATIONS
     """Configurations for each task, 1 to 64: the first ones of the split."""
+    repetitions: int = 1
+    """Episodes of each task and configuration, each with random numbers of its own."""
     split: str = "train"
     """Configurations to evaluate on: `train` or `held_out`."""
     temperature: float = 0.6
@@ -112,6 +114,10 @@ class PeriodicEvaluationConfig:
     def __post_init__(self) -> None:
         if not 1 <= self.n_episodes <= NUM_CONFIGURATIONS:
             raise ValueError(f"eval.n_episodes must be 1 to {NUM_CONFIGURATIONS}, got {self.n_episodes}.")
+        if self.repetitions < 1:
+            raise ValueError(f"eval.repetitions must be >= 1, got {self.repetitions}.")
+        if self.repetitions > 1 and not self.temperature:
+            raise ValueError(f"eval.repetitions={self.repetitions} would all be alike at eval.temperature=0.")
         if self.split not in ("train", "held_out"):
             raise ValueError(f"eval.split must be 'train' or 'held_out', got {self.split!r}.")
         if self.temperature < 0:
@@ -152,7 +158,10 @@ class CronosTrainConfig:
     """The periodic evaluation."""
     eval_freq: int = 102_400
     """Interaction steps between two evaluations; one more before the first step, one after the last.
-    0 never evaluates."""
+    0 never does so by the steps."""
+    eval_at_interventions: list[int] = field(default_factory=list)
+    """Evaluate also at the first policy update at which so many interventions have been counted, for each of
+    these: what a run came to after 1000 of them is then measured."""
     save_checkpoint: bool = True
     """Save checkpoints."""
     save_freq: int = 102_400
@@ -178,6 +187,8 @@ class CronosTrainConfig:
         for name in ("eval_freq", "save_freq", "seed"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}.")
+        if any(count < 1 for count in self.eval_at_interventions):
+            raise ValueError(f"eval_at_interventions must be >= 1 each, got {self.eval_at_interventions}.")
         for name in ("keep_checkpoints", "torch_threads"):
             if (value := getattr(self, name)) is not None and value < 1:
                 raise ValueError(f"{name} must be >= 1 or null, got {value}.")

@@ -18,8 +18,8 @@ RUN = "run.json"
 
 _TABLE = {
     "": {
-        FOLLOWED: "resume steps job_name eval_freq save_checkpoint save_freq keep_checkpoints log_freq "
-        "tensorboard torch_threads wandb.*",
+        FOLLOWED: "resume steps job_name eval_freq eval_at_interventions save_checkpoint save_freq "
+        "keep_checkpoints log_freq tensorboard torch_threads wandb.*",
         REFUSED: "output_dir seed num_envs",
     },
     "env.": {
@@ -43,7 +43,7 @@ _TABLE = {
         REFUSED: "type kl_base_coef temperature",
     },
     "record.": {FOLLOWED: "flush_interval_s", REFUSED: "repo_id root streams filmed_streams"},
-    "eval.": {FOLLOWED: "n_episodes split temperature batch_size seed"},
+    "eval.": {FOLLOWED: "n_episodes repetitions split temperature batch_size seed"},
 }
 FLAGS = {
     group + name: rule

@@ -79,6 +79,7 @@ class Trainer:
         self.agent = PPOAgent(ppo, buffer, actions, self.stopwatch, mine)
         self.loop = self.task_set.new_loop(config.num_envs)
         self._last_evaluation = 0
+        self._last_interventions = 0
         recorded = config.record.num_streams
         self._num_recorded = config.num_envs if isinstance(recorded, str) else recorded
         self._observers: dict[str, Any] = {}
@@ -103,6 +104,7 @@ class Trainer:
             return
         self._observers = load_checkpoint(self.run_state, self.config, self.config.checkpoint_path)
         self._last_evaluation = self._observers["last_evaluation"]
+        self._last_interventions = self._observers["last_interventions"]
         self.statistics.load_state_dict(self._observers["statistics"])
         budget = self.config.protocol.reset_budget
         if self.loop.n >= self.config.total_steps:
@@ -152,8 +154,9 @@ class Trainer:
             updated = False
             self._check_processes()
             self._log_update()
-            if _due(self.loop.n, self._last_evaluation, self.config.eval_freq):
+            if _due(self.loop.n, self._last_evaluation, self.config.eval_freq) or self._reached():
                 self._evaluate()
+            self._last_interventions = self.loop.b
             if self.config.save_checkpoint and _due(self.loop.n, last_save, self.config.save_freq):
                 self._save(env_state)
                 last_save = self.loop.n
@@ -210,9 +213,14 @@ class Trainer:
         if self.loop.updates % self.config.log_freq == 0:
             self.logger.progress(rates | {"steps_per_s": steps_per_s})
 
+    def _reached(self) -> list[int]:
+        """Those of `eval_at_interventions` that were reached since the last policy update."""
+        wanted = self.config.eval_at_interventions
+        return [count for count in wanted if self._last_interventions < count <= self.loop.b]
+
     def _evaluate(self) -> None:
         self._last_evaluation = self.loop.n
-        if not self.config.eval_freq:
+        if not (self.config.eval_freq or self.config.eval_at_interventions):
             return
         options = self.config.eval
         if self._eval_env is None:
@@ -223,12 +231,13 @@ class Trainer:
             self.policy,
             self.processors,
             n_episodes=options.n_episodes,
+            repetitions=options.repetitions,
             split=options.split,
             temperature=options.temperature,
             seed=options.seed,
             processes=self.processes,
         )
-        self.logger.log("evaluation", result)
+        self.logger.log("evaluation", result | {"at_interventions": self._reached()})
         self.stopwatch.lap()
 
     def _save(self, env_state: dict[str, np.ndarray]) -> None:
@@ -236,6 +245,7 @@ class Trainer:
             "logger": self.logger.state_dict(),
             "recorder": self.recorder.state_dict(),
             "last_evaluation": self._last_evaluation,
+            "last_interventions": self._last_interventions,
             "statistics": self.statistics.state_dict(),
         }
         self.logger.log_checkpoint(save_checkpoint(self.run_state, self.config, observers, env_state))

@@ -55,6 +55,22 @@ def test_the_split_reaches_the_environment_and_only_configurations_that_are_aske
     assert seen == [([0, 1] * 4, "held_out")]
 
 
+def test_repetitions_are_as_many_episodes_with_random_numbers_of_their_own():
+    class Restless(DummyPolicy):
+        """Keeps still, and remembers the first random number of each episode batch."""
+
+        def sample_actions(self, batch, *, temperature=1.0, generator=None):
+            draws.append(float(torch.rand(1, generator=generator)))
+            return {"action": torch.zeros(len(batch["task"]), 7)}
+
+    draws = []
+    result = evaluate(DummyEnv(4), Restless(), n_episodes=1, repetitions=3)
+    assert (result["n"], {rate["n"] for rate in result["per_task"].values()}) == (12, {3})
+    # 80 decisions of all four tasks at once, three times over.
+    assert len(draws) == 240
+    assert len({tuple(draws[i : i + 80]) for i in (0, 80, 160)}) == 3
+
+
 def test_it_leaves_the_global_generators_and_the_policys_mode_alone():
     policy = DummyPolicy(seed=1).train()
     torch.manual_seed(0)

@@ -63,6 +63,10 @@ def test_what_cannot_be_read_is_left_out_and_said(tmp_path, monkeypatch, capsys)
     (tmp_path / "crashed/metrics.jsonl").write_text("")
     write_training_run(tmp_path / "cut")
     (tmp_path / "cut/manifest.json").write_text('{"starts": [')
+    manifest = write_training_run(tmp_path / "v0") / "manifest.json"
+    content = json.loads(manifest.read_text())
+    del content["starts"][0]["environment"]
+    manifest.write_text(json.dumps(content))
     write_evaluation(tmp_path / "eval")
     (tmp_path / "eval/eval_info.json").write_text("{}")
     (tmp_path / "old").mkdir()
@@ -80,7 +84,7 @@ def test_what_cannot_be_read_is_left_out_and_said(tmp_path, monkeypatch, capsys)
     for what in (*words, "kitchen_2x2-v0; this is version 1"):
         assert [what in line for line in said].count(True) == 1, what
         assert what in page
-    assert len(said) == 4
+    assert len(said) == 5
     # Where nothing is left there is no report.
     with pytest.raises(ValueError, match="has no record yet"):
         find_runs([tmp_path / "crashed"])
@@ -243,7 +247,7 @@ def test_seeds_together_end_where_all_have_been(tmp_path):
     assert row["C / interventions"] == pytest.approx(row["D / steps"])
     assert row["D / steps std"] == pytest.approx(0.125 / 2**0.5)
     (merged,) = merge_statistics([row])
-    assert merged["success"] == "0.625 ± 0.18 [-0.963, 2.21]"
+    assert merged["success"] == "0.625 ± 0.18 [-0.9633, 2.213]"
     assert "success std" not in merged
 
 

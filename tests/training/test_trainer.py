@@ -105,6 +105,27 @@ def test_resumed_run_equals_the_unbroken_one(tmp_path):
     assert len(json.loads((broken / "manifest.json").read_text())["starts"]) == 2
 
 
+def test_evaluations_at_so_many_interventions(tmp_path):
+    """Four streams, reset every 16 steps, updates every 8: 4 counted interventions at every second update."""
+    options = {"eval_freq": 0, "eval_at_interventions": [1, 4, 5], "steps": 6 * STEPS_PER_UPDATE}
+    train(config(tmp_path / "run", **options), env=DummyEnv(STREAMS))
+    found = [
+        (line["interaction_steps"], line["interventions"], line["at_interventions"])
+        for line in metrics(tmp_path / "run")
+        if line["kind"] == "evaluation"
+    ]
+    spent = {line["interaction_steps"]: line["interventions"] for line in metrics(tmp_path / "run")}
+    first = next(n for n, b in sorted(spent.items()) if b >= 4)
+    second = next(n for n, b in sorted(spent.items()) if b >= 8)
+    assert found[:3] == [(0, 0, []), (first, 4, [1, 4]), (second, 8, [5])]
+    # The end is evaluated as always.
+    assert [n for n, _, _ in found[3:]] in ([], [6 * STEPS_PER_UPDATE])
+    # The run itself is that without them.
+    train(config(tmp_path / "without", **options | {"eval_at_interventions": []}), env=DummyEnv(STREAMS))
+    for name, tensor in weights(tmp_path / "run").items():
+        assert torch.equal(tensor, weights(tmp_path / "without")[name]), name
+
+
 def test_a_kill_during_the_last_evaluation_does_not_lose_it(tmp_path, monkeypatch):
     short = {"steps": 3 * STEPS_PER_UPDATE, "eval_freq": 2 * STEPS_PER_UPDATE}
     unbroken, broken = config(tmp_path / "unbroken", **short), config(tmp_path / "broken", **short)
