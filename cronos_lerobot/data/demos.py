@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, REWARD
 from lerobot_env_cronos import CronosVectorEnv, Task
-from lerobot_env_cronos.benchmark.configurations import sample_configuration
+from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS, sample_configuration
 from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW
 
 from cronos_lerobot.agents.processing import observation_columns
@@ -47,6 +47,8 @@ class StartConfig:
 
     layouts: str = "train"
     """`train`: the scene's 64 training configurations in turn; `random`: freshly drawn layouts."""
+    num_configurations: int = NUM_CONFIGURATIONS
+    """Of the training configurations the first so many; a policy cloned from one has only ever seen that one."""
     arm_pose: str = "home"
     """`home`; `random`: at a random place above the table; `after_task`: where another task left it."""
     occupied_receptacles: bool = False
@@ -60,6 +62,10 @@ class StartConfig:
             raise ValueError(f"unknown start.layouts {self.layouts!r}; valid: {list(LAYOUTS)}")
         if self.arm_pose not in ARM_POSES:
             raise ValueError(f"unknown start.arm_pose {self.arm_pose!r}; valid: {list(ARM_POSES)}")
+        if not 1 <= self.num_configurations <= NUM_CONFIGURATIONS:
+            raise ValueError(
+                f"start.num_configurations must be 1 to {NUM_CONFIGURATIONS}, got {self.num_configurations}"
+            )
         if not 0 <= self.share <= 1:
             raise ValueError(f"start.share must be between 0 and 1, got {self.share}")
 
@@ -234,7 +240,8 @@ class DemoCollector:
 
     def _new_episode(self, stream: int, task: Task) -> _Episode:
         rng = np.random.default_rng((*self._seed, self._started))
-        number = self._tried[task] % len(self.env.benchmark.configurations["train"])
+        available = len(self.env.benchmark.configurations["train"])
+        number = self._tried[task] % min(self.config.start.num_configurations, available)
         self._tried[task] += 1
         self._started += 1
         start, ids = self.config.start, np.array([stream])

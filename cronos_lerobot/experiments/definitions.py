@@ -213,6 +213,13 @@ _ALL = (
         evaluations=(HELD_OUT_CURVE,),
     ),
 )
+PAPER_BUDGETS = {
+    steps: tuple(
+        sorted({budget for experiment in _ALL if experiment.steps == steps for budget in experiment.budgets})
+    )
+    for steps in (SHORT, LONG)
+}
+"""Numbers of interventions at which runs of so many of the paper's steps are evaluated, whoever shares them."""
 EXPERIMENTS: dict[str, Experiment] = {experiment.name: experiment for experiment in _ALL}
 """Experiments by name. Runs with the same settings are shared between them."""
 

@@ -11,7 +11,14 @@ from typing import Any
 from cronos_lerobot.experiments import plots, tables
 from cronos_lerobot.experiments.definitions import Experiment, Row
 from cronos_lerobot.experiments.jobs import this_commit
-from cronos_lerobot.experiments.results import ExperimentResult, RowResult, collect, paper_results
+from cronos_lerobot.experiments.results import (
+    APART,
+    AtBudget,
+    ExperimentResult,
+    RowResult,
+    collect,
+    paper_results,
+)
 from cronos_lerobot.experiments.specs import Options, base_policy
 from cronos_lerobot.protocol.metrics import Summary
 from cronos_lerobot.report.statistics import Rate
@@ -20,6 +27,7 @@ from cronos_lerobot.training.logging import METRICS
 
 DPI = 150
 MISSING = "–"
+NOT_APPLICABLE = "not applicable"
 
 
 def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options, folder: Path) -> str:
@@ -85,10 +93,11 @@ def _settings(result: ExperimentResult) -> dict[str, Any]:
 
 def markdown(result: ExperimentResult, figures: Sequence[str]) -> str:
     """The page: what was run, the table, what the paper's text says, the figures, what is missing."""
-    lines = [*_introduction(result), "", *_table(_main_columns(result)), "", NOTES]
+    lines = [*_introduction(result), "", *_table(_main_columns(result)), "", NOTES, "", PPO_NOTES]
     if result.experiment.source:
         lines += _about_the_paper(result)
-    lines += _section("Success after so many interventions", _budget_columns(result))
+    if budget_columns := _budget_columns(result):
+        lines += [*_section("Success after so many interventions", budget_columns), *_budget_notes(result)]
     lines += _section("What the text says", _claim_columns(tables.claim_rows(result)))
     lines += _section("Sequences of tasks", _sequential_columns(tables.sequential_rows(result)))
     lines += _section("Success while training, by segment since the last scene reset", _segment_columns(result))
@@ -104,7 +113,16 @@ NOTES = (
     " t-interval of the mean over seeds, of one seed alone the Wilson interval of its"
     " evaluation. n: episodes of one seed's evaluation. D and C are the areas between the curve and 1.0 over"
     " interaction steps and over interventions (Equations 3 and 4), divided by the length of the axis: smaller is"
-    " better."
+    " better. Found complete, never grasped: of the successes at the end, all seeds together, those for which"
+    " nothing had to be done, and others without a grasp."
+)
+BUDGET_NOTES = (
+    "A number without a mark is measured, by the evaluation at the first policy update at which so many"
+    " interventions had been counted; ~ is interpolated between two evaluations."
+)
+PPO_NOTES = (
+    "A scale is that of steps, streams and seeds. The learning algorithm is `ppo`, with this project's settings,"
+    " at every scale; the paper's settings are `-- --algorithm.type=ppo_paper`."
 )
 
 
@@ -155,6 +173,8 @@ def _main_columns(result: ExperimentResult) -> Columns:
         columns[f"success{suffix}"] = [_cell(summary) for summary in summaries]
         columns[f"95 %{suffix}"] = [_interval(summary) for summary in summaries]
         columns[f"n{suffix}"] = [str(row[f"n_{split}"] or MISSING) for row in rows]
+        for name in APART:
+            columns[f"{name.replace('_', ' ')}{suffix}"] = [_number(row[f"{name}_{split}"], 0) for row in rows]
     columns["seeds"] = [f"{row['seeds']}/{row['seeds_wanted']}" for row in rows]
     if any(row["paper_mean"] is not None for row in rows):
         columns["paper"] = [f"{row['paper_mean']:.3f} ± {row['paper_std']:.3f}" for row in rows]
@@ -174,7 +194,25 @@ def _budget_columns(result: ExperimentResult) -> Columns:
     if not rows:
         return {}
     columns: Columns = {"": [row.row.label for row in rows]}
-    return columns | {f"{n:,}": [_cell(row.success_at(n)) for row in rows] for n in tables.budgets(result)}
+    return columns | {f"{n:,}": [_at(row.success_at(n)) for row in rows] for n in tables.budgets(result)}
+
+
+def _at(found: AtBudget) -> str:
+    return NOT_APPLICABLE if found.reason else "~" * bool(found.between and found.summary) + _cell(found.summary)
+
+
+def _budget_notes(result: ExperimentResult) -> list[str]:
+    """What is measured, and for each cell that is not, why or between what it is interpolated."""
+    lines = []
+    for row in result.rows:
+        for budget in tables.budgets(result) if row.finished else ():
+            found = row.success_at(budget)
+            if found.reason:
+                lines.append(f"- {row.row.label} at {budget:,}: not applicable, {found.reason}.")
+            elif found.between and found.summary:
+                low, high = found.between
+                lines.append(f"- {row.row.label} at {budget:,}: a straight line between {low:,} and {high:,}.")
+    return ["", BUDGET_NOTES, *([""] if lines else []), *lines]
 
 
 def _claim_columns(claims: list[dict[str, Any]]) -> Columns:
@@ -184,20 +222,29 @@ def _claim_columns(claims: list[dict[str, Any]]) -> Columns:
     return {
         "": [claim["claim"] for claim in claims],
         "paper": [_number(claim["paper"], n) for claim, n in zip(claims, digits, strict=True)],
-        "here": [_number(claim["ours"], n) for claim, n in zip(claims, digits, strict=True)],
+        "here": [_ours(claim, n) for claim, n in zip(claims, digits, strict=True)],
     }
+
+
+def _ours(claim: dict[str, Any], digits: int) -> str:
+    if claim["not_applicable"]:
+        return f"{NOT_APPLICABLE}: {claim['not_applicable']}"
+    return "~" * claim["interpolated"] + _number(claim["ours"], digits)
 
 
 def _sequential_columns(rows: list[dict[str, Any]]) -> Columns:
     if not rows:
         return {}
     columns: Columns = {"": [row["row"] for row in rows], "split": [row["split"] for row in rows]}
+    columns["orderings"] = [row["orderings"] for row in rows]
     measures = [key.removesuffix("_mean") for key in rows[0] if key.endswith("_mean")]
     for measure in measures:
         columns[measure.replace("_", " ")] = [
             _plus_minus(row[f"{measure}_mean"], row[f"{measure}_std"]) for row in rows
         ]
     columns["chains"] = [str(row["n"]) for row in rows]
+    columns["found complete"] = [str(row["found_complete"]) for row in rows]
+    columns["never grasped"] = [str(row["never_grasped"]) for row in rows]
     columns["seeds"] = [str(row["seeds"]) for row in rows]
     return columns
 

@@ -41,26 +41,28 @@ def make_jobs(experiments: Iterable[tuple[Experiment, tuple[Row, ...]]], options
     """All jobs of some experiments with their chosen rows, each once, in an order that runs."""
     jobs: dict[str, Job] = {}
     for experiment, rows in experiments:
-        base = [] if options.policy_path else base_jobs(experiment.scene, options)
-        jobs |= {job.name: job for job in base}
         for spec in run_specs(experiment, options, rows):
+            configurations = spec.row.num_configurations
+            base = [] if options.policy_path else base_jobs(experiment.scene, options, configurations)
+            jobs |= {job.name: job for job in base}
             train = train_job(spec, base[-1].name if base else None)
             jobs |= {train.name: train}
             for evaluation in experiment.evaluations:
-                base_evaluations = base_evaluation_jobs(experiment.scene, options, evaluation)
+                base_evaluations = base_evaluation_jobs(experiment.scene, options, evaluation, configurations)
                 jobs |= {job.name: job for job in base_evaluations}
                 jobs |= {job.name: job for job in evaluation_jobs(spec, evaluation)}
     return list(jobs.values())
 
 
-def base_jobs(scene: str, options: Options) -> list[Job]:
-    """Demonstrations of the expert, and their cloning: two jobs."""
-    folder, recipe = base_folder(scene, options), options.recipes[scene]
+def base_jobs(scene: str, options: Options, configurations: int = 64) -> list[Job]:
+    """Demonstrations of the expert in the first `configurations`, and their cloning: two jobs."""
+    folder, recipe = base_folder(scene, options, configurations), options.recipes[scene]
     pixels = OBS_NAMES[options.obs_type] == "pixels"
     dataset = (f"--dataset.repo_id=local/{folder.name}", f"--dataset.root={folder / 'demos'}")
     record = ["cronos-record-demos", "--env.type=cronos", f"--env.scene={scene}", *dataset]
     record += [f"--env.obs_type={options.obs_type}", f"--dataset.num_episodes={recipe.demos}", "--seed=1"]
     record += [] if recipe.clean else DIVERSE_DEMO_FLAGS
+    record += [] if configurations == 64 else [f"--start.num_configurations={configurations}"]
     clone = ["lerobot-train", "--policy.type=pocketvla", "--policy.device=cpu", "--policy.push_to_hub=false"]
     clone += [*dataset, f"--batch_size={recipe.clone_batch}", f"--steps={recipe.clone_steps}"]
     clone += [f"--save_freq={recipe.save_freq}", "--log_freq=40", "--wandb.enable=false", "--seed=1"]
@@ -105,16 +107,20 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
     """One run of `cronos-train`."""
     options = spec.options
     episodes = min(options.scale.eval_episodes, spec.row.num_configurations)
+    # From few configurations as many episodes as from all.
+    repetitions = options.scale.eval_episodes // episodes if options.temperature else 1
     command = [
         "cronos-train",
-        f"--policy.path={base_policy(spec.scene, options)}",
+        f"--policy.path={base_policy(spec.scene, options, spec.row.num_configurations)}",
         *ALGORITHM_FLAGS[options.obs_type],
         "--env.type=cronos",
         f"--env.scene={spec.scene}",
         f"--env.obs_type={options.obs_type}",
         *train_flags(spec),
         f"--eval_freq={options.scale.eval_freq}",
+        f"--eval_at_interventions={json.dumps(spec.budgets)}",
         f"--eval.n_episodes={episodes}",
+        f"--eval.repetitions={repetitions}",
         f"--eval.temperature={options.temperature}",
         f"--save_freq={options.scale.eval_freq}",
         f"--env.num_threads={options.threads}",
@@ -176,14 +182,17 @@ def checkpoint_evaluations(spec: RunSpec, evaluation: CheckpointEvaluation) -> l
     return jobs
 
 
-def base_evaluation_jobs(scene: str, options: Options, evaluation: CheckpointEvaluation) -> list[Job]:
+def base_evaluation_jobs(
+    scene: str, options: Options, evaluation: CheckpointEvaluation, configurations: int = 64
+) -> list[Job]:
     """`cronos-eval` of the base policy, where curves begin."""
     if not evaluation.every_checkpoint:
         return []
-    jobs, needed = [], None if options.policy_path else base_jobs(scene, options)[-1].name
+    jobs, needed = [], None if options.policy_path else base_jobs(scene, options, configurations)[-1].name
     for split in evaluation.splits:
-        folder = base_evaluation_folder(scene, evaluation.suite, split, options)
-        command = eval_command(base_policy(scene, options), scene, evaluation.suite, split, folder, options)
+        folder = base_evaluation_folder(scene, evaluation.suite, split, options, configurations)
+        policy = base_policy(scene, options, configurations)
+        command = eval_command(policy, scene, evaluation.suite, split, folder, options)
         command = _with_flags(command, _env_flags(options.extra))
         jobs.append(_eval_job(f"base/{folder.parent.name}/{folder.name}", command, folder, needed, scene))
     return jobs

@@ -23,6 +23,7 @@ from cronos_lerobot.report.runs import Group, TrainingRun, read_training_run
 from cronos_lerobot.training.logging import METRICS
 
 RESULTS = "results.json"
+APART = ("found_complete", "never_grasped")
 
 
 @dataclass(frozen=True)
@@ -34,10 +35,27 @@ class Point:
     success: float
     n: int
     ci95: tuple[float, float]
+    apart: dict[str, int] = field(default_factory=dict)
+    """Of the successes, those `found_complete` and those `never_grasped`."""
+    at_interventions: tuple[int, ...] = ()
+    """Numbers of interventions that the evaluation was made for."""
 
     def x(self, axis: str) -> int:
         """The point's place on `axis`, interaction_steps or interventions."""
         return self.interventions if axis == INTERVENTIONS else self.interaction_steps
+
+
+@dataclass(frozen=True)
+class AtBudget:
+    """Success after a number of interventions."""
+
+    summary: Summary | None
+    """Over the finished seeds; None if one of them did not get there."""
+    between: tuple[int, int] | None = None
+    """Interventions of the evaluations between which a seed is interpolated, the furthest apart; None if all are
+    measured."""
+    reason: str = ""
+    """Why there is no number and never will be."""
 
 
 @dataclass
@@ -115,10 +133,35 @@ class RowResult:
         curves = [seed.curve(split) for seed in self.finished]
         return [performance_gap(*_xy(curve, axis), up_to) for curve in curves if curve]
 
-    def success_at(self, interventions: float, split: str = "train") -> Summary | None:
-        """Success after so many interventions; None if a finished seed did not get there."""
-        curves = [seed.curve(split) for seed in self.finished]
-        return summarise([success_at(*_xy(curve, INTERVENTIONS), interventions) for curve in curves if curve])
+    def success_at(self, interventions: int, split: str = "train") -> AtBudget:
+        """Success after so many interventions.
+
+        Measured by the evaluation at the first policy update that came to so many, else interpolated.
+        """
+        finished = [
+            (curve, seed.run.last["interventions"]) for seed in self.finished if (curve := seed.curve(split))
+        ]
+        if finished and max(last for _, last in finished) < interventions:
+            return AtBudget(
+                None, reason=f"the runs ended after {max(last for _, last in finished):,} interventions"
+            )
+        values: list[float] = []
+        gaps: list[tuple[int, int]] = []
+        for curve, _ in finished:
+            measured = [p for p in curve if interventions in (p.interventions, *p.at_interventions)]
+            if measured:
+                values.append(measured[-1].success)
+                continue
+            values.append(success_at(*_xy(curve, INTERVENTIONS), interventions))
+            places = [point.interventions for point in curve]
+            before, after = [x for x in places if x < interventions], [x for x in places if x > interventions]
+            gaps += [(max(before), min(after))] if before and after else []
+        return AtBudget(summarise(values), max(gaps, key=lambda gap: gap[1] - gap[0], default=None))
+
+    def apart(self, split: str) -> dict[str, int]:
+        """Of all finished seeds' successes at the end, those found complete and those never grasped."""
+        points = self.finals(split)
+        return {name: sum(p.apart[name] for p in points) for name in APART if points and name in points[0].apart}
 
 
 @dataclass
@@ -167,7 +210,7 @@ def _read_seed(spec: RunSpec, result: ExperimentResult) -> SeedResult | None:
         return None
     result.commits += [f"{spec.name}: {commit}" for commit in other_commits(job)]
     for evaluation in result.experiment.evaluations:
-        for job in base_evaluation_jobs(spec.scene, spec.options, evaluation):
+        for job in base_evaluation_jobs(spec.scene, spec.options, evaluation, spec.row.num_configurations):
             _read_evaluation(job, 0, evaluation, seed, result)
         for job, checkpoint in checkpoint_evaluations(spec, evaluation):
             _read_evaluation(job, checkpoint, evaluation, seed, result)
@@ -194,30 +237,41 @@ def _read_evaluation(
 
 def _point(steps: int, interventions: int, record: dict[str, Any], task: str | None) -> Point:
     rate = record["per_task"][task] if task else record
-    return Point(steps, interventions, rate["success"], rate["n"], tuple(rate["ci95"]))
+    apart = {name: rate[name] for name in APART if name in rate}
+    at = tuple(record.get("at_interventions", ()))
+    return Point(steps, interventions, rate["success"], rate["n"], tuple(rate["ci95"]), apart, at)
 
 
 def _xy(curve: list[Point], axis: str) -> tuple[list[float], list[float]]:
     return [point.x(axis) for point in curve], [point.success for point in curve]
 
 
-def sequential(row: RowResult, split: str) -> dict[str, Any] | None:
+def sequential(row: RowResult, split: str, orderings: str = "all") -> dict[str, Any] | None:
     """SEQ 0-3 and the average chain length of a row's finished seeds at their last checkpoint.
+
+    Args:
+        row: whose.
+        split: train or held_out.
+        orderings: all, or those `seen` in training (a piece of the training cycle) or `unseen` alone.
 
     Returns:
         `positions`, a Summary for each, `chain_length`, a Summary, and `n`, chains of each seed; None if there is
         no result.
     """
-    found = [
+    whole = [
         results[seed.spec.steps]
         for seed in row.finished
         if seed.spec.steps in (results := seed.evaluations.get(("sequential", split), {}))
     ]
+    found = whole if orderings == "all" else [part for result in whole if (part := result.get(orderings))]
     if not found:
         return None
     rates = np.array([[position["success"] for position in result["positions"]] for result in found])
     lengths = [result["average_chain_length"]["mean"] for result in found]
-    return {
+    apart = {
+        name: sum(position.get(name, 0) for result in found for position in result["positions"]) for name in APART
+    }
+    return apart | {
         "positions": [summarise(column) for column in rates.T],
         "chain_length": summarise(lengths),
         "n": found[0]["n"],

@@ -10,7 +10,7 @@ from pathlib import Path
 from lerobot.common.train_utils import get_step_identifier
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 
-from cronos_lerobot.experiments.definitions import Experiment, Row
+from cronos_lerobot.experiments.definitions import PAPER_BUDGETS, Experiment, Row
 from cronos_lerobot.experiments.scales import OBS_NAMES, BaseRecipe, Scale
 
 UPDATE_INTERVAL = 160
@@ -53,6 +53,13 @@ class RunSpec:
         """S of this run, rounded up to whole policy updates as `cronos-train` does."""
         per_update = self.options.scale.num_envs * UPDATE_INTERVAL
         return -(-self.options.scale.steps[self.paper_steps] // per_update) * per_update
+
+    @property
+    def budgets(self) -> list[int]:
+        """Numbers of interventions at which the run is evaluated: those of the tables, scaled as the steps."""
+        steps = self.options.scale.steps[self.paper_steps]
+        wanted = (budget * steps // self.paper_steps for budget in PAPER_BUDGETS.get(self.paper_steps, ()))
+        return sorted({budget for budget in wanted if budget})
 
     @property
     def group(self) -> str:
@@ -111,30 +118,34 @@ def run_specs(experiment: Experiment, options: Options, rows: Iterable[Row] | No
     ]
 
 
-def base_folder(scene: str, options: Options) -> Path:
+def base_folder(scene: str, options: Options, configurations: int = 64) -> Path:
     """Folder of the demonstrations and the clone that all experiments of a scene share.
+
+    Rows that train on fewer `configurations` have one that is cloned from those.
 
     The recipe is part of its name, and so of the runs' commands: another recipe makes other runs.
     """
     recipe = options.recipes[scene]
     made = f"{recipe.demos}{'clean' if recipe.clean else ''}demos_{recipe.clone_steps}steps"
-    return options.root / "base" / f"{scene}_{OBS_NAMES[options.obs_type]}_{made}"
+    own = "" if configurations == 64 else f"_{configurations}config"
+    return options.root / "base" / f"{scene}_{OBS_NAMES[options.obs_type]}_{made}{own}"
 
 
-def base_policy(scene: str, options: Options) -> str:
+def base_policy(scene: str, options: Options, configurations: int = 64) -> str:
     """Path of the policy that the runs of a scene begin with."""
     if options.policy_path:
         return options.policy_path
     recipe = options.recipes[scene]
     checkpoint = get_step_identifier(recipe.checkpoint, recipe.clone_steps)
-    return str(base_folder(scene, options) / "clone" / CHECKPOINTS_DIR / checkpoint / PRETRAINED_MODEL_DIR)
+    folder = base_folder(scene, options, configurations)
+    return str(folder / "clone" / CHECKPOINTS_DIR / checkpoint / PRETRAINED_MODEL_DIR)
 
 
-def base_evaluation_folder(scene: str, suite: str, split: str, options: Options) -> Path:
+def base_evaluation_folder(scene: str, suite: str, split: str, options: Options, configurations: int = 64) -> Path:
     """`--output_dir` of an evaluation of the base policy."""
     if options.policy_path:
         given = hashlib.sha256(options.policy_path.encode()).hexdigest()[:8]
         folder = options.root / "base" / f"{scene}_{OBS_NAMES[options.obs_type]}_{given}"
     else:
-        folder = base_folder(scene, options)
+        folder = base_folder(scene, options, configurations)
     return folder / f"{suite}_{split}{'_smoke' if options.scale.smoke else ''}"

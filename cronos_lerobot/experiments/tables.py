@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cronos_lerobot.experiments.definitions import INTERACTION_STEPS, INTERVENTIONS
-from cronos_lerobot.experiments.results import ExperimentResult, RowResult, paper_results, sequential
+from cronos_lerobot.experiments.results import APART, ExperimentResult, RowResult, paper_results, sequential
 from cronos_lerobot.protocol.metrics import Summary, interpolate, summarise
 from cronos_lerobot.report.series import segment_rates, task_rates
 from cronos_lerobot.report.statistics import Rate
@@ -52,6 +52,7 @@ def _main_row(result: ExperimentResult, row: RowResult, shared: float | None) ->
     for split in result.experiment.splits:
         cells |= _numbers(f"success_{split}", row.success(split))
         cells[f"n_{split}"] = next((point.n for point in row.finals(split)), None)
+        cells |= {f"{name}_{split}": row.apart(split).get(name) for name in APART}
     paper = paper_results()["final_success"].get(result.experiment.name, {}).get(setting.name)
     cells |= {"paper_mean": paper[0] if paper else None, "paper_std": paper[1] if paper else None}
     starts = [seed.curve("train")[0] for seed in row.finished if seed.curve("train")]
@@ -65,7 +66,10 @@ def _main_row(result: ExperimentResult, row: RowResult, shared: float | None) ->
     cells |= _numbers("C_normalised", row.gap(INTERVENTIONS))
     cells |= {"shared_budget": shared} | _numbers("C_normalised_shared", row.gap(INTERVENTIONS, up_to=shared))
     for budget in budgets(result):
-        cells |= _numbers(f"success_at_{budget}", row.success_at(budget))
+        at = row.success_at(budget)
+        cells |= _numbers(f"success_at_{budget}", at.summary)
+        cells[f"success_at_{budget}_interpolated_between"] = "-".join(map(str, at.between)) if at.between else None
+        cells[f"success_at_{budget}_not_applicable"] = at.reason or None
     return cells
 
 
@@ -117,26 +121,36 @@ def curve_rows(result: ExperimentResult) -> list[Row]:
                     for point in seed.curve(split, task):
                         cells = asdict(point)
                         low, high = cells.pop("ci95")
+                        cells |= cells.pop("apart")
+                        cells["at_interventions"] = " ".join(map(str, point.at_interventions))
                         rows.append(identity | cells | {"ci95_low": low, "ci95_high": high})
     return rows
 
 
+ORDERINGS = ("all", "seen", "unseen")
+"""In training: heuristic streams run the training cycle without end."""
+
+
 def sequential_rows(result: ExperimentResult) -> list[Row]:
-    """SEQ 0-3 and the average chain length of every row and split."""
+    """SEQ 0-3 and the average chain length of every row and split, seen and unseen orderings apart."""
+    kinds = [
+        (split, row, orderings)
+        for evaluation in result.experiment.evaluations
+        if evaluation.suite == "sequential"
+        for split in evaluation.splits
+        for row in result.rows
+        for orderings in ORDERINGS
+    ]
     rows = []
-    for evaluation in result.experiment.evaluations:
-        for split in evaluation.splits if evaluation.suite == "sequential" else ():
-            for row in result.rows:
-                if found := sequential(row, split):
-                    cells: Row = {
-                        "row": row.row.name,
-                        "split": split,
-                        "seeds": found["chain_length"].n,
-                        "n": found["n"],
-                    }
-                    for position, summary in enumerate(found["positions"]):
-                        cells |= _numbers(f"SEQ {position}", summary)
-                    rows.append(cells | _numbers("chain_length", found["chain_length"]))
+    for split, row, orderings in kinds:
+        if found := sequential(row, split, orderings):
+            cells: Row = {"row": row.row.name, "split": split, "orderings": orderings}
+            cells |= {"seeds": found["chain_length"].n, "n": found["n"]}
+            for position, summary in enumerate(found["positions"]):
+                cells |= _numbers(f"SEQ {position}", summary)
+            rows.append(
+                cells | _numbers("chain_length", found["chain_length"]) | {name: found[name] for name in APART}
+            )
     return rows
 
 
@@ -150,26 +164,45 @@ def claim_rows(result: ExperimentResult) -> list[Row]:
             spent = summarise([seed.run.last["interventions"] for seed in rows[row].finished])
             claims.append(_claim(f"interventions of {row} at the end", count, spent.mean if spent else None))
     if reach := paper["interventions_to_reach"].get(name):
-        goal = rows[reach["goal"]].success("train") if reach["goal"] in rows else None
         for row, count in reach["rows"].items():
             if row in rows:
-                ours = interventions_to_reach(rows[row], goal.mean) if goal else None
-                claims.append(_claim(f"interventions of {row} to reach the end of {reach['goal']}", count, ours))
+                text = f"interventions of {row} to reach the end of {reach['goal']}"
+                claims.append(_claim(text, count, *_reach(rows[row], rows.get(reach["goal"]))))
     if gap := paper["difference_at_interventions"].get(name):
-        steps = result.options.scale.steps[result.experiment.steps]
-        at = gap["interventions"] * steps // result.experiment.steps
-        better, worse = (
-            rows[row].success_at(at) if row in rows else None for row in (gap["better"], gap["worse"])
-        )
-        ours = better.mean - worse.mean if better and worse else None
-        text = f"{gap['better']} minus {gap['worse']} after {gap['interventions']} interventions"
-        text += "" if at == gap["interventions"] else f" (ours: {at})"
-        claims.append(_claim(text, gap["difference"], ours))
+        claims.append(_difference(gap, rows, result))
     return claims
 
 
-def _claim(what: str, paper: float, ours: float | None) -> Row:
-    return {"claim": what, "paper": paper, "ours": ours}
+def _difference(gap: dict[str, Any], rows: dict[str, RowResult], result: ExperimentResult) -> Row:
+    """A row's success minus another's after a number of interventions."""
+    steps = result.options.scale.steps[result.experiment.steps]
+    at = gap["interventions"] * steps // result.experiment.steps
+    text = f"{gap['better']} minus {gap['worse']} after {gap['interventions']} interventions"
+    text += "" if at == gap["interventions"] else f" (ours: {at})"
+    found = {name: rows[name].success_at(at) for name in (gap["better"], gap["worse"]) if name in rows}
+    reasons = "; ".join(f"{name}: {one.reason}" for name, one in found.items() if one.reason)
+    means = [one.summary.mean for one in found.values() if one.summary]
+    ours = means[0] - means[1] if len(means) == 2 else None
+    is_interpolated = ours is not None and any(one.between for one in found.values())
+    return _claim(text, gap["difference"], ours, reasons, interpolated=is_interpolated)
+
+
+def _claim(what: str, paper: float, ours: float | None, reason: str = "", *, interpolated: bool = False) -> Row:
+    claim: Row = {"claim": what, "paper": paper, "ours": ours, "interpolated": interpolated}
+    return claim | {"not_applicable": reason or None}
+
+
+def _reach(row: RowResult, goal_row: RowResult | None) -> tuple[float | None, str]:
+    """Interventions until a row comes to another one's end, or why that says nothing."""
+    goal = goal_row.success("train") if goal_row else None
+    starts = [curve[0].success for seed in row.finished if (curve := seed.curve("train"))]
+    if goal is None or not starts:
+        return None, ""
+    base = float(np.mean(starts))
+    if base >= goal.mean:
+        return None, f"the base policy is there from the start: {base:.3f}, the goal is {goal.mean:.3f}"
+    ours = interventions_to_reach(row, goal.mean)
+    return ours, "" if ours is not None else f"it never came to {goal.mean:.3f}"
 
 
 def interventions_to_reach(row: RowResult, goal: float) -> float | None:

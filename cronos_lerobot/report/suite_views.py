@@ -12,7 +12,10 @@ from matplotlib.figure import Figure
 from cronos_lerobot.report.clips import Clip
 from cronos_lerobot.report.figures import COLORS, INK, SPLIT_LABELS, style_axes
 from cronos_lerobot.report.suites import SuiteRun
+from cronos_lerobot.report.tables import APART
 
+ORDERINGS = ("all", "seen", "unseen")
+"""In training, whose heuristic streams run the training cycle without end."""
 MAX_DRAWN = len(COLORS)
 """Evaluations in the figure, the first ones; the tables have all."""
 
@@ -25,23 +28,36 @@ def independent_rows(runs: Iterable[SuiteRun]) -> list[dict[str, Any]]:
             for task, rate in {"all tasks": found, **found["per_task"]}.items():
                 low, high = rate["ci95"]
                 numbers = {"success": rate["success"], "n": rate["n"], "ci95_low": low, "ci95_high": high}
+                numbers |= {name: rate.get(name) for name in APART}
                 rows.append({"policy": run.name, "split": split, "task": task} | numbers)
     return rows
 
 
 def sequential_rows(runs: Iterable[SuiteRun]) -> list[dict[str, Any]]:
-    """Success at each position of a chain, and the average chain length; `std` is over the orderings."""
-    rows = []
-    for run in runs:
-        for split, found in run.splits("sequential").items():
-            row: dict[str, Any] = {"policy": run.name, "split": split, "chains": found["n"]}
-            for k, position in enumerate(found["positions"]):
-                row |= {f"SEQ {k}": position["success"], f"SEQ {k} std": position["std"]}
-            length = found["average_chain_length"]
-            low, high = length["ci95"]
-            row |= {"chain length": length["mean"], "chain length std": length["std"]}
-            rows.append(row | {"chain length ci95_low": low, "chain length ci95_high": high})
-    return rows
+    """Success at each position of a chain, and the average chain length; `std` is over the orderings.
+
+    A row for all orderings, and one each for those seen in training and the others.
+    """
+    return [
+        {"policy": run.name, "split": split, "orderings": orderings} | _chain_cells(part)
+        for run in runs
+        for split, found in run.splits("sequential").items()
+        for orderings in ORDERINGS
+        if (part := found if orderings == "all" else found.get(orderings))
+    ]
+
+
+def _chain_cells(found: dict[str, Any]) -> dict[str, Any]:
+    row: dict[str, Any] = {"chains": found["n"]}
+    for k, position in enumerate(found["positions"]):
+        row |= {f"SEQ {k}": position["success"], f"SEQ {k} std": position["std"]}
+        low, high = position["ci95"]
+        row |= {f"SEQ {k} ci95_low": low, f"SEQ {k} ci95_high": high}
+    length = found["average_chain_length"]
+    low, high = length["ci95"]
+    row |= {"chain length": length["mean"], "chain length std": length["std"]}
+    row |= {"chain length ci95_low": low, "chain length ci95_high": high}
+    return row | {name: sum(position.get(name, 0) for position in found["positions"]) for name in APART}
 
 
 def sequential_figure(runs: Iterable[SuiteRun]) -> Figure | None:

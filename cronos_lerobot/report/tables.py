@@ -14,6 +14,8 @@ from cronos_lerobot.report.statistics import Gain, Rate
 
 Row = dict[str, Any]
 ALL = "all tasks"
+APART = ("found_complete", "never_grasped")
+"""Of the successes, those for which nothing had to be done, and others without a grasp."""
 COUNTED = ("scene_reset", "heuristic_reset", "divergence")
 """Kinds of intervention that count against the budget."""
 
@@ -64,6 +66,8 @@ def seed_rows(groups: Iterable[Group]) -> list[Row]:
         row: Row = {"runs": group.label, "seeds": len(curves), "split": curves[0][-1]["split"]}
         row |= {"n": curves[0][-1]["n"], "interaction_steps": end}
         row |= _summary_columns("success", [success_at(x, y, end) for x, y in zip(steps, success, strict=True)])
+        last = [curve[-1] for curve in curves]
+        row |= {name: sum(e.get(name, 0) for e in last) for name in APART}
         row |= _summary_columns("interventions", at_end)
         row |= _summary_columns("D / steps", by_steps) | _summary_columns("C / interventions", by_resets)
         rows.append(row)
@@ -97,7 +101,9 @@ def evaluation_rows(groups: Iterable[Group]) -> list[Row]:
                 rates = evaluation_rates(evaluation)
                 overall = Rate(round(evaluation["success"] * evaluation["n"]), evaluation["n"])
                 for task, rate in {ALL: overall, **rates}.items():
-                    rows.append(_identity(group, run) | counters | {"task": task} | rate_columns(rate))
+                    found = evaluation if task == ALL else evaluation["per_task"][task]
+                    apart = {name: found.get(name) for name in APART}
+                    rows.append(_identity(group, run) | counters | {"task": task} | rate_columns(rate) | apart)
     return rows
 
 
@@ -112,6 +118,7 @@ def update_rows(groups: Iterable[Group]) -> list[Row]:
                     name: update[name] for name in ("interaction_steps", "interventions", "updates")
                 }
                 row |= {name: rollout[name] for name in ("success", "segments", "reward_per_segment", "diverged")}
+                row |= {name: (rollout.get(name) or [None])[0] for name in APART}
                 row |= {f"ppo/{name}": value for name, value in update["ppo"].items()}
                 row |= {"steps_per_s": update["steps_per_s"]}
                 rows.append(row | {f"time/{name}": value for name, value in update["time_share"].items()})

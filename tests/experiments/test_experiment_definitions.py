@@ -161,8 +161,37 @@ def test_runs_are_shared_between_experiments():
     assert len(trains) == 5 * (7 + 1 + 1 + 2 + 4 + 2 + 2)
     assert len({job.name for job in everything}) == len(everything)
     assert len({job.output for job in everything}) == len(everything)
-    # Three scenes, each with demonstrations and their cloning, and the evaluation where held-out curves begin.
-    assert len([job for job in everything if job.name.startswith("base/")]) == 6 + 1
+    # Three scenes, each with demonstrations and their cloning, and the evaluation where held-out curves begin; the
+    # three of the base policy from one configuration.
+    assert len([job for job in everything if job.name.startswith("base/")]) == 6 + 1 + 3
+
+
+def test_rows_of_one_configuration_begin_with_a_policy_of_that_one_and_repeat_their_episodes():
+    jobs = jobs_of("figure4", rows=["t80", "t80_1config"])
+    one = "base/kitchen_2x2_state_400demos_320steps_1config"
+    assert "--start.num_configurations=1" in jobs[f"{one}/demos"].command
+    run = jobs["kitchen_2x2_state_paper/t80_1config_1300k/seed1"]
+    assert run.needs == (f"{one}/clone",)
+    # 64 episodes of each task, as of the rows with 64 configurations.
+    wanted = {
+        f"--policy.path=out/{one}/clone/checkpoints/000320/pretrained_model", "--eval.n_episodes=1",
+        "--eval.repetitions=64",
+    }  # fmt: skip
+    assert wanted <= set(run.command)
+    assert {"--eval.n_episodes=64", "--eval.repetitions=1"} <= set(
+        jobs["kitchen_2x2_state_paper/t80_1300k/seed1"].command
+    )
+    base = jobs[f"{one}/independent_held_out"]
+    assert f"--policy.path=out/{one}/clone/checkpoints/000320/pretrained_model" in base.command
+
+
+def test_runs_are_evaluated_at_the_budgets_of_all_tables_that_share_them():
+    at = "--eval_at_interventions=[1000, 1600, 2000, 4000, 6000, 8000]"
+    for name in ("table1", "figure4"):
+        assert at in jobs_of(name, rows=["t80"])["kitchen_2x2_state_paper/t80_1300k/seed1"].command
+    # 307,200 of 1.3 M steps.
+    small = jobs_of("table1", rows=["t80"], scale="small")["kitchen_2x2_state_small/t80_307k/seed1"].command
+    assert "--eval_at_interventions=[236, 378, 472, 945, 1417, 1890]" in small
 
 
 def test_own_policy_needs_no_base():

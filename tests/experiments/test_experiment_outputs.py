@@ -128,7 +128,46 @@ def test_interventions_to_reach(options):
         "claim": "interventions of t1280_eer_cl_hsr at the end",
         "paper": 6000,
         "ours": None,
+        "interpolated": False,
+        "not_applicable": None,
     }
+
+
+def test_what_says_nothing_is_not_applicable_and_says_why(options, tmp_path):
+    make_run(options, "table1", "t1280_eer", 1, (4, 3, 3))
+    result = results(options, "table1")
+    claims = {claim["claim"]: claim for claim in tables.claim_rows(result)}
+    claim = claims["interventions of t1280_eer to reach the end of t1280_eer"]
+    # The base policy is at .5, the end at .375.
+    assert claim["ours"] is None
+    assert claim["not_applicable"] == "the base policy is there from the start: 0.500, the goal is 0.375"
+    row = by_row(tables.main_rows(result))["t1280_eer"]
+    # 8 streams of 1280 steps are reset once each.
+    assert row["success_at_12_not_applicable"] == "the runs ended after 8 interventions"
+    text = write_outputs(EXPERIMENTS["table1"], EXPERIMENTS["table1"].rows, options, tmp_path / "out")
+    assert "not applicable: the base policy is there from the start" in text
+    assert "- T = 1280, EER at 12: not applicable, the runs ended after 8 interventions." in text
+    assert "The learning algorithm is `ppo`" in text
+
+
+def test_what_is_interpolated_is_marked_and_what_is_measured_is_not(options, tmp_path):
+    spec = make_run(options, "figure3", "t80", 1, (2, 4, 6))
+    make_run(options, "figure3", "t320_eer", 1, (2, 6, 8))
+    metrics = spec.train_folder / "metrics.jsonl"
+    lines = [json.loads(line) for line in metrics.read_text().splitlines()]
+    # Evaluations at 0, 64 and 128 interventions, the second at the first update that came to 28.
+    [line for line in lines if line["kind"] == "evaluation"][1]["at_interventions"] = [28]
+    metrics.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    rows = by_row(tables.main_rows(results(options, "figure3")))
+    t80, t320 = rows["t80"], rows["t320_eer"]
+    assert (t80["success_at_28_mean"], t80["success_at_28_interpolated_between"]) == (0.5, None)
+    assert t80["success_at_14_interpolated_between"] == "0-64"
+    assert t320["success_at_28_interpolated_between"] == "16-32"
+    text = write_outputs(EXPERIMENTS["figure3"], EXPERIMENTS["figure3"].rows, options, tmp_path / "out")
+    # Success is .25 to .5 over 64 interventions.
+    assert "| T = 80 | ~0.262 | ~0.277 | ~0.305 | 0.500 |" in text
+    assert "- T = 80 at 14: a straight line between 0 and 64." in text
+    assert (tmp_path / "out/figure3.csv").read_text().count("0-64") == 3
 
 
 def test_unfinished_run_is_drawn_but_not_counted(options, tmp_path):
@@ -223,22 +262,29 @@ def test_held_out_curve_is_cronos_evals(options, tmp_path):
 
 
 def test_sequences(options, tmp_path):
+    apart = {"found_complete": 1, "never_grasped": 2}
     rates = {1: [0.75, 0.5, 0.25, 0.0], 2: [0.25, 0.5, 0.25, 0.0]}
     for seed, successes in rates.items():
         spec = make_run(options, "figure5", "t320_eer", seed, (2, 4, 6))
         content = {
             "n": 640,
-            "positions": [{"success": s, "std": 0.1, "n": 640, "ci95": [0, 1]} for s in successes],
+            "positions": [{"success": s, "std": 0.1, "n": 640, "ci95": [0, 1]} | apart for s in successes],
+            "seen": {"n": 64, "positions": [{"success": 1.0}] * 4, "average_chain_length": {"mean": 4.0}},
+            "unseen": None,
             "average_chain_length": {"mean": sum(successes), "std": 0.1, "ci95": [0, 4]},
         }
         write_results(spec.evaluation_folder("sequential", "held_out", 10_240), "sequential", "held_out", content)
-    (row,) = tables.sequential_rows(results(options, "figure5"))
+    row, seen = tables.sequential_rows(results(options, "figure5"))
+    assert (seen["orderings"], seen["n"], seen["SEQ 0_mean"], seen["chain_length_mean"]) == ("seen", 64, 1.0, 4.0)
     assert (row["row"], row["split"], row["n"], row["seeds"]) == ("t320_eer", "held_out", 640, 2)
     assert [row[f"SEQ {i}_mean"] for i in range(4)] == [0.5, 0.5, 0.25, 0.0]
     assert row["SEQ 0_std"] == pytest.approx(0.5 / 2**0.5)
     assert row["chain_length_mean"] == 1.25
     text = write_outputs(EXPERIMENTS["figure5"], EXPERIMENTS["figure5"].rows, options, tmp_path / "out")
-    assert "| 0.500 ± 0.354 | 0.500 ± 0.000 | 0.250 ± 0.000 | 0.000 ± 0.000 | 1.250 ± 0.354 | 640 | 2 |" in text
+    assert (
+        "| 0.500 ± 0.354 | 0.500 ± 0.000 | 0.250 ± 0.000 | 0.000 ± 0.000 | 1.250 ± 0.354 | 640 | 8 | 16 | 2 |"
+        in text
+    )
     assert (tmp_path / "out/figure5_sequential.png").exists()
 
 
@@ -249,8 +295,9 @@ def test_files_of_table1(options, tmp_path):
     out = tmp_path / "out"
     line = next(line for line in text.splitlines() if line.startswith("| 80 |"))
     cells = [cell.strip() for cell in line.split("|")][1:-1]
-    assert cells[:11] == [
-        "80", "–", "–", "–", "–", "0.688 ± 0.088", "[-0.107, 1.482]", "32", "2/2", "0.897 ± 0.027", "0.250",
+    assert cells[:13] == [
+        "80", "–", "–", "–", "–", "0.688 ± 0.088", "[-0.107, 1.482]", "32", "0", "0", "2/2", "0.897 ± 0.027",
+        "0.250",
     ]  # fmt: skip
     assert (out / "table1.md").read_text() in text
     curves = read_csv(out / "table1_curves.csv")

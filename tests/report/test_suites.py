@@ -20,8 +20,11 @@ def write_results(folder, policy, content, **settings):
     (folder / "results.json").write_text(json.dumps(head | content))
 
 
+APART = {"found_complete": 2, "never_grasped": 3}
+
+
 def rate(success, n=64, std=0.1):
-    return {"success": success, "n": n, "ci95": [max(0, success - 0.1), min(1, success + 0.1)], "std": std}
+    return {"success": success, "n": n, "ci95": [max(0, success - 0.1), min(1, success + 0.1)], "std": std} | APART
 
 
 def chains(successes):
@@ -34,7 +37,8 @@ def test_results_of_cronos_eval(tmp_path):
     policy = "outputs/train/eer/checkpoints/0010240/pretrained_model"
     single = {"independent": {"train": rate(0.75) | {"per_task": {INSTRUCTIONS[0]: rate(0.5, 16)}}}}
     write_results(tmp_path / "e/single", policy, single)
-    sequential = {"sequential": {"train": chains([0.75, 0.5]), "held_out": chains([0.25, 0.0])}}
+    seen = {"seen": chains([1.0, 0.75]) | {"n": 64}, "unseen": None}
+    sequential = {"sequential": {"train": chains([0.75, 0.5]) | seen, "held_out": chains([0.25, 0.0])}}
     video = {"path": "videos/a.mp4", "suite": "sequential", "split": "train", "kind": "good", "number": 3}
     sequential["videos"] = [video | {"configuration": 7, "length": 2}]
     write_results(tmp_path / "e/chains", policy, sequential)
@@ -46,14 +50,16 @@ def test_results_of_cronos_eval(tmp_path):
         make_report([tmp_path / "e/single", tmp_path / "e/chains"]), tmp_path / "report"
     ).read_text()
     rows = read_csv(tmp_path / "report/sequential.csv")
-    assert [(r["policy"], r["split"], r["SEQ 0"], r["SEQ 1"], r["chain length"], r["chains"]) for r in rows] == [
-        ("eer 0010240", "train", "0.75", "0.5", "1.25", "640"),
-        ("eer 0010240", "held_out", "0.25", "0.0", "0.25", "640"),
+    columns = ("policy", "split", "orderings", "SEQ 0", "SEQ 1", "chain length", "chains", "never_grasped")
+    assert [tuple(r[name] for name in columns) for r in rows] == [
+        ("eer 0010240", "train", "all", "0.75", "0.5", "1.25", "640", "6"),
+        ("eer 0010240", "train", "seen", "1.0", "0.75", "1.75", "64", "6"),
+        ("eer 0010240", "held_out", "all", "0.25", "0.0", "0.25", "640", "6"),
     ]
     rows = read_csv(tmp_path / "report/independent.csv")
-    assert [(r["task"], r["success"], r["n"]) for r in rows] == [
-        ("all tasks", "0.75", "64"),
-        (INSTRUCTIONS[0], "0.5", "16"),
+    assert [(r["task"], r["success"], r["n"], r["found_complete"]) for r in rows] == [
+        ("all tasks", "0.75", "64", "2"),
+        (INSTRUCTIONS[0], "0.5", "16", "2"),
     ]
     assert "1.25 ± 0.2 [0.5, 2.5]" in page
     assert base64.b64encode(b"a chain").decode() in page
