@@ -185,10 +185,11 @@ def lock(job: Job) -> int | None:
     """Claim a job; None if another process has it.
 
     The claim is a file descriptor. A command that inherits it keeps the claim while it lives, so that a job whose
-    runner was killed is not started twice. Close it to give the job back.
+    runner was killed is not started twice. Close it to give the job back. Its file is not that of the command's
+    own FolderLock, which would find the folder taken.
     """
     job.record.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(job.record.with_name(f".{job.output.name}.lock"), os.O_RDWR | os.O_CREAT, 0o644)
+    descriptor = os.open(job.record.with_name(f".{job.output.name}.job.lock"), os.O_RDWR | os.O_CREAT, 0o644)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

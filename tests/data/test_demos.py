@@ -84,6 +84,16 @@ def test_starts_at_home_in_training_configurations(env, tmp_path):
     assert dataset.meta.episodes["cronos.configuration"] == [0, 0, 0, 0]
 
 
+def test_starts_in_the_first_configurations_alone(env, tmp_path):
+    tasks = [env.scene.tasks[0]]
+    config = DemoConfig(start=StartConfig(num_configurations=1))
+    dataset, _ = collect(env, tmp_path / "one", config, num_episodes=2, tasks=tasks)
+    # Four streams attempt it at once, of all configurations in the first four.
+    assert dataset.meta.episodes["cronos.configuration"] == [0, 0]
+    with pytest.raises(ValueError, match=r"start\.num_configurations must be 1 to 64, got 65"):
+        StartConfig(num_configurations=65)
+
+
 def home_position(env):
     env.scene_reset(np.array([0]), np.array([0]))
     np.testing.assert_array_equal(env.simulation.qpos[0, :6], HOME_QPOS)

@@ -168,8 +168,8 @@ def test_what_was_made_of_a_lost_output_is_made_again(tmp_path):
 
 def test_job_of_another_process_is_waited_for(tmp_path):
     job = count_job(tmp_path, "a")
-    (tmp_path / ".a.lock").touch()
-    with (tmp_path / ".a.lock").open() as held:
+    (tmp_path / ".a.job.lock").touch()
+    with (tmp_path / ".a.job.lock").open() as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         release = subprocess.Popen(
             [sys.executable, "-c", "import time; time.sleep(0.5)"], pass_fds=(held.fileno(),)
