@@ -83,7 +83,7 @@ def test_configurations_from_a_file(tmp_path):
 def test_plain_bodies_have_mass_and_colour_and_can_be_placed():
     register_scene(SCENE, bodies=[BLOCK, COASTER])
     env = CronosVectorEnv(8, "study_2x1", obs_type=STATE)
-    model = env.simulation.model
+    model = env.simulation.render_model
     assert model.body("red block").mass[0] == pytest.approx(0.03**3 * 600)
     assert model.body("blue coaster").mass[0] == pytest.approx(np.pi * 0.045**2 * 0.005 * 900)
     material = model.geom("red block visual").matid[0]

@@ -13,6 +13,7 @@ import numpy as np
 
 from lerobot_env_cronos.benchmark.configurations import check_split
 from lerobot_env_cronos.benchmark.load import load_benchmark
+from lerobot_env_cronos.scene.physics import PHYSICS
 from lerobot_env_cronos.scene.scenes import CONTROL_HZ, Task, get_scene
 from lerobot_env_cronos.simulation.observations import ObservationBuilder
 from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW, Simulation
@@ -50,6 +51,9 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             training run hangs its stopwatch here.
     """
 
+    physics = PHYSICS
+    """Another one is for studies that compare."""
+
     metadata = {  # noqa: RUF012 - Gymnasium declares it this way
         "render_modes": ["rgb_array"],
         "render_fps": CONTROL_HZ,
@@ -86,7 +90,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         self.timer: Callable[[str], AbstractContextManager] = nullcontext
         self.reward = reward
         self._num_threads = num_threads
-        self.simulation = Simulation(self.scene, num_envs, num_threads)
+        self.simulation = Simulation(self.scene, num_envs, num_threads, self.physics)
         self._observations = ObservationBuilder(
             self.simulation, obs_type, privileged_state, observation_height, observation_width, camera_name,
             render_size, renderer, task_observation,

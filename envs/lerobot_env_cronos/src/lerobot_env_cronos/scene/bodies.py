@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import mujoco
 
-from lerobot_env_cronos.scene.robot import CONTACT_SOLIMP, CONTACT_SOLREF
+from lerobot_env_cronos.scene.robot import CONTACT_SOLIMP
 from lerobot_env_cronos.scene.scenes import Body
 
 # Sliding 1.0 as in SimplerEnv; torsional and rolling friction (condim 6) keep round bodies from rolling away.
@@ -20,7 +20,7 @@ COLLISION_GROUP = 3
 def _add_geom(spec_body: mujoco.MjsBody, body: Body, geom_type: mujoco.mjtGeom, size, pos=(0, 0, 0), **extra):
     spec_body.add_geom(
         type=geom_type, size=size, pos=pos, density=body.density, group=COLLISION_GROUP, condim=6,
-        friction=FRICTION, solref=CONTACT_SOLREF, solimp=CONTACT_SOLIMP, **extra,
+        friction=FRICTION, solimp=CONTACT_SOLIMP, **extra,
     )  # fmt: skip
 
 

@@ -7,12 +7,9 @@ import numpy as np
 
 from lerobot_env_cronos.scene import visuals
 from lerobot_env_cronos.scene.bodies import add_body
-from lerobot_env_cronos.scene.robot import CONTACT_SOLIMP, CONTACT_SOLREF, add_robot
-from lerobot_env_cronos.scene.scenes import BODIES, CONTROL_HZ, Scene
-
-TIMESTEP_S = 0.005
-SUBSTEPS = round(1 / (CONTROL_HZ * TIMESTEP_S))
-"""Physics steps per control step (40)."""
+from lerobot_env_cronos.scene.physics import PHYSICS, Physics
+from lerobot_env_cronos.scene.robot import CONTACT_SOLIMP, add_robot
+from lerobot_env_cronos.scene.scenes import BODIES, Scene
 
 TABLE_LOW, TABLE_HIGH, TABLE_THICKNESS = (-0.20, -0.45), (0.70, 0.45), 0.04
 """Table top in the base frame, surface at z = 0 [m]. A body pushed over its edge falls to the floor."""
@@ -51,13 +48,13 @@ def support_sensor(obj: str, support: str) -> str:
     return f"{obj}/{support}"
 
 
-def build_spec(scene: Scene) -> mujoco.MjSpec:
-    """Build the scene's MjSpec: table, floor, WX250S, free bodies, cameras, contact sensors."""
+def build_spec(scene: Scene, looks: bool = True, physics: Physics = PHYSICS) -> mujoco.MjSpec:
+    """Build the scene's MjSpec: table, floor, WX250S, free bodies, cameras, contact sensors, and their looks."""
     spec = mujoco.MjSpec()
     spec.modelname = scene.name
     spec.compiler.degree = False
     spec.compiler.autolimits = True
-    _set_options(spec)
+    _set_options(spec, physics)
     _add_furniture(spec)
     add_robot(spec)
     bodies = {name: add_body(spec, BODIES[name]) for name in scene.bodies}
@@ -66,13 +63,14 @@ def build_spec(scene: Scene) -> mujoco.MjSpec:
         spec.worldbody.add_camera(
             name=name, pos=camera["pos"], fovy=camera["fovy"], quat=_camera_quat(camera["xyaxes"])
         )
-    visuals.dress(spec, bodies)
+    if looks:
+        visuals.dress(spec, bodies)
     return spec
 
 
-def build_model(scene: Scene) -> mujoco.MjModel:
-    """Compile the scene's model."""
-    return build_spec(scene).compile()
+def build_model(scene: Scene, looks: bool = True, physics: Physics = PHYSICS) -> mujoco.MjModel:
+    """Compile the scene's model; what it looks like has no mass, touches nothing, and costs physics time."""
+    return build_spec(scene, looks, physics).compile()
 
 
 def camera_axes(name: str) -> tuple[np.ndarray, np.ndarray, float]:
@@ -98,10 +96,11 @@ def _camera_quat(xyaxes: list[float]) -> np.ndarray:
     return quat
 
 
-def _set_options(spec: mujoco.MjSpec) -> None:
+def _set_options(spec: mujoco.MjSpec, physics: Physics) -> None:
+    spec.default.geom.solref = spec.default.equality.solref = physics.solref
     option = spec.option
-    option.timestep = TIMESTEP_S
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.timestep = physics.timestep_s
+    option.integrator = physics.integrator
     # Elliptic cones and a high friction-to-normal impedance ratio: grasped objects do not creep.
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = 10.0
@@ -118,7 +117,6 @@ def _add_furniture(spec: mujoco.MjSpec) -> None:
     contact = {
         "friction": [1.0, 0.01, 0.003],
         "condim": 6,
-        "solref": CONTACT_SOLREF,
         "solimp": CONTACT_SOLIMP,
     }
     spec.worldbody.add_geom(

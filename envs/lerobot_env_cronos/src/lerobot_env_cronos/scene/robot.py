@@ -35,9 +35,9 @@ GRIPPER_KP, GRIPPER_FORCE_LIMIT = 1000.0, 20.0
 ARM_FORCE_LIMIT = (200.0, 200.0, 100.0, 100.0, 100.0, 100.0)
 """Torque limits of SimplerEnv's system identification [N m]."""
 
-CONTACT_SOLREF = (0.01, 1.0)
 CONTACT_SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
-"""Contacts as stiff as a 5 ms time step allows (2 dt); softer ones let grasped objects slip by centimetres."""
+"""Impedance of contacts; their time constant is the model's default (`Physics.solref`)."""
+PALM_SOLREF = (0.02, 1.0)
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def add_robot(spec: mujoco.MjSpec) -> None:
     gripper.add_site(name=EE_SITE, pos=EE_OFFSET, size=[0.004] * 3, group=4)
     gripper.add_geom(
         name="palm", type=mujoco.mjtGeom.mjGEOM_BOX, pos=[0.036, 0, 0], size=[0.026, 0.045, 0.022],
-        group=3, mass=0,
+        group=3, mass=0, solref=PALM_SOLREF,
     )  # fmt: skip
     _add_fingers(gripper)
     _add_actuators(spec)
@@ -124,7 +124,7 @@ def _add_fingers(gripper: mujoco.MjsBody) -> None:
         finger.add_geom(
             name=f"{side}_pad", type=mujoco.mjtGeom.mjGEOM_BOX, size=PAD_HALF_SIZE, group=3, mass=0,
             pos=[PAD_POS[0], sign * PAD_POS[1], PAD_POS[2]], friction=[2.0, 0.02, 0.001], condim=4,
-            priority=1, solref=CONTACT_SOLREF, solimp=CONTACT_SOLIMP,
+            priority=1, solimp=CONTACT_SOLIMP,
         )  # fmt: skip
 
 
@@ -142,6 +142,6 @@ def _add_actuators(spec: mujoco.MjSpec) -> None:
     gripper.set_to_position(kp=GRIPPER_KP, dampratio=1.0)
     equality = spec.add_equality(
         type=mujoco.mjtEq.mjEQ_JOINT, name1="right_finger", name2="left_finger",
-        solref=CONTACT_SOLREF, solimp=CONTACT_SOLIMP,
+        solimp=CONTACT_SOLIMP,
     )  # fmt: skip
     equality.data[:5] = [0, -1, 0, 0, 0]

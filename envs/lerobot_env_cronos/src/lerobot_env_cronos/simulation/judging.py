@@ -13,6 +13,9 @@ from lerobot_env_cronos.scene.scenes import BODIES, Scene
 
 GRASP_MIN_FORCE_N, GRASP_MAX_ANGLE_RAD = 0.5, np.deg2rad(85)
 """Grasp of the SimplerEnv Bridge tasks: force of each finger, and its angle to the closing axis."""
+SQUEEZE_MAX_ANGLE_RAD = np.deg2rad(60)
+"""Of what is carried: the fingers press on it from opposite sides, each within this angle of the closing axis. A
+closed hand that hits an object, so that it jumps, may touch it with both fingers, too."""
 
 CARRIES, CARRIES_NOTHING = 0.5, 0.05
 """Shares of an object's weight: what carries it, and what does not take part in carrying it."""
@@ -23,6 +26,9 @@ not do: light objects may tremble in place [m]."""
 
 RESTING_GAP = 0.001
 """Height above its resting pose up to which a body that was put there counts as lying on the table [m]."""
+
+CARRY_READINGS = 3
+"""Control steps in a row that make a hold a carry; a push may wedge an object between the fingers for two."""
 
 NOTHING, IN_HAND, ON_TABLE = -2, -1, 0
 """Where an object is: nowhere that counts, in the hand, on the table; on receptacle i of the scene is i + 1."""
@@ -38,15 +44,16 @@ class Judge:
 
     Attributes:
         grasped: (n, objects) bool, both fingers press on the object.
-        place: (n, objects) where the object was at the last reading: IN_HAND, grasped and borne by nothing else;
+        place: (n, objects) where the object was at the last reading: IN_HAND, squeezed and borne by nothing else;
             on what it lay, untouched by the hand; or NOTHING.
         pose: (n, objects, 7) its pose then.
         confirmed: (n, objects) where it was at the last two readings, and still if it lay; NOTHING if neither.
+        held: (n, objects) readings in a row, at most CARRY_READINGS, at which it was IN_HAND.
         carried_to: (n, objects) what bore the object first since the hand let go of it; IN_HAND since the hand has
-            carried it at two readings; NOTHING when something else has borne it since.
+            carried it at CARRY_READINGS readings; NOTHING when something else has borne it since.
     """
 
-    STATE_FIELDS = ("grasped", "carried_to", "place", "pose", "confirmed")
+    STATE_FIELDS = ("grasped", "held", "carried_to", "place", "pose", "confirmed")
 
     def __init__(self, scene: Scene, model: mujoco.MjModel, sensordata: np.ndarray, qpos: np.ndarray):
         self.scene = scene
@@ -68,6 +75,7 @@ class Judge:
         shape = (len(sensordata), len(objects))
         self.grasped = np.zeros(shape, dtype=bool)
         self.carried_to = np.full(shape, IN_HAND, dtype=np.int8)
+        self.held = np.zeros(shape, dtype=np.int8)
         # Since the last reading: looks, touches of the hand, shares of the weight that each support bore.
         self._looks, self._touched = np.zeros(len(sensordata), dtype=int), np.zeros(shape, dtype=bool)
         self._sum_up, self._max_up, self._max_share = (np.zeros((*shape, len(supports))) for _ in range(3))
@@ -109,9 +117,9 @@ class Judge:
         unseen = ids[self._looks[ids] == 0]
         if len(unseen):
             self.look(unseen)
-        grasped = self._read_grasps(self._sensordata[ids][:, self._fingers], closing_axis)
+        grasped, squeezed = self._read_grasps(self._sensordata[ids][:, self._fingers], closing_axis)
         touched, up, share = self._contacts(ids)
-        in_air = grasped & (share <= CARRIES_NOTHING).all(-1)
+        in_air = squeezed & (share <= CARRIES_NOTHING).all(-1)
         carrier = np.where(~touched & (up.max(-1) >= CARRIES), up.argmax(-1), NOTHING)
 
         mean_up = self._sum_up[ids] / self._looks[ids][:, None, None]
@@ -127,17 +135,19 @@ class Judge:
         carried_to = self.carried_to[ids]
         elsewhere = (carried_to != IN_HAND) & (carried_to != carrier)
         carried_to = np.where(carrier == NOTHING, carried_to, np.where(elsewhere, NOTHING, carrier))
-        self.carried_to[ids] = np.where(confirmed == IN_HAND, IN_HAND, carried_to)
+        self.held[ids] = np.where(in_air, np.minimum(self.held[ids] + 1, CARRY_READINGS), 0)
+        self.carried_to[ids] = np.where(self.held[ids] == CARRY_READINGS, IN_HAND, carried_to)
         self.grasped[ids], self.confirmed[ids] = grasped, confirmed
         self.place[ids], self.pose[ids] = place, pose
         self.forget(ids)
 
-    def _read_grasps(self, forces: np.ndarray, closing_axis: np.ndarray) -> np.ndarray:
-        """Grasps (k, objects) from the fingers' forces (k, objects, 2, 3) [N]."""
+    def _read_grasps(self, forces: np.ndarray, closing_axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Grasps, and those that squeeze, (k, objects) each, from the fingers' forces (k, objects, 2, 3) [N]."""
         strength = np.linalg.norm(forces, axis=-1)
-        along = np.abs(np.einsum("kofd,kd->kof", forces, closing_axis))
-        pressed = (strength >= GRASP_MIN_FORCE_N) & (along >= np.cos(GRASP_MAX_ANGLE_RAD) * strength)
-        return pressed.all(-1)
+        along = np.einsum("kofd,kd->kof", forces, closing_axis)
+        pressed = (strength >= GRASP_MIN_FORCE_N) & (np.abs(along) >= np.cos(GRASP_MAX_ANGLE_RAD) * strength)
+        opposed = (along.prod(-1) < 0) & (np.abs(along) >= np.cos(SQUEEZE_MAX_ANGLE_RAD) * strength).all(-1)
+        return pressed.all(-1), pressed.all(-1) & opposed
 
     def _distance(self, pose: np.ndarray, before: np.ndarray) -> np.ndarray:
         """What no point of an object moved further than between two poses (k, objects, 7): (k, objects) [m]."""
@@ -150,7 +160,8 @@ class Judge:
         Contacts only show after a step, so what was put into its resting pose on the table counts as lying there.
         """
         on_table = poses[..., 2] <= self._height / 2 + RESTING_GAP
-        self.grasped[ids], self.carried_to[ids] = False, np.where(on_table, ON_TABLE, IN_HAND)
+        self.grasped[ids], self.held[ids] = False, 0
+        self.carried_to[ids] = np.where(on_table, ON_TABLE, IN_HAND)
         self.pose[ids] = poses
         self.place[ids] = self.confirmed[ids] = np.where(on_table, ON_TABLE, NOTHING)
 

@@ -144,7 +144,7 @@ class ObservationBuilder:
     def _renderer(self, size: tuple[int, int], camera: str) -> BatchRenderer:
         key = (size, camera)
         if key not in self._renderers:
-            self._renderers[key] = make_renderer(self.renderer, self.simulation.model, *size, camera)
+            self._renderers[key] = make_renderer(self.renderer, self.simulation.render_model, *size, camera)
         return self._renderers[key]
 
     def __getstate__(self) -> dict[str, Any]:

@@ -5,11 +5,14 @@ previous target, not to the measured pose) and a gripper command. Targets become
 kinematics and are ramped over most of the control step.
 """
 
+from functools import cached_property
+
 import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-from lerobot_env_cronos.scene.model import SUBSTEPS, build_model
+from lerobot_env_cronos.scene.model import build_model
+from lerobot_env_cronos.scene.physics import PHYSICS, RAMP_CHUNKS, Physics
 from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, FINGER_CLOSED, FINGER_OPEN, FINGERTIP_REACH, HOME_QPOS
 from lerobot_env_cronos.scene.scenes import Scene
 from lerobot_env_cronos.simulation.judging import Judge
@@ -25,14 +28,11 @@ ACTION_HIGH = np.array([0.028309678, 0.040855255, 0.040161587, 0.0819204776, 0.0
 """q01 and q99 of `bridge_orig`, the range that OpenVLA's action tokens span: m, rad, gripper (1 open)."""
 ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 
-RAMP_CHUNKS, CHUNK_SUBSTEPS = 8, 4
-"""The joint targets move linearly over 8 x 4 of the 40 substeps. Without the ramp, grasped objects slip."""
-
 NUM_ARM_JOINTS, NUM_ROBOT_JOINTS = 6, 8
 MAX_SPEED = 200.0
 """Joint or body speed beyond which a simulation counts as diverged [m/s, rad/s]."""
 
-SETTLE_CHUNK, SETTLE_MAX_CHUNKS, SETTLE_SPEED = 20, 10, 0.02
+SETTLE_MAX_CHUNKS, SETTLE_SPEED = 10, 0.02
 """After an arm teleport bodies fall for at most 1 s, checked every 0.1 s, until slower than 0.02 m/s."""
 
 
@@ -42,10 +42,12 @@ class Simulation:
     Attributes are live arrays: `qpos` (n, nq), `qvel` (n, nv), `sensordata` (n, nsensor).
     """
 
-    def __init__(self, scene: Scene, num_sims: int, num_threads: int = 0):
-        self.scene = scene
+    def __init__(self, scene: Scene, num_sims: int, num_threads: int = 0, physics: Physics = PHYSICS):
+        if num_threads < 0:
+            raise ValueError(f"num_threads must be 0 (all cores) or more, got {num_threads}")
+        self.scene, self.physics = scene, physics
         self.num_sims = num_sims
-        self.model = build_model(scene)
+        self.model = build_model(scene, looks=False, physics=physics)
         self._batch = Batch(self.model, num_sims, num_threads, persistent=True)
         self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl, self.sensordata = self._batch.bind("ctrl"), self._batch.bind("sensordata")
@@ -57,6 +59,11 @@ class Simulation:
         self.arm_target = np.tile(HOME_QPOS, (num_sims, 1))
         self.gripper_target = np.full(num_sims, FINGER_OPEN)
         self.judge = Judge(scene, self.model, self.sensordata, self.qpos)
+
+    @cached_property
+    def render_model(self) -> mujoco.MjModel:
+        """The same bodies and joints with their looks."""
+        return build_model(self.scene)
 
     def _find_sensors(self) -> dict[str, slice]:
         sensors = (self.model.sensor(i) for i in range(self.model.nsensor))
@@ -81,11 +88,11 @@ class Simulation:
         self.gripper_target[ids] = np.where(actions[:, 6] > 0.5, FINGER_OPEN, FINGER_CLOSED)
         self._ctrl[ids, NUM_ARM_JOINTS] = self.gripper_target[ids]
         broken = np.zeros(self.num_sims, dtype=bool)
+        physics, chunk = self.physics, self.physics.chunk_substeps
         for k in range(1, RAMP_CHUNKS + 1):
             self._ctrl[ids, :NUM_ARM_JOINTS] = start + (k / RAMP_CHUNKS) * (goal - start)
             last = k == RAMP_CHUNKS
-            nstep = SUBSTEPS - (RAMP_CHUNKS - 1) * CHUNK_SUBSTEPS if last else CHUNK_SUBSTEPS
-            broken |= self._advance(ids, nstep)
+            broken |= self._advance(ids, physics.substeps - (RAMP_CHUNKS - 1) * chunk if last else chunk)
             self.judge.look(ids)
         diverged = broken[ids] | self._is_diverged(ids)
         if diverged.any():
@@ -172,7 +179,7 @@ class Simulation:
         """
         before = self.qpos[ids].copy()
         for _ in range(SETTLE_MAX_CHUNKS):
-            broken = self._advance(ids, SETTLE_CHUNK)
+            broken = self._advance(ids, self.physics.settle_substeps)
             diverged = broken[ids] | self._is_diverged(ids)
             if diverged.any():
                 self._restore(ids[diverged], before[diverged])

@@ -1,0 +1,59 @@
+"""Friction of the table against Coulomb's law, in plain MuJoCo with sleep and motors off."""
+
+import mujoco
+import numpy as np
+import pytest
+from lerobot_env_cronos import get_scene
+from lerobot_env_cronos.scene.model import build_model
+from lerobot_env_cronos.scene.scenes import BODIES
+from lerobot_env_cronos.simulation.simulation import Simulation
+
+SCENE, GRAVITY = "kitchen_2x2", 9.81
+FLAT = get_scene(SCENE).receptacles
+
+
+def flat_body_on_the_table(body: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    model = build_model(get_scene(SCENE))
+    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    data = mujoco.MjData(model)
+    for i, name in enumerate(get_scene(SCENE).bodies):
+        x, y = (0.3, 0.0) if name == body else (-0.1, -0.36 + 0.14 * i)
+        data.joint(name).qpos[:] = [x, y, BODIES[name].size[2] / 2, 1, 0, 0, 0]
+    data.qpos[:6] = [0, -1.0, 0, 0, 0, 0]  # The hand is far above.
+    advance(model, data, 0.5)
+    return model, data
+
+
+def advance(model: mujoco.MjModel, data: mujoco.MjData, seconds: float) -> None:
+    for _ in range(round(seconds / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+
+
+@pytest.mark.parametrize("body", FLAT)
+@pytest.mark.parametrize(("slope", "expected", "tolerance"), [(0.9, 0.0, 0.0005), (1.1, 0.0825, 0.003)])
+def test_a_slope_holds_below_the_friction_angle_and_not_above(body, slope, expected, tolerance):
+    model, data = flat_body_on_the_table(body)
+    angle, before = np.arctan(slope), data.joint(body).qpos[0]
+    model.opt.gravity[:] = GRAVITY * np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    advance(model, data, 0.5)
+    # Friction 1: above 45 degrees it slides g (sin - cos) t^2 / 2 = 9.81 x 0.0673 x 0.25 / 2 = 82.5 mm.
+    assert data.joint(body).qpos[0] - before == pytest.approx(expected, abs=tolerance)
+
+
+@pytest.mark.parametrize("body", FLAT)
+def test_a_body_let_go_at_speed_stops_where_coulomb_says(body):
+    model, data = flat_body_on_the_table(body)
+    before = data.joint(body).qpos[0]
+    data.joint(body).qvel[0] = 0.5
+    advance(model, data, 1.0)
+    # v^2 / (2 mu g) = 0.25 / 19.62 = 12.7 mm.
+    assert data.joint(body).qpos[0] - before == pytest.approx(0.0127, abs=0.001)
+    # At rest: 1 mm/s, and half a millimetre a second at the rim.
+    assert np.abs(data.joint(body).qvel[:3]).max() < 1e-3
+    assert np.abs(data.joint(body).qvel[3:]).max() < 1e-2
+
+
+def test_a_negative_number_of_threads_is_refused():
+    with pytest.raises(ValueError, match=r"num_threads .* got -3"):
+        Simulation(get_scene(SCENE), 1, -3)
