@@ -9,6 +9,8 @@ import pandas as pd
 import pytest
 from lerobot.datasets import LeRobotDataset
 
+from cronos_lerobot.report import page
+from cronos_lerobot.scripts import demo, probe
 from cronos_lerobot.scripts.demo import SCALES, make_steps
 from cronos_lerobot.scripts.pipeline import Step, StepFailedError, command_line, run_steps
 
@@ -101,6 +103,23 @@ def test_shown_command_can_be_copied(tmp_path):
     assert (
         subprocess.run(line, shell=True, capture_output=True, text=True, check=True).stdout == "--a=1,b c,--d,$e,"
     )
+
+
+@pytest.mark.parametrize(("probe_s", "scale"), [(0.9, "full"), (3.0, "short")])
+def test_a_slow_machine_gets_a_shorter_demo_and_is_told_the_time(folder, monkeypatch, capsys, probe_s, scale):
+    monkeypatch.setattr(demo, "MINUTES_PER_PROBE_SECOND", {"full": 11.0, "short": 5.0})
+    monkeypatch.setattr(probe, "measure", lambda: probe_s)
+    assert demo.choose_scale(folder) == scale
+    said = capsys.readouterr().out
+    # 0.9 s * 11 min/s; 3 s * 5 and 3 s * 11.
+    assert "about 10 min here" in said if scale == "full" else "about 15 min here" in said and "33 min" in said
+    # Asked again, at another moment, the folder's demo stays the one that it is.
+    monkeypatch.setattr(probe, "measure", lambda: 0.1)
+    assert demo.choose_scale(folder) == scale
+
+
+def test_the_page_is_where_the_demo_says():
+    assert demo.PAGE == page.PAGE
 
 
 def test_full_demo_evaluates_every_configuration_of_both_splits(tmp_path):

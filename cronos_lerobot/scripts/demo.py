@@ -10,15 +10,22 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from cronos_lerobot.report.page import PAGE
-from cronos_lerobot.scripts.pipeline import Step, StepFailedError, run_steps
+from cronos_lerobot.scripts import probe
+from cronos_lerobot.scripts.pipeline import Step, StepFailedError, remember, run_steps
 
 ENV = ["--env.type=cronos", "--env.obs_type=environment_state_agent_pos"]
 DEMOS = "local/cronos_demos"
 STREAMS = "local/cronos_demo_streams"
+PAGE = "index.html"
+
+MINUTES_PER_PROBE_SECOND = {"full": 10.0, "short": 5.0}
+"""How long a scale takes [min] where the probe takes one second; measured together on one machine, nothing else
+running."""
+SHORTEN_ABOVE_MIN = 20.0
+"""Where the full demo would take longer than this, `--scale=auto` takes the short one."""
 
 
 @dataclass(frozen=True)
@@ -51,20 +58,26 @@ class Scale:
     """Length of the filmed stream, 80 control steps each."""
 
 
+_FULL = Scale(
+    demos=400,
+    clone_steps=320,
+    clone_batch=256,
+    train_steps=245_760,
+    streams=64,
+    update_interval=160,
+    scene_reset_interval=320,
+    eval_freq=81_920,
+    train_eval_episodes=32,
+    eval_episodes=64,
+    eval_splits=("train", "held_out"),
+    filmed_segments=16,
+)
+
 SCALES = {
-    "full": Scale(
-        demos=400,
-        clone_steps=320,
-        clone_batch=256,
-        train_steps=245_760,
-        streams=64,
-        update_interval=160,
-        scene_reset_interval=320,
-        eval_freq=81_920,
-        train_eval_episodes=32,
-        eval_episodes=64,
-        eval_splits=("train", "held_out"),
-        filmed_segments=16,
+    "full": _FULL,
+    # A third of the learning, half of the evaluation.
+    "short": replace(
+        _FULL, train_steps=81_920, eval_freq=40_960, train_eval_episodes=16, eval_episodes=32, filmed_segments=8
     ),
     "smoke": Scale(
         demos=8,
@@ -195,6 +208,25 @@ def report_step(scale: Scale, folder: Path) -> Step:
     return Step("report", "Curves, tables and videos", command, folder / "report", always=True)
 
 
+def choose_scale(folder: Path) -> str:
+    """The scale that this machine does in a reasonable time; says how long it will take here.
+
+    Raises:
+        FileExistsError: the folder holds something else.
+    """
+    print("How fast is this machine? ...", end=" ", flush=True)
+    note = remember(folder, "machine", lambda: {"probe_s": probe.measure()})
+    minutes = {scale: note["probe_s"] * factor for scale, factor in MINUTES_PER_PROBE_SECOND.items()}
+    scale = "full" if minutes["full"] <= SHORTEN_ABOVE_MIN else "short"
+    print(f"the demo takes about {minutes[scale]:.0f} min here.")
+    if scale == "short":
+        print(
+            f"That is a shortened one, with a third of the learning; in full (--scale=full) it would take about "
+            f"{minutes['full']:.0f} min."
+        )
+    return scale
+
+
 def main() -> None:
     """Entry point of `cronos-demo`."""
     parser = argparse.ArgumentParser(
@@ -202,13 +234,18 @@ def main() -> None:
     )
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/demo"), help="default: outputs/demo")
     parser.add_argument(
-        "--scale", choices=SCALES, default="full", help="smoke runs everything in a minute and learns nothing"
+        "--scale",
+        choices=["auto", *SCALES],
+        default="auto",
+        help="auto (default) is full, or short where that would take more than "
+        f"{SHORTEN_ABOVE_MIN:.0f} minutes; smoke runs everything in a minute or two and learns nothing",
     )
     args = parser.parse_args()
     start = time.perf_counter()
     again = "run the same command again to go on from here"
     try:
-        run_steps(make_steps(SCALES[args.scale], args.output_dir), args.output_dir)
+        scale = choose_scale(args.output_dir) if args.scale == "auto" else args.scale
+        run_steps(make_steps(SCALES[scale], args.output_dir), args.output_dir)
     except FileExistsError as error:
         sys.exit(f"error: {error}")
     except StepFailedError as error:

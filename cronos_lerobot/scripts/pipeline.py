@@ -74,6 +74,19 @@ def run_steps(steps: Sequence[Step], folder: Path) -> None:
         print(f"    took {seconds / 60:.1f} min", flush=True)
 
 
+def remember(folder: Path, name: str, find_out: Callable[[], dict]) -> dict:
+    """What is noted in the folder under `name`; found out and noted if nothing is, so that a later call agrees.
+
+    Raises:
+        FileExistsError: the folder holds something else.
+    """
+    state = _read_state(folder)
+    if name not in state:
+        state[name] = find_out()
+        _write_state(folder, state)
+    return state[name]
+
+
 def run_command(command: list[str]) -> None:
     """Show a command as one may type it, and run it; its output goes where ours goes.
 
