@@ -5,12 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from lerobot_env_cronos.scene.scenes import SCENES
-
-from cronos_lerobot.report.page import Report, write_report
-from cronos_lerobot.report.runs import FoundRuns, find_runs
-from cronos_lerobot.report.tables import comparison_text
+# What draws and what reads runs is imported where it is used: --help and a wrong flag are answered at once.
+if TYPE_CHECKING:
+    from cronos_lerobot.report.page import Report
 
 EPILOG = """\
 DIR is a run folder of cronos-train, an output folder of cronos-eval or lerobot-eval, or any folder above such
@@ -48,7 +47,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--videos", nargs="+", type=Path, metavar="MP4", default=[], help="more videos to show")
     parser.add_argument("--output", type=Path, default=Path("report"), help="folder to write (default: report)")
     parser.add_argument(
-        "--scene", default="kitchen_2x2", choices=SCENES,
+        "--scene", default="kitchen_2x2",
         help="of lerobot-eval's folders, which number the tasks and do not name the scene (default: kitchen_2x2)",
     )  # fmt: skip
     parser.add_argument("--title", default="CRONOS report", help="headline of the page")
@@ -68,7 +67,14 @@ def make_report(
 
     Raises:
         FileNotFoundError: a folder holds no run, or a video is missing.
+        ValueError: there is no such scene.
     """
+    from lerobot_env_cronos import get_scene
+
+    from cronos_lerobot.report.page import Report
+    from cronos_lerobot.report.runs import FoundRuns, find_runs
+
+    get_scene(scene)
     found, old, new = (
         find_runs(folders, scene) if folders else FoundRuns([], [], [], []) for folders in (runs, before, after)
     )
@@ -95,6 +101,9 @@ def main() -> None:
         )
     except (FileNotFoundError, ValueError) as error:
         sys.exit(f"error: {error}")
+    from cronos_lerobot.report.page import write_report
+    from cronos_lerobot.report.tables import comparison_text
+
     page = write_report(report, args.output)
     for text in report.left_out:
         print(f"left out: {text}", file=sys.stderr)
