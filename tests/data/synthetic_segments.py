@@ -49,6 +49,7 @@ def segment(length: int, seed: int = 0) -> dict[str, np.ndarray]:
         "next.reward": rng.normal(size=length).astype(np.float32),
         "next.success": rng.random(length) < 0.3,
         "next.done": done,
+        "next.truncated": np.zeros(length, bool),
     }
 
 

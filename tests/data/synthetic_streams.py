@@ -17,7 +17,7 @@ STREAMS = 3
 STEPS = 8 * K
 RESET = 4 * K
 UPDATE = 2 * K
-TASKS = ("put the cup on the plate", "put the can on the cloth")
+TASKS = ("put the ketchup bottle on the yellow plate", "put the kitchen shovel on the cloth")
 PICTURES = images(7)
 
 

@@ -237,6 +237,8 @@ def test_killed_while_publishing_it_still_loads_and_resumes(tmp_path, segments, 
     with pytest.raises(RuntimeError, match="killed here"):
         writer.flush()
     monkeypatch.undo()
+    # The operating system takes back what a process held.
+    writer._lock.release()
     dataset = LeRobotDataset("me/test", root=tmp_path / "d")
     assert (dataset.num_episodes, len(dataset)) == (2, sum(LENGTHS[:2]))
     with SegmentWriter.resume("me/test", tmp_path / "d") as writer:
