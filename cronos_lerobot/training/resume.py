@@ -142,7 +142,8 @@ def check_resumed(config: Any, checkpoint: Path) -> dict[str, Any]:
     run = read_run(checkpoint)
     given, own = flatten(config.to_dict()), flatten(run["config"])
     for name in sorted(given.keys() | own.keys(), key=lambda name: "features" in name):
-        same = given.get(name) == own.get(name)
+        # A config made in Python, as for a run that begins, leaves the features to the environment.
+        same = given.get(name) == own.get(name) or ("features" in name and not given.get(name))
         if not same and name not in _OWN_FOLDER and rule_of(name) == REFUSED:
             raise ValueError(_refusal(name, given.get(name), own.get(name)))
     if (now := describe_environment(config.env)["benchmark"]) != run["benchmark"]:

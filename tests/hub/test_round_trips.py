@@ -226,7 +226,8 @@ def test_a_benchmark_that_cannot_be_loaded(hub, bench, commands):
 
 def test_missing_repositories_and_revisions(hub, bench, evaluation, commands):
     results = ("cronos-publish", "results", f"--results={evaluation}")
-    assert f"there is no model me/nobody on {hub.url}" in commands.try_(*results, "--repo_id=me/nobody").output
+    output = commands.try_(*results, "--repo_id=me/nobody").output
+    assert "the results are of 'me/policy', not of me/nobody: evaluate with --policy.path=me/nobody" in output
     output = commands.try_(*results, "--repo_id=me/policy", "--benchmark=me/bench@v9").output
     assert "benchmark me/bench has no revision 'v9'" in output
     output = commands.try_("cronos-publish", *BENCHMARK, "--pictures=false", "--branch=x", "--revision=v9").output
