@@ -119,7 +119,7 @@ def trial_rows(physics: Physics, *, quick: bool, random_steps: int) -> Iterator[
 def main() -> None:
     """Run the trials and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="fewer streams and steps: a minute instead of ten")
+    parser.add_argument("--quick", action="store_true", help="fewer streams and steps")
     parser.add_argument("--random_steps", type=int, help="control steps of random actions (default: 200,000)")
     args = parser.parse_args()
     if args.random_steps is not None and args.random_steps < 1:
