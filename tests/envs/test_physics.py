@@ -1,9 +1,9 @@
-"""Friction of the table against Coulomb's law, in plain MuJoCo with sleep and motors off."""
+"""Friction of the table against Coulomb's law, in plain MuJoCo with sleep and motors off; limits of speed and depth."""
 
 import mujoco
 import numpy as np
 import pytest
-from lerobot_env_cronos import get_scene
+from lerobot_env_cronos import CronosVectorEnv, get_scene
 from lerobot_env_cronos.scene.model import build_model
 from lerobot_env_cronos.scene.scenes import BODIES
 from lerobot_env_cronos.simulation.simulation import Simulation
@@ -57,3 +57,21 @@ def test_a_body_let_go_at_speed_stops_where_coulomb_says(body):
 def test_a_negative_number_of_threads_is_refused():
     with pytest.raises(ValueError, match=r"num_threads .* got -3"):
         Simulation(get_scene(SCENE), 1, -3)
+
+
+def test_a_body_that_spins_fast_slows_down_and_one_pressed_down_stays_on_the_table():
+    env = CronosVectorEnv(2, "kitchen_2x2", obs_type="environment_state_agent_pos")
+    env.reset(seed=0)
+    sim, everyone = env.simulation, np.arange(2)
+    # Out of a pinch: without a limit a spin of 140 rad/s grows beyond 10,000 within a second.
+    sim.qpos[0, 8:11] = [0.3, 0.0, 0.4]
+    sim.qvel[0, 8:14] = [0, 0, 2.0, 100.0, 100.0, 10.0]
+    # A hand that leans on it: 25 mm deep, past the middle of the board that is drawn.
+    sim.qpos[1, 8:11] = [0.3, 0.0, -0.025]
+    for _ in range(10):
+        diverged = sim.step(np.tile([0, 0, 0, 0, 0, 0, 1.0], (2, 1)), everyone)
+        assert not diverged.any()
+        spin, speed = np.linalg.norm(sim.qvel[:, 11:14], axis=1), np.linalg.norm(sim.qvel[:, 8:11], axis=1)
+        assert (spin <= 50.0 + 1e-9).all()
+        assert (speed <= 3.0 + 1e-9).all()
+    assert (sim.qpos[:, 10] > 0).all()

@@ -136,19 +136,54 @@ def test_what_lies_on_another_object_is_not_on_the_receptacle():
     assert env.simulation.body_pose(BOTTLE)[0, 2] > PLATE_TOP + 0.02
 
 
-def test_pressed_from_above_counts_once_the_hand_is_gone():
+def test_pressed_from_above_counts_once_the_hand_is_gone_and_then_for_good():
     task = Task(BOTTLE, PLATE)
     env = make(2)
     put(env, [task] * 2, np.array([[0, 0, PLATE_TOP]] * 2))
     top = PLATE_TOP + BODIES[BOTTLE].size[2]
-    move_hand(env, np.tile([*CENTRE, top + 0.02], (2, 1)), np.tile([1.0, 0.0], (2, 1)))
-    assert drive(env, np.zeros((1, 3)), np.zeros(2), 3)[-1].all()
-    pressing = drive(env, np.array([[0, 0, -0.01], [0, 0, 0]]), np.zeros(2), 4)
-    # Only the first hand goes down: it presses from the third step on.
-    np.testing.assert_array_equal(pressing[2:], [[False, True]] * 2)
+    above = np.tile([*CENTRE, top + 0.02], (2, 1))
+    # The first hand is there before the bottle has come to rest, the second one comes later.
+    above[0, 2] = top - 0.002
+    move_hand(env, above, np.tile([1.0, 0.0], (2, 1)))
+    closed, pressing = np.zeros(2), np.array([[0, 0, -0.01], [0, 0, 0]])
+    early = drive(env, pressing, closed, 4)
     assert env.simulation.force(support_sensor(BOTTLE, PLATE))[0, 2] > 2 * WEIGHT[BOTTLE]
-    raised = drive(env, np.array([[0, 0, 0.02], [0, 0, 0]]), np.zeros(2), 8)
-    assert raised[-1].all()
+    np.testing.assert_array_equal(early[-1], [False, True])
+    assert drive(env, np.array([[0, 0, 0.02], [0, 0, 0]]), closed, 8)[-1].all()
+    # Both are placed. A press, and the touches of a hand that goes away, change nothing.
+    late = drive(env, np.array([[0, 0, 0], [0, 0, -0.01]]), closed, 4)
+    assert env.simulation.force(support_sensor(BOTTLE, PLATE))[1, 2] > 2 * WEIGHT[BOTTLE]
+    assert late.all()
+    assert drive(env, np.array([[0, 0, 0], [0, 0, 0.02]]), closed, 8).all()
+
+
+def test_what_was_placed_is_so_until_it_leaves_the_receptacle():
+    # Of three bottles on the plate one is pushed 1 cm along it, one off it, and one is lifted and put back.
+    task = Task(BOTTLE, PLATE)
+    env = make(3)
+    put(env, [task] * 3, np.array([[0, 0, PLATE_TOP]] * 3))
+    assert wait(env, 3)[-1].all()
+    width = BODIES[BOTTLE].size[1]
+    tips = np.tile([*CENTRE, PLATE_TOP + 0.004], (3, 1))
+    tips[:2, 1] += width / 2 + 0.05
+    tips[2, 2] += 0.01
+    closing = np.array([[0.0, 1.0], [0.0, 1.0], [1.0, 0.0]])
+    move_hand(env, tips + np.array([0, 0, 0.08]), closing)
+    drive(env, np.zeros((1, 3)), np.array([0, 0, 1]), 2)
+    move_hand(env, tips, closing)
+    before = env.simulation.body_pose(BOTTLE)[:, 1].copy()
+    push = np.array([[0, -0.012, 0], [0, -0.03, 0], [0, 0, 0.0]])
+    pushed = drive(env, push, np.array([0, 0, 0]), 4)
+    moved = before - env.simulation.body_pose(BOTTLE)[:, 1]
+    assert 0.004 < moved[0] < 0.04
+    assert moved[1] > 0.05
+    assert pushed[:, 0].all()
+    assert not pushed[-1, 1]
+    lifted = drive(env, np.array([[0, 0, 0.03]]), np.array([0, 0, 0]), 3)
+    np.testing.assert_array_equal(lifted[-1], [True, False, False])
+    assert env.simulation.body_pose(BOTTLE)[2, 2] > 0.05
+    drive(env, np.array([[0, 0, -0.03]]), np.array([0, 0, 0]), 3)
+    np.testing.assert_array_equal(wait(env, 6)[-1], [True, False, True])
 
 
 def test_what_is_dropped_counts_when_it_lies_still():

@@ -23,6 +23,8 @@ BLOCKED_DEPTH = 0.003
 """An overlap with another object from which on a receptacle counts as full [m]."""
 PREFERRED_OFFSET = 0.03
 """Distance beside the middle at which an empty receptacle still holds a second object [m]."""
+EDGE_ROOM = 0.015
+"""Wanted distance of the object's centre from the receptacle's edge: what overhangs further may tip over it [m]."""
 SPACING = 0.016
 """Of the points of the held object that are checked: closer than the thinnest side of an object, 18 mm [m]."""
 
@@ -88,11 +90,20 @@ def choose_places(
     else:
         cost += 12 * np.abs(distance - PREFERRED_OFFSET) + 100 * np.maximum(distance - 0.05, 0.0)
         cost += 15 * _along(held, spots, turn, world, obj)
+        cost += 100 * np.maximum(EDGE_ROOM - _inset(world, receptacle, goal), 0.0)
     best, i = cost.argmin(1), np.arange(n)
     yaw = held.hand_yaw + turn[best]
     nearest, gap = which[gaps[i, best].argmin(-1)], gaps[i, best].min(-1)
     blocker = np.where((gap < -BLOCKED_DEPTH) & (nearest < len(scene.objects)), nearest, -1)
     return Places(spots[i, best], anchor, np.stack([np.cos(yaw), np.sin(yaw)], 1), blocker)
+
+
+def _inset(world: WorldBoxes, receptacle: int, goal: np.ndarray) -> np.ndarray:
+    """How far inside the receptacle's bounding rectangle the points goal (n, s, 2) are, negative outside [m]."""
+    boxes = np.flatnonzero(world.boxes.body == receptacle)
+    offset = goal[:, :, None] - world.centre[:, None, boxes, :2]
+    local = np.einsum("nbij,nsbi->nsbj", world.rotation[:, boxes, :2], offset)[..., :2]
+    return (world.boxes.half[boxes, :2] - np.abs(local)).min(-1).max(-1)
 
 
 def _table_grid(scene: Scene) -> np.ndarray:

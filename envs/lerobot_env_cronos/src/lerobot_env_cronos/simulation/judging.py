@@ -1,8 +1,8 @@
 """What lies where, and what the hand holds: read from the contact forces once after every control step.
 
-An object is placed on a receptacle when the hand, having carried it, has let go of it there, and now at two
-readings in a row it lies still, neither hand nor table touches it, and the receptacle carries at least half of its
-weight. The reasons are in docs/protocol.md.
+An object is placed on a receptacle when the hand, having carried it, has let go of it there, and at two readings in
+a row it lies still, neither hand nor table touches it, and the receptacle carries at least half of its weight. It
+stays placed for as long as the receptacle carries it. The reasons are in docs/protocol.md.
 """
 
 import mujoco
@@ -48,12 +48,14 @@ class Judge:
             on what it lay, untouched by the hand; or NOTHING.
         pose: (n, objects, 7) its pose then.
         confirmed: (n, objects) where it was at the last two readings, and still if it lay; NOTHING if neither.
+        rests: (n, objects) what it was last confirmed to lie on, for as long as that goes on carrying it, whether
+            the hand touches it or not; else NOTHING.
         held: (n, objects) readings in a row, at most CARRY_READINGS, at which it was IN_HAND.
         carried_to: (n, objects) what bore the object first since the hand let go of it; IN_HAND since the hand has
             carried it at CARRY_READINGS readings; NOTHING when something else has borne it since.
     """
 
-    STATE_FIELDS = ("grasped", "held", "carried_to", "place", "pose", "confirmed")
+    STATE_FIELDS = ("grasped", "held", "carried_to", "place", "pose", "confirmed", "rests")
 
     def __init__(self, scene: Scene, model: mujoco.MjModel, sensordata: np.ndarray, qpos: np.ndarray):
         self.scene = scene
@@ -80,7 +82,7 @@ class Judge:
         self._looks, self._touched = np.zeros(len(sensordata), dtype=int), np.zeros(shape, dtype=bool)
         self._sum_up, self._max_up, self._max_share = (np.zeros((*shape, len(supports))) for _ in range(3))
         self.pose = qpos[:, self._pose]
-        self.place, self.confirmed = (np.full(shape, NOTHING, dtype=np.int8) for _ in range(2))
+        self.place, self.confirmed, self.rests = (np.full(shape, NOTHING, dtype=np.int8) for _ in range(3))
 
     def look(self, ids: np.ndarray) -> None:
         """Take in the contacts of simulations `ids` (k,) now, for the next reading; several times a control step.
@@ -122,15 +124,15 @@ class Judge:
         in_air = squeezed & (share <= CARRIES_NOTHING).all(-1)
         carrier = np.where(~touched & (up.max(-1) >= CARRIES), up.argmax(-1), NOTHING)
 
-        mean_up = self._sum_up[ids] / self._looks[ids][:, None, None]
-        borne = np.take_along_axis(mean_up, np.maximum(carrier, 0)[..., None], -1)[..., 0] >= CARRIES
-        table_helps = self._max_share[ids][..., ON_TABLE] > CARRIES_NOTHING
-        receptacle_helps = (self._max_up[ids][..., ON_TABLE + 1 :] > CARRIES_NOTHING).any(-1)
-        alone = borne & ~self._touched[ids] & ~np.where(carrier == ON_TABLE, receptacle_helps, table_helps)
+        alone = self._bears_alone(ids, carrier) & ~self._touched[ids]
         place = np.where(in_air, IN_HAND, np.where(alone, carrier, NOTHING))
         pose = self._qpos[ids][:, self._pose]
         same = (place == self.place[ids]) & (in_air | (self._distance(pose, self.pose[ids]) <= STILL_DISTANCE))
         confirmed = np.where(settled | same, place, NOTHING)
+
+        # A hand that brushes past what was placed does not take it away.
+        stays = np.where(~in_air & self._bears_alone(ids, self.rests[ids]), self.rests[ids], NOTHING)
+        self.rests[ids] = np.where(confirmed >= ON_TABLE, confirmed, stays)
 
         carried_to = self.carried_to[ids]
         elsewhere = (carried_to != IN_HAND) & (carried_to != carrier)
@@ -140,6 +142,15 @@ class Judge:
         self.grasped[ids], self.confirmed[ids] = grasped, confirmed
         self.place[ids], self.pose[ids] = place, pose
         self.forget(ids)
+
+    def _bears_alone(self, ids: np.ndarray, support: np.ndarray) -> np.ndarray:
+        """Since the last reading `support` (k, objects) bore the object, on average, and no support of the other
+        kind, table or receptacle, took part: (k, objects) bool; False where it is none."""
+        mean_up = self._sum_up[ids] / self._looks[ids][:, None, None]
+        borne = np.take_along_axis(mean_up, np.maximum(support, 0)[..., None], -1)[..., 0] >= CARRIES
+        table_helps = self._max_share[ids][..., ON_TABLE] > CARRIES_NOTHING
+        receptacle_helps = (self._max_up[ids][..., ON_TABLE + 1 :] > CARRIES_NOTHING).any(-1)
+        return (support >= ON_TABLE) & borne & ~np.where(support == ON_TABLE, receptacle_helps, table_helps)
 
     def _read_grasps(self, forces: np.ndarray, closing_axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Grasps, and those that squeeze, (k, objects) each, from the fingers' forces (k, objects, 2, 3) [N]."""
@@ -163,7 +174,7 @@ class Judge:
         self.grasped[ids], self.held[ids] = False, 0
         self.carried_to[ids] = np.where(on_table, ON_TABLE, IN_HAND)
         self.pose[ids] = poses
-        self.place[ids] = self.confirmed[ids] = np.where(on_table, ON_TABLE, NOTHING)
+        self.place[ids] = self.confirmed[ids] = self.rests[ids] = np.where(on_table, ON_TABLE, NOTHING)
 
     def put_one(self, ids: np.ndarray, body: str) -> None:
         """One body of simulations `ids` (k,) was moved by an intervention."""
@@ -175,13 +186,14 @@ class Judge:
         return self.grasped[:, self.scene.objects.index(obj)].copy()
 
     def is_on(self, obj: str, receptacle: str) -> np.ndarray:
-        """The object was carried to the receptacle, let go, and rests on it (n,)."""
+        """The object was carried to the receptacle, let go, came to rest on it, and has not left it (n,)."""
         i, place = self.scene.objects.index(obj), self.scene.receptacles.index(receptacle) + 1
-        return (self.confirmed[:, i] == place) & (self.carried_to[:, i] == place)
+        return (self.rests[:, i] == place) & (self.carried_to[:, i] == place)
 
     def is_on_table(self, obj: str) -> np.ndarray:
-        """The object is released and rests on the table, no receptacle carrying any of it (n,)."""
-        return self.confirmed[:, self.scene.objects.index(obj)] == ON_TABLE
+        """The object was released, came to rest on the table and has not left it, no receptacle carrying any of it
+        (n,)."""
+        return self.rests[:, self.scene.objects.index(obj)] == ON_TABLE
 
     def get_state(self) -> dict[str, np.ndarray]:
         """What the next reading depends on, as arrays with a leading dimension n."""

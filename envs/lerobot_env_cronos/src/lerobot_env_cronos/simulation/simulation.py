@@ -31,6 +31,9 @@ ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 NUM_ARM_JOINTS, NUM_ROBOT_JOINTS = 6, 8
 MAX_SPEED = 200.0
 """Joint or body speed beyond which a simulation counts as diverged [m/s, rad/s]."""
+BODY_SPEED_LIMITS = np.array([3.0, 50.0])
+"""No body moves [m/s] or spins [rad/s] faster, as in engines that limit both by default. A body that jumps out of a
+pinch would otherwise spin so fast that the integrator adds to its energy at each time step. No task comes near."""
 
 SETTLE_MAX_CHUNKS, SETTLE_SPEED = 10, 0.02
 """After an arm teleport bodies fall for at most 1 s, checked every 0.1 s, until slower than 0.02 m/s."""
@@ -107,7 +110,20 @@ class Simulation:
             self._batch.step(ids, nstep=nstep)
         except SimulationError as error:
             broken[error.ids] = True
+        self._limit_body_speeds(ids)
         return broken
+
+    def _limit_body_speeds(self, ids: np.ndarray) -> None:
+        velocity = self.qvel[ids, NUM_ROBOT_JOINTS:].reshape(len(ids), -1, 2, 3)
+        with np.errstate(invalid="ignore", over="ignore"):
+            speed = np.sqrt(np.einsum("nbki,nbki->nbk", velocity, velocity))
+            too_fast = speed > BODY_SPEED_LIMITS
+            if not too_fast.any():
+                return
+            mine = too_fast.any((1, 2))
+            scale = np.where(too_fast, BODY_SPEED_LIMITS / np.maximum(speed, BODY_SPEED_LIMITS), 1.0)
+        limited = (velocity * scale[..., None])[mine]
+        self.qvel[ids[mine], NUM_ROBOT_JOINTS:] = limited.reshape(len(limited), -1)
 
     def _next_arm_target(self, q: np.ndarray, actions: np.ndarray) -> np.ndarray:
         p, R, _ = forward_kinematics(q)
