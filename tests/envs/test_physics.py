@@ -1,4 +1,4 @@
-"""Friction of the table against Coulomb's law, in plain MuJoCo with sleep and motors off; limits of speed and depth."""
+"""Friction of the table against Coulomb's law, in plain MuJoCo with sleep and motors off; speed and depth limits."""
 
 import mujoco
 import numpy as np

@@ -24,7 +24,7 @@ BLOCKED_DEPTH = 0.003
 PREFERRED_OFFSET = 0.03
 """Distance beside the middle at which an empty receptacle still holds a second object [m]."""
 EDGE_ROOM = 0.015
-"""Wanted distance of the object's centre from the receptacle's edge: what overhangs further may tip over it [m]."""
+"""Wanted distance of an object's centre from the receptacle's edge: what overhangs further may tip [m]."""
 SPACING = 0.016
 """Of the points of the held object that are checked: closer than the thinnest side of an object, 18 mm [m]."""
 

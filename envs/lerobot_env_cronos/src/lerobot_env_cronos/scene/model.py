@@ -12,8 +12,8 @@ from lerobot_env_cronos.scene.robot import CONTACT_SOLIMP, add_robot
 from lerobot_env_cronos.scene.scenes import BODIES, Scene
 
 TABLE_LOW, TABLE_HIGH, TABLE_THICKNESS = (-0.20, -0.45), (0.70, 0.45), 0.30
-"""Table top in the base frame, surface at z = 0 [m]. A body pushed over its edge falls to the floor. Contacts push out
-along the shortest way: a hand that leans on a body would press it through the thin board that is drawn."""
+"""Table top in the base frame, surface at z = 0 [m]. A body pushed over its edge falls to the floor. Contacts push
+out along the shortest way: a hand that leans on a body would press it through the thin board that is drawn."""
 FLOOR_Z = -0.75
 
 CAMERAS: dict[str, dict[str, Any]] = {

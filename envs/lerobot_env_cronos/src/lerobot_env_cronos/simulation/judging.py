@@ -1,8 +1,8 @@
 """What lies where, and what the hand holds: read from the contact forces once after every control step.
 
-An object is placed on a receptacle when the hand, having carried it, has let go of it there, and at two readings in
-a row it lies still, neither hand nor table touches it, and the receptacle carries at least half of its weight. It
-stays placed for as long as the receptacle carries it. The reasons are in docs/protocol.md.
+An object is placed on a receptacle when the hand, having carried it, has let go of it there, and at two readings
+in a row it lies still, neither hand nor table touches it, and the receptacle carries at least half of its weight.
+It stays placed for as long as the receptacle carries it. The reasons are in docs/protocol.md.
 """
 
 import mujoco

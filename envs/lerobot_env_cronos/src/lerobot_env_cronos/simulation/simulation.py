@@ -32,8 +32,8 @@ NUM_ARM_JOINTS, NUM_ROBOT_JOINTS = 6, 8
 MAX_SPEED = 200.0
 """Joint or body speed beyond which a simulation counts as diverged [m/s, rad/s]."""
 BODY_SPEED_LIMITS = np.array([3.0, 50.0])
-"""No body moves [m/s] or spins [rad/s] faster, as in engines that limit both by default. A body that jumps out of a
-pinch would otherwise spin so fast that the integrator adds to its energy at each time step. No task comes near."""
+"""No body moves [m/s] or spins [rad/s] faster, as in engines that limit both by default. A body that jumps out of
+a pinch would otherwise spin so fast that the integrator adds to its energy at each step. No task comes near."""
 
 SETTLE_MAX_CHUNKS, SETTLE_SPEED = 10, 0.02
 """After an arm teleport bodies fall for at most 1 s, checked every 0.1 s, until slower than 0.02 m/s."""
