@@ -1,4 +1,4 @@
-"""Friction of the table against Coulomb's law, in plain MuJoCo with sleep and motors off; speed and depth limits."""
+"""Friction of the table against Coulomb's law, in plain MuJoCo with sleep and motors off; speed, depth."""
 
 import mujoco
 import numpy as np
