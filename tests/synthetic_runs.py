@@ -41,7 +41,7 @@ def write_training_run(folder, *, seed=0, interval=320, successes=(2, 3, 5), upd
                     "reward_per_segment": 0.5,
                     "diverged": 0,
                 },
-                "ppo": {
+                "agent": {
                     "approx_kl": 0.01 * update,
                     "entropy": 3.0 - 0.1 * update,
                     "explained_variance": None if update == 1 else 0.1 * update,

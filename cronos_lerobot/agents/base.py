@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from torch.optim import Optimizer
 
 Columns = dict[str, np.ndarray]
 """Observations by LeRobot's names, as the environment made them: images uint8 (B, H, W, 3), vectors float32."""
@@ -94,10 +100,12 @@ class ActionSample:
 class Agent(Protocol):
     """Lines 11, 13 and 16 to 18 of Algorithm 1."""
 
+    @abstractmethod
     def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
         """Sample actions for the raw observation `o_t` under the instructions `tau`."""
         ...
 
+    @abstractmethod
     def store(
         self,
         o_t: dict[str, Any],
@@ -111,6 +119,51 @@ class Agent(Protocol):
         """Keep one transition of every stream; `cut_t` is (N,) bool, where the trace ends with it."""
         ...
 
+    @abstractmethod
     def update(self) -> dict[str, float]:
         """Learn from what was stored, forget it, and return metrics."""
         ...
+
+
+class LearningAgent(Agent):
+    """An agent that `cronos-train` can run, save and resume; its defaults are those of one that only has a policy.
+
+    `act` gets the observations of this process's streams and the instructions of all N; so do `store`'s arguments.
+    """
+
+    policy: Any
+    """The LeRobot policy that acts: what is saved and evaluated."""
+    optimizer: Optimizer | dict[str, Optimizer] | None = None
+    """Saved and loaded as LeRobot does it."""
+
+    def end_step(self, success: np.ndarray) -> None:
+        """The step last stored left the tasks complete where `success` (N,) bool says so; before any `update`."""
+        return
+
+    def end_segment(self, success: np.ndarray, found_complete: np.ndarray) -> None:
+        """A segment of every stream is over and its resets are done; the next observation is of a new one.
+
+        Args:
+            success: (N,) bool, complete at any step of the segment.
+            found_complete: (N,) bool, a success for which nothing had to be done.
+        """
+        return
+
+    def shared_tensors(self) -> Iterable[Tensor]:
+        """What all processes must have alike after an update; it is checked."""
+        return (param for param in self.policy.parameters() if param.requires_grad)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What the agent needs to go on bit for bit, beside policy, optimizer and the context's generators.
+
+        All processes call it, and the first one's answer, which covers all streams, is kept: nested dicts and
+        lists of tensors, numbers and strings.
+        """
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from the first process's `state_dict`, in every process, perhaps with another config.
+
+        The policy, the optimizer and the generators are loaded already.
+        """
+        return

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from cronos_lerobot.report.runs import Group
+from cronos_lerobot.report.runs import Group, agent_metrics
 from cronos_lerobot.report.series import (
     Curve,
     evaluation_curve,
@@ -118,7 +118,7 @@ def ppo_figure(groups: list[Group]) -> Figure | None:
 
 
 def _metric(name: str) -> Callable[[dict[str, Any]], float | None]:
-    return lambda update: update["ppo"].get(name)
+    return lambda update: agent_metrics(update).get(name)
 
 
 def _reward(update: dict[str, Any]) -> float | None:

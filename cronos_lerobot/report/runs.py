@@ -39,6 +39,11 @@ Evaluation = dict[str, Any]
 Update = dict[str, Any]
 
 
+def agent_metrics(update: Update) -> dict[str, float | None]:
+    """What the agent said of a policy update; it stood under `ppo` when there was no other agent."""
+    return update.get("agent") or update.get("ppo") or {}
+
+
 @dataclass
 class TrainingRun:
     """A run folder of `cronos-train`."""

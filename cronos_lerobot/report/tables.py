@@ -9,7 +9,7 @@ from typing import Any
 
 from cronos_lerobot.protocol.metrics import performance_gap, success_at, summarise
 from cronos_lerobot.report.comparisons import Comparison
-from cronos_lerobot.report.runs import EvaluationRun, Group, TrainingRun, evaluation_rates
+from cronos_lerobot.report.runs import EvaluationRun, Group, TrainingRun, agent_metrics, evaluation_rates
 from cronos_lerobot.report.statistics import Gain, Rate
 
 Row = dict[str, Any]
@@ -108,7 +108,7 @@ def evaluation_rows(groups: Iterable[Group]) -> list[Row]:
 
 
 def update_rows(groups: Iterable[Group]) -> list[Row]:
-    """Every policy update: training success, PPO's diagnostics, speed."""
+    """Every policy update: training success, the agent's diagnostics, speed."""
     rows = []
     for group in groups:
         for run in group.runs:
@@ -119,7 +119,7 @@ def update_rows(groups: Iterable[Group]) -> list[Row]:
                 }
                 row |= {name: rollout[name] for name in ("success", "segments", "reward_per_segment", "diverged")}
                 row |= {name: (rollout.get(name) or [None])[0] for name in APART}
-                row |= {f"ppo/{name}": value for name, value in update["ppo"].items()}
+                row |= {f"agent/{name}": value for name, value in agent_metrics(update).items()}
                 row |= {"steps_per_s": update["steps_per_s"]}
                 rows.append(row | {f"time/{name}": value for name, value in update["time_share"].items()})
     return rows

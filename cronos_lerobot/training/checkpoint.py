@@ -4,7 +4,7 @@ checkpoints/
   0102400/
     pretrained_model/   config.json, model.safetensors, processors, train_config.json: what LeRobot loads
     training_state/     optimizer, RNGs, loop.json, env_state.npz, observers.pt, training_step.json, run.json;
-                        rollout.pt if a budget ended the run between two updates
+                        agent.pt: what the agent keeps of its own
   last -> 0102400
 
 Of a run on many processes it holds the streams and random numbers of all of them, written by the first one.
@@ -17,7 +17,7 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -41,23 +41,21 @@ from lerobot.utils.utils import flatten_dict, unflatten_dict
 from safetensors import SafetensorError
 from safetensors.torch import load_file, load_model, save_file
 
-from cronos_lerobot.agents.ppo.ppo import PPO
-from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
+from cronos_lerobot.agents.base import LearningAgent
+from cronos_lerobot.agents.state import to_arrays, to_tensors
 from cronos_lerobot.processes import Processes
 from cronos_lerobot.protocol.loop_state import LoopState
 from cronos_lerobot.training.config import CronosTrainConfig
-from cronos_lerobot.training.resume import RUN, check_resumed, describe_run, set_optimizer
+from cronos_lerobot.training.resume import RUN, check_resumed, describe_run
 from cronos_lerobot.training.seeding import NamedGenerators
 
 DAMAGE = (ValueError, RuntimeError, KeyError, EOFError, BadZipFile, UnpicklingError, SafetensorError)
 """What the readers of the files raise for a truncated one."""
 
-BASE_POLICY = "base_policy.safetensors"
+AGENT = "agent.pt"
 ENV_STATE = "env_state.npz"
 LOOP = "loop.json"
 OBSERVERS = "observers.pt"
-ROLLOUT = "rollout.pt"
-"""Transitions that no update has learned from yet."""
 PROCESS_RNG = "rng_state_process_{rank}.safetensors"
 """State of Python's, NumPy's and PyTorch's own generators of the processes after the first."""
 PARTIAL = ".partial_"
@@ -68,8 +66,7 @@ PARTIAL = ".partial_"
 class RunState:
     """What a run is made of, beside its config."""
 
-    ppo: PPO
-    buffer: RolloutBuffer
+    agent: LearningAgent
     loop: LoopState
     generators: NamedGenerators
     env: Any
@@ -96,7 +93,7 @@ def save_checkpoint(
     folder = Path(config.output_dir) / CHECKPOINTS_DIR
     final = folder / get_step_identifier(run.loop.n, config.total_steps)
     generators = _merge(run.processes.gather(run.generators.state_dict()))
-    rollout = _join(run.buffer.state_dict(), run.processes)
+    agent = run.agent.state_dict()
     other_rngs = run.processes.gather(serialize_rng_state())[1:]
     if not run.processes.is_main:
         return final
@@ -107,7 +104,7 @@ def save_checkpoint(
         _write_model(run, config, partial / PRETRAINED_MODEL_DIR)
         state_dir = partial / TRAINING_STATE_DIR
         _write_training_state(run, state_dir, observers, env_state, generators)
-        _save_tensors(rollout, state_dir / ROLLOUT)
+        torch.save(agent, state_dir / AGENT)
         about = describe_run(config, run.loop.n, run.loop.b)
         (state_dir / RUN).write_text(json.dumps(about, indent=2))
         for rank, rng in enumerate(other_rngs, start=1):
@@ -135,26 +132,24 @@ def load_checkpoint(run: RunState, config: CronosTrainConfig, folder: Path) -> d
         NotADirectoryError: `folder` is no checkpoint of a run.
         ValueError: `config` has what a resumed run refuses, or a file is damaged; it is named.
     """
-    about = check_resumed(config, folder)
+    check_resumed(config, folder)
     state_dir = folder / TRAINING_STATE_DIR
     with _reading(state_dir / LOOP) as path:
         state = json.loads(path.read_text())
     _warn_of_other_count(folder, run.processes)
     with _reading(folder / PRETRAINED_MODEL_DIR / "model.safetensors") as path:
-        load_model(run.ppo.policy, str(path))
-    with _reading(state_dir / OPTIMIZER_STATE):
-        load_optimizer_state(run.ppo.optimizer, state_dir)
-    set_optimizer(run.ppo.optimizer, config, about)
-    if run.ppo.base_policy is not None:
-        run.ppo.base_policy.load(load_file(state_dir / BASE_POLICY))
-    run.ppo.num_updates = state["num_updates"]
+        load_model(run.agent.policy, str(path))
+    if run.agent.optimizer is not None:
+        with _reading(state_dir / OPTIMIZER_STATE):
+            load_optimizer_state(run.agent.optimizer, state_dir)
     run.loop.__dict__.update(vars(LoopState.from_state_dict(state["loop"])))
     run.generators.load_state_dict(state["generators"])
     with _reading(state_dir / ENV_STATE) as path, np.load(path) as arrays:
         run.env.set_state(dict(arrays))
-    run.buffer.load_state_dict(_load_tensors(state_dir / ROLLOUT), run.processes.share_of(run.loop.num_streams))
+    run.agent.load_state_dict(_load_agent(state_dir / AGENT))
     _load_rng_state(state_dir, run.processes.rank)
-    return _load_tensors(state_dir / OBSERVERS)
+    with _reading(state_dir / OBSERVERS) as path:
+        return to_arrays(torch.load(path))
 
 
 def list_checkpoints(folder: Path) -> list[Path]:
@@ -163,7 +158,7 @@ def list_checkpoints(folder: Path) -> list[Path]:
 
 
 def _write_model(run: RunState, config: CronosTrainConfig, folder: Path) -> None:
-    run.ppo.policy.save_pretrained(folder)
+    run.agent.policy.save_pretrained(folder)
     config.save_pretrained(folder)
     run.preprocessor.save_pretrained(folder)
     run.postprocessor.save_pretrained(folder)
@@ -177,29 +172,24 @@ def _write_training_state(
     generators: dict[str, Any],
 ) -> None:
     folder.mkdir()
-    save_optimizer_state(run.ppo.optimizer, folder)
+    if run.agent.optimizer is not None:
+        save_optimizer_state(run.agent.optimizer, folder)
     save_rng_state(folder)
     save_training_step(run.loop.n, folder, num_processes=run.processes.count)
-    if run.ppo.base_policy is not None:
-        save_file(run.ppo.base_policy.parameters, folder / BASE_POLICY)
     np.savez(folder / ENV_STATE, allow_pickle=False, **env_state)
-    _save_tensors(observers, folder / OBSERVERS)
-    state = {
-        "loop": run.loop.state_dict(),
-        "num_updates": run.ppo.num_updates,
-        "generators": generators,
-    }
+    torch.save(to_tensors(observers), folder / OBSERVERS)
+    state = {"loop": run.loop.state_dict(), "generators": generators}
     (folder / LOOP).write_text(json.dumps(state))
 
 
-def _save_tensors(tree: dict[str, Any], path: Path) -> None:
-    """Write nested dicts with arrays: as tensors, which torch reads back without executing anything."""
-    torch.save(_map_leaves(tree, np.ndarray, torch.from_numpy), path)
-
-
-def _load_tensors(path: Path) -> dict[str, Any]:
+def _load_agent(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise ValueError(
+            f"{path} is missing: an earlier version made this checkpoint. Begin a new run, with the checkpoint as "
+            "--policy.path."
+        )
     with _reading(path):
-        return _map_leaves(torch.load(path), torch.Tensor, lambda tensor: tensor.numpy())
+        return torch.load(path, map_location="cpu")
 
 
 @contextmanager
@@ -209,16 +199,6 @@ def _reading(path: Path) -> Generator[Path]:
         yield path
     except DAMAGE as error:
         raise ValueError(f"{path} is damaged, or is of another policy: {error}") from error
-
-
-def _join(rollout: dict[str, Any], processes: Processes) -> dict[str, Any]:
-    """The rollouts of all processes as one, in the first of them; they number instructions each in its own way."""
-    if not rollout:
-        return {}
-    texts = sorted(set().union(*processes.gather(rollout["instructions"])))
-    numbers = np.array([texts.index(text) for text in rollout["instructions"]])
-    rollout = rollout | {"instruction_ids": numbers[rollout["instruction_ids"]]}
-    return _map_leaves(rollout, np.ndarray, processes.collect) | {"instructions": texts}
 
 
 def _merge(states: list[dict[str, Any]]) -> dict[str, Any]:
@@ -242,15 +222,6 @@ def _warn_of_other_count(folder: Path, processes: Processes) -> None:
             "they were, but with other random numbers, and an optimizer step now takes algorithm.minibatch_size * "
             f"algorithm.grad_accumulation transitions of {processes.count} processes."
         )
-
-
-def _map_leaves(tree: Any, leaf: type, convert: Callable[[Any], Any]) -> Any:
-    """Convert every `leaf` in nested dicts and lists."""
-    if isinstance(tree, dict):
-        return {key: _map_leaves(value, leaf, convert) for key, value in tree.items()}
-    if isinstance(tree, list):
-        return [_map_leaves(value, leaf, convert) for value in tree]
-    return convert(tree) if isinstance(tree, leaf) else tree
 
 
 def _remove_partial(folder: Path) -> None:

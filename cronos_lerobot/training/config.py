@@ -21,7 +21,9 @@ from lerobot.utils.constants import OBS_ENV_STATE, PRETRAINED_MODEL_DIR
 from lerobot_env_cronos import CronosEnvConfig, load_benchmark
 from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
 
+from cronos_lerobot.agents import builtin  # noqa: F401  (registers the agents)
 from cronos_lerobot.agents.ppo.config import PPOConfig
+from cronos_lerobot.agents.registry import check_agent
 from cronos_lerobot.data.writer import FLUSH_INTERVAL_S
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.resets import check_extra_resets
@@ -151,7 +153,7 @@ class CronosTrainConfig:
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     """When a stream switches task, when the policy learns, and what help a stream gets."""
     algorithm: RLAlgorithmConfig = field(default_factory=PPOConfig)
-    """How the policy learns: --algorithm.type=ppo (PocketVLA's settings, default) or ppo_paper."""
+    """How the policy learns: --algorithm.type=ppo (PocketVLA's settings, default), ppo_paper or another agent."""
     record: RecordConfig = field(default_factory=RecordConfig)
     """Recording of the streams."""
     eval: PeriodicEvaluationConfig = field(default_factory=PeriodicEvaluationConfig)
@@ -218,8 +220,7 @@ class CronosTrainConfig:
             raise ValueError("Choose an environment: --env.type=cronos --env.scene=kitchen_2x2.")
         if not isinstance(self.env, CronosEnvConfig):
             raise ValueError(f"--env.type must be cronos to train in, got {self.env.type!r}.")
-        if not isinstance(self.algorithm, PPOConfig):
-            raise ValueError(f"--algorithm.type must be ppo or ppo_paper, got {self.algorithm.type!r}.")
+        check_agent(self.algorithm.type)
         self._pin_benchmark(self.env)
         if not self.resume and (path := parser.get_path_arg("policy")):
             overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])

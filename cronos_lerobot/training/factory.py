@@ -14,7 +14,6 @@ from lerobot.utils.constants import ACTION
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, SequentialVectorEnv, get_scene
 from safetensors import SafetensorError
 
-from cronos_lerobot.agents.base import check_trainable
 from cronos_lerobot.evaluation.policy_env import check_task_observation
 from cronos_lerobot.training.config import CronosTrainConfig
 
@@ -71,8 +70,7 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
     """Return the config's policy on its device, its preprocessor and its postprocessor.
 
     Raises:
-        ValueError: the policy cannot be trained by reinforcement, was made for other observations or actions, or
-            its files are damaged.
+        ValueError: the policy was made for other observations or actions, or its files are damaged.
     """
     policy_config, env_config = config.policy, _cronos(config)
     assert policy_config is not None
@@ -83,7 +81,6 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
         logging.warning("Training a policy from scratch: its states are not normalised, its success starts at 0.")
     try:
         policy = make_policy(policy_config, env_cfg=env_config)
-        _check_trainable(policy)
         if path is None:
             return policy, *make_pre_post_processors(policy_config)
         # Like lerobot-train: the checkpoint's processors, on the device of this run.
@@ -93,13 +90,6 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
         raise ValueError(f"{path}/{SAFETENSORS_SINGLE_FILE} or a processor's file is damaged: {error}") from error
     except json.JSONDecodeError as error:
         raise ValueError(f"a configuration of a processor in {path} is damaged: {error}") from error
-
-
-def _check_trainable(policy: Any) -> None:
-    try:
-        check_trainable(policy)
-    except TypeError as error:
-        raise ValueError(str(error)) from error
 
 
 def check_features(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:

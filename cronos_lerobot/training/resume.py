@@ -9,7 +9,6 @@ from typing import Any
 from lerobot.configs import parser
 from lerobot.utils.constants import TRAINING_STATE_DIR
 from lerobot_env_cronos import CronosEnvConfig, check_environment_id, gymnasium_id, load_benchmark
-from torch.optim import Optimizer
 
 FOLLOWED, REFUSED = "followed", "refused"
 
@@ -40,7 +39,7 @@ _TABLE = {
         "value_lr lr_schedule target_kl kl_stop_factor lr_factor policy_lr_min policy_lr_max max_grad_norm "
         "value_max_grad_norm beta1 "
         "beta2 weight_decay",
-        REFUSED: "type kl_base_coef temperature",
+        REFUSED: "type kl_base_coef temperature *",
     },
     "record.": {FOLLOWED: "flush_interval_s", REFUSED: "repo_id root streams filmed_streams"},
     "eval.": {FOLLOWED: "n_episodes repetitions split temperature batch_size seed"},
@@ -157,17 +156,6 @@ def check_resumed(config: Any, checkpoint: Path) -> dict[str, Any]:
             f"--protocol.reset_budget={budget}, but the run has spent {spent}: give more than {spent}, or null."
         )
     return run
-
-
-def set_optimizer(optimizer: Optimizer, config: Any, run: dict[str, Any]) -> None:
-    """Give a loaded optimizer what `config` changes; other learning rates stay as they have become."""
-    own, new = run["config"]["algorithm"], config.to_dict()["algorithm"]
-    for group in optimizer.param_groups:
-        name = f"{group['name']}_lr"
-        if new[name] != own[name]:
-            group["lr"] = new[name]
-        group["weight_decay"] = new["weight_decay"]
-        group["betas"] = (new["beta1"], new["beta2"])
 
 
 def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:

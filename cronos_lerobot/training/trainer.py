@@ -8,11 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from cronos_lerobot.agents.ppo.agent import PPOAgent
-from cronos_lerobot.agents.ppo.config import PPOConfig
-from cronos_lerobot.agents.ppo.ppo import PPO
-from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
+from cronos_lerobot.agents.base import LearningAgent
 from cronos_lerobot.agents.processing import make_processors
+from cronos_lerobot.agents.registry import AgentContext, make_agent
 from cronos_lerobot.evaluation.independent import evaluate_independent
 from cronos_lerobot.processes import Processes, bit_sum
 from cronos_lerobot.protocol.loop_state import Event, SegmentEnd, Step, Update
@@ -37,14 +35,13 @@ class Trainer:
         env: the N streams, or those of this process; never reset by anyone but the run.
         make_eval_env: makes the evaluation's own environments, n of them (a `SequentialVectorEnv`), when first
             needed.
-        policy: a LeRobot policy that is a TrainablePolicy.
+        policy: a LeRobot policy that the config's agent can train.
         preprocessor: the policy's LeRobot preprocessor.
         postprocessor: the policy's LeRobot postprocessor.
         processes: that train together, this one among them; each makes its own Trainer.
 
     Raises:
-        TypeError: the policy is not trainable.
-        ValueError: the checkpoint to resume does not fit the config.
+        ValueError: the policy cannot be trained by the config's agent, or there is no such agent.
     """
 
     def __init__(
@@ -57,7 +54,6 @@ class Trainer:
         postprocessor: Any,
         processes: Processes | None = None,
     ) -> None:
-        assert isinstance(config.algorithm, PPOConfig)
         self.config = config
         self.policy = policy
         self.processes = processes or Processes()
@@ -69,14 +65,14 @@ class Trainer:
         self.generators = NamedGenerators(config.seed, str(next(policy.parameters()).device))
         self.processors = make_processors(policy, preprocessor, postprocessor)
         self.processes.copy_from_main([*policy.parameters(), *policy.buffers()])
-        # Every process draws its own minibatches and actions; configurations and tasks are drawn alike in all.
-        minibatches = self.generators.for_numpy(self.processes.own("minibatches"))
-        actions = self.generators.for_torch(self.processes.own("actions"))
-        ppo = PPO(policy, self.processors, config.algorithm, minibatches, self.processes)
-        buffer = RolloutBuffer(config.protocol.update_interval, env.num_envs)
+        self._resets = make_resets(config.protocol, self.generators.for_numpy)
+        task_rng = self.generators.for_numpy("task_order")
+        self._task_order = make_task_order(config.protocol.task_order, task_rng, self.task_set)
+        # Configurations and tasks are drawn alike in all processes; what an agent draws is each process's own.
+        self._drawn_alike = set(self.generators.state_dict()["numpy"])
+        # Every named generator exists before a checkpoint is loaded into them.
+        self.agent = self._make_agent()
         self.env = env if self.processes.count == 1 else ShardedEnv(env, self.processes)
-        mine = self.processes.share_of(config.num_envs)
-        self.agent = PPOAgent(ppo, buffer, actions, self.stopwatch, mine)
         self.loop = self.task_set.new_loop(config.num_envs)
         self._last_evaluation = 0
         self._last_interventions = 0
@@ -84,14 +80,26 @@ class Trainer:
         self._num_recorded = config.num_envs if isinstance(recorded, str) else recorded
         self._observers: dict[str, Any] = {}
         self.run_state = RunState(
-            ppo, buffer, self.loop, self.generators, self.env, preprocessor, postprocessor, self.processes
+            self.agent, self.loop, self.generators, self.env, preprocessor, postprocessor, self.processes
         )
         self.statistics = RolloutStatistics([t.instruction for t in self.task_set.all], len(self.task_set.tasks))
         self._smoothed = SmoothedSuccess(config.protocol, len(self.task_set.tasks))
-        # Every named generator exists before a checkpoint is loaded into them.
-        self._resets = make_resets(config.protocol, self.generators.for_numpy)
-        task_rng = self.generators.for_numpy("task_order")
-        self._task_order = make_task_order(config.protocol.task_order, task_rng, self.task_set)
+
+    def _make_agent(self) -> LearningAgent:
+        own = self.processes.own
+        return make_agent(
+            AgentContext(
+                config=self.config.algorithm,
+                policy=self.policy,
+                processors=self.processors,
+                num_streams=self.config.num_envs,
+                update_interval=self.config.protocol.update_interval,
+                rng=lambda name: self.generators.for_numpy(own(name)),
+                torch_rng=lambda name: self.generators.for_torch(own(name)),
+                processes=self.processes,
+                stopwatch=self.stopwatch,
+            )
+        )
 
     def load(self) -> None:
         """Go on from the config's checkpoint, if it has one.
@@ -182,23 +190,25 @@ class Trainer:
     def _observe(self, event: Event) -> None:
         self.statistics.on_event(event)
         if isinstance(event, Step):
+            self.agent.end_step(event.success)
             with self.stopwatch("record"):
                 if self.config.record.repo_id is not None:
                     event = whole_step(event, self.processes, self._num_recorded)
                 self.recorder.on_step(event)
         elif isinstance(event, Update):
             self._update_metrics = event.metrics
+        elif isinstance(event, SegmentEnd):
+            self.agent.end_segment(event.success, event.found_complete)
 
     def _check_processes(self) -> None:
         if self.processes.count == 1:
             return
-        generators = self.generators.state_dict()["numpy"]
-        generators.pop(self.processes.own("minibatches"))
+        states = self.generators.state_dict()["numpy"]
         self.processes.check_alike(
             {
                 "the loop's state": self.loop.state_dict(),
-                "the random numbers": generators,
-                "the policy": bit_sum(p for p in self.policy.parameters() if p.requires_grad),
+                "the random numbers": {name: states[name] for name in sorted(self._drawn_alike)},
+                "the policy": bit_sum(self.agent.shared_tensors()),
             }
         )
 
@@ -207,7 +217,7 @@ class Trainer:
         shares = {name: spent / wall for name, spent in sorted(seconds.items())}
         steps_per_s = self.config.steps_per_update / wall
         rollout = self.statistics.pop()
-        record = {"rollout": rollout, "ppo": self._update_metrics, "steps_per_s": steps_per_s}
+        record = {"rollout": rollout, "agent": self._update_metrics, "steps_per_s": steps_per_s}
         self.logger.log("update", record | {"time_share": shares})
         rates = self._smoothed.add(rollout, self.loop.n)
         if self.loop.updates % self.config.log_freq == 0:

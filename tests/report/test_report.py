@@ -223,8 +223,8 @@ def test_csv_files_hold_every_number(report_folder):
     assert (overall["before_successes"], overall["after_successes"], overall["gain"]) == ("10", "26", "0.5")
     assert len(read_csv(folder / "evaluations.csv")) == 3 * 5
     updates = read_csv(folder / "updates.csv")
-    assert [float(row["ppo/approx_kl"]) for row in updates] == [0.01 * i for i in range(1, 9)]
-    assert updates[0]["ppo/explained_variance"] == ""
+    assert [float(row["agent/approx_kl"]) for row in updates] == [0.01 * i for i in range(1, 9)]
+    assert updates[0]["agent/explained_variance"] == ""
     assert sum(int(row["n"]) for row in read_csv(folder / "segments.csv")) == 8 * 16
     (interventions,) = read_csv(folder / "interventions.csv")
     assert (interventions["scene_reset"], interventions["initial"]) == ("32", "8")

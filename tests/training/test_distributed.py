@@ -84,7 +84,7 @@ def test_two_processes_are_one_run(tmp_path, algorithm):
     assert answers[0][1] == pytest.approx(policy, rel=1e-3, abs=1e-5)
     one, two = metrics(tmp_path / "one"), metrics(tmp_path / "two")
     for a, b in zip(one, two, strict=True):
-        assert a.pop("ppo", {}) == pytest.approx(b.pop("ppo", {}), rel=1e-3, abs=1e-5)
+        assert a.pop("agent", {}) == pytest.approx(b.pop("agent", {}), rel=1e-3, abs=1e-5)
         assert a == b
     first, second = columns(tmp_path / "one"), columns(tmp_path / "two")
     assert first["cronos.stream_id"].tolist() == np.repeat(range(STREAMS), 32).tolist()
@@ -103,7 +103,7 @@ def test_the_runs_compared_have_everything_that_is_counted(tmp_path):
     assert np.sum(trainer_loop["successes"]) > 0
     early = settings(tmp_path / "early", 32, algorithm={"policy_lr": 0.3, "lr_schedule": "kl_step"})
     train(Processes(), early)
-    epochs = [line["ppo"]["policy_epochs"] for line in metrics(tmp_path / "early") if line["kind"] == "update"]
+    epochs = [line["agent"]["policy_epochs"] for line in metrics(tmp_path / "early") if line["kind"] == "update"]
     assert min(epochs[2:]) < 4
 
 

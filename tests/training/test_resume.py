@@ -44,7 +44,7 @@ def test_every_flag_is_followed_or_refused():
             unknown.append(name)
     assert not unknown, "say in training/resume.py and docs/training.md what a resumed run does with them"
     with pytest.raises(KeyError):
-        resume.rule_of("algorithm.no_such_flag")
+        resume.rule_of("record.no_such_flag")
 
 
 def test_the_docs_have_the_table():
@@ -101,7 +101,7 @@ def test_a_learning_rate_that_is_given_is_the_optimizers(tmp_path):
         changed = dataclasses.replace(algorithm, **given)
         trainer = make_trainer(resumed(tmp_path / "run", algorithm=changed))
         trainer.load()
-        groups = {group["name"]: group for group in trainer.run_state.ppo.optimizer.param_groups}
+        groups = {group["name"]: group for group in trainer.agent.optimizer.param_groups}
         saved = json.loads((state / "optimizer_param_groups.json").read_text())
         before = {group["name"]: group for group in saved}
         assert groups["policy"]["lr"] == (before["policy"]["lr"] if expected is None else expected)
@@ -113,7 +113,7 @@ DAMAGED = {
     "training_state/loop.json": "loop.json",
     "training_state/env_state.npz": "env_state.npz",
     "training_state/observers.pt": "observers.pt",
-    "training_state/rollout.pt": "rollout.pt",
+    "training_state/agent.pt": "agent.pt",
     "training_state/run.json": "run.json",
     "training_state/optimizer_state.safetensors": "optimizer_state.safetensors",
     "pretrained_model/model.safetensors": "model.safetensors",

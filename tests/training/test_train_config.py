@@ -74,7 +74,7 @@ def test_steps_are_rounded_up_to_whole_updates():
         (["--resume=true", "--config_path=/nowhere/train_config.json"], "--config_path=/nowhere/.*: no such file"),
         (["--env.type=cronos", "--policy.path=/nowhere"], "--policy.path=/nowhere: no such folder"),
         (["--policy.path=/nowhere", "--policy.type=act"], "Cannot specify both --policy.path and --policy.type"),
-        (["--env.type=cronos", "--algorithm.type=sac"], "ppo or ppo_paper"),
+        (["--env.type=cronos", "--algorithm.type=sac"], r"one of \[.*'ppo', 'ppo_paper'.*\], got 'sac'"),
     ],
 )
 def test_bad_values_are_named_on_the_command_line(arguments, message, monkeypatch):

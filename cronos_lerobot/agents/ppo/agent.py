@@ -7,14 +7,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from cronos_lerobot.agents.base import ActionSample, Columns
+from cronos_lerobot.agents.base import ActionSample, Columns, LearningAgent
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
+from cronos_lerobot.agents.ppo.state import join_rollouts, set_optimizer
 from cronos_lerobot.agents.processing import observation_columns
+from cronos_lerobot.agents.state import to_arrays, to_tensors
 from cronos_lerobot.stopwatch import Stopwatch
 
 
-class PPOAgent:
+class PPOAgent(LearningAgent):
     """Acts, stores and updates.
 
     Args:
@@ -34,6 +36,7 @@ class PPOAgent:
         streams: slice = slice(None),
     ) -> None:
         self.ppo = ppo
+        self.policy, self.optimizer = ppo.policy, ppo.optimizer
         self.buffer = buffer
         self.generator = generator
         self.stopwatch = stopwatch or Stopwatch()
@@ -86,6 +89,25 @@ class PPOAgent:
             metrics = self.ppo.update(self.buffer)
             self.buffer.clear()
             return metrics
+
+    def state_dict(self) -> dict[str, Any]:
+        """The rollout that a budget's end left, the base policy, the count of updates; see `LearningAgent`."""
+        ppo = self.ppo
+        base = {} if ppo.base_policy is None else ppo.base_policy.parameters
+        return {
+            "num_updates": ppo.num_updates,
+            "config": {"policy_lr": ppo.config.policy_lr, "value_lr": ppo.config.value_lr},
+            "base_policy": base,
+            "rollout": to_tensors(join_rollouts(self.buffer.state_dict(), ppo.processes)),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from `state_dict`, with the streams of this process."""
+        self.ppo.num_updates = state["num_updates"]
+        set_optimizer(self.ppo.optimizer, self.ppo.config, state["config"])
+        if self.ppo.base_policy is not None:
+            self.ppo.base_policy.load(state["base_policy"])
+        self.buffer.load_state_dict(to_arrays(state["rollout"]), self.streams)
 
     @torch.inference_mode()
     def _values(self, observation: dict[str, Any], tau: list[str]) -> np.ndarray:

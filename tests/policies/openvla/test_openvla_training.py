@@ -124,7 +124,7 @@ def test_the_papers_preset(published, tmp_path, monkeypatch):
         *[flag for flag in small if "grad_accumulation" not in flag],
     )  # fmt: skip
     (line,) = updates_of(output)
-    update = line["ppo"]
+    update = line["agent"]
     # All four minibatches are of the one optimizer step, so the policy is still the one that acted.
     assert update["ratio_max"] == pytest.approx(1.0, abs=1e-4)
     assert update["approx_kl"] < 1e-6

@@ -1,0 +1,5 @@
+"""The agents of this package; importing it registers them."""
+
+from cronos_lerobot.agents.ppo import factory as ppo
+
+__all__ = ["ppo"]

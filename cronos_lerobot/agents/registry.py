@@ -1,0 +1,96 @@
+"""Agents by name: what `--algorithm.type=` picks, open to users as resets and task orders are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.rl.algorithms.configs import RLAlgorithmConfig
+
+from cronos_lerobot.agents.base import LearningAgent
+from cronos_lerobot.agents.processing import PolicyProcessors
+from cronos_lerobot.processes import Processes
+from cronos_lerobot.stopwatch import Stopwatch
+
+
+@dataclass(frozen=True)
+class AgentContext:
+    """What an agent is made from."""
+
+    config: Any
+    """`--algorithm.*`: the agent's own config class, with the command line's values."""
+    policy: Any
+    """The LeRobot policy, on its device, with the weights that the run begins with."""
+    processors: PolicyProcessors
+    """The policy's pre- and postprocessor."""
+    num_streams: int
+    """N, of all processes together."""
+    update_interval: int
+    """U: control steps of each stream between two updates."""
+    rng: Callable[[str], np.random.Generator]
+    """Returns the NumPy generator of a name, this process's own. Ask for all of them when the agent is made: the
+    checkpoint holds them and continues them."""
+    torch_rng: Callable[[str], torch.Generator]
+    """Returns the torch generator of a name, on the policy's device, in the same way."""
+    processes: Processes = field(default_factory=Processes)
+    """Those that train together. Gradients are averaged over them by the agent."""
+    stopwatch: Stopwatch = field(default_factory=Stopwatch)
+    """To be told the time spent in `act` ("infer") and in `update` ("update")."""
+
+    @property
+    def streams(self) -> slice:
+        """Of all N streams, those of this process."""
+        return self.processes.share_of(self.num_streams)
+
+
+AgentFactory = Callable[[AgentContext], LearningAgent]
+
+AGENTS: dict[str, AgentFactory] = {}
+"""What makes the agent of an `--algorithm.type`."""
+
+
+def register_agent(name: str) -> Callable[[AgentFactory], AgentFactory]:
+    """Make an agent selectable as `--algorithm.type=name`.
+
+    It decorates a class whose constructor, or a function that, takes an AgentContext. The config of the same name
+    is registered with LeRobot: `@RLAlgorithmConfig.register_subclass(name)`. If the policy cannot be trained by
+    the agent, it raises a ValueError that says so.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+
+    def register(factory: AgentFactory) -> AgentFactory:
+        if name in AGENTS:
+            raise ValueError(f"there is an agent {name!r} already; taken names: {sorted(AGENTS)}.")
+        AGENTS[name] = factory
+        return factory
+
+    return register
+
+
+def agent_names() -> list[str]:
+    """The valid values of `--algorithm.type`: those with an agent and a config."""
+    return sorted(AGENTS.keys() & RLAlgorithmConfig.get_known_choices().keys())
+
+
+def check_agent(name: str) -> None:
+    """Raise a ValueError that lists the valid names, unless `name` is one of them."""
+    if name not in AGENTS:
+        raise ValueError(
+            f"--algorithm.type must be one of {agent_names()}, got {name!r}. Register your own with "
+            "cronos_lerobot.agents.registry.register_agent, in a module named by --discover_packages_path."
+        )
+
+
+def make_agent(context: AgentContext) -> LearningAgent:
+    """Return the agent of the context's config.
+
+    Raises:
+        ValueError: there is no agent of that name, or the policy cannot be trained by it.
+    """
+    check_agent(context.config.type)
+    return AGENTS[context.config.type](context)

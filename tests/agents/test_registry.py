@@ -1,0 +1,29 @@
+"""Agents by name."""
+
+from types import SimpleNamespace
+
+import pytest
+from lerobot.rl.algorithms.configs import RLAlgorithmConfig
+
+from cronos_lerobot.agents import builtin, registry
+
+assert builtin
+
+
+def test_a_name_is_taken_once_and_needs_a_config_to_be_offered(monkeypatch):
+    monkeypatch.setattr(registry, "AGENTS", dict(registry.AGENTS))
+    made = registry.register_agent("of_a_test")(lambda context: ("made of", context))
+    context = SimpleNamespace(config=SimpleNamespace(type="of_a_test"))
+    assert registry.make_agent(context) == ("made of", context)
+    assert registry.AGENTS["of_a_test"] is made
+    # LeRobot's own algorithm has a config and no agent here, this one an agent and no config.
+    assert {"ppo", "ppo_paper"} <= set(registry.agent_names())
+    assert not {"sac", "of_a_test"} & set(registry.agent_names())
+    with pytest.raises(ValueError, match=r"there is an agent 'ppo' already; taken names: \[.*'of_a_test', 'ppo'"):
+        registry.register_agent("ppo")(made)
+    with pytest.raises(ValueError, match=r"--algorithm\.type must be one of \[.*'ppo_paper'.*\], got 'sac'"):
+        registry.check_agent("sac")
+
+
+def test_every_agent_of_this_package_has_a_config():
+    assert set(registry.AGENTS) <= set(RLAlgorithmConfig.get_known_choices())
