@@ -3,6 +3,7 @@
 cronos-streams statistics   successes by segment since the scene reset, task, policy version; what they began after
 cronos-streams check        that nothing is missing, nothing there twice, every annotation where it belongs
 cronos-streams filter       some of the segments as an ordinary LeRobotDataset, for lerobot-train
+cronos-streams weights      a weight for every frame, good and bad segments alike, for lerobot-train's RA-BC
 
 examples:
   what happened in a run
@@ -17,6 +18,16 @@ examples:
       cronos-streams filter --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams \\
           --filter.success=false --filter.min_policy_version=10 --filter.interventions='[end_effector_reset]' \\
           --output.repo_id=me/failures --output.root=outputs/failures
+  learn from the whole stream with a stock lerobot-train: a frame counts in full if its action chunk led nearer to
+  a grasp or a success, not at all if it undid one, by less than half if it changed nothing
+      cronos-streams weights --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams \\
+          --output=outputs/progress.parquet --chunk_size=50
+      lerobot-train --policy.type=smolvla --policy.load_vlm_weights=true --policy.push_to_hub=false \\
+          --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams \\
+          --sample_weighting.type=rabc --sample_weighting.progress_path=outputs/progress.parquet
+  the same by PPO's advantages, from the recorded rewards and values
+      cronos-streams weights --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams \\
+          --weight_by=advantage --output=outputs/advantage.parquet
 
 `cronos-streams filter --help` has the flags of a command, docs/streams.md the rest.
 """
@@ -34,6 +45,7 @@ from rich.console import Console
 from cronos_lerobot.data.file_check import check_dataset
 from cronos_lerobot.data.stream_filter import SegmentFilter, filter_streams
 from cronos_lerobot.data.stream_statistics import make_tables, statistics
+from cronos_lerobot.data.stream_weights import Weighting, count_weights, write_progress
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.scripts.subcommands import run_subcommand
 
@@ -111,6 +123,28 @@ class FilterConfig:
             raise ValueError(f"frames_after_success must be >= 0 or null, got {self.frames_after_success}")
 
 
+@dataclass
+class WeightsConfig(Weighting):
+    """Write what `lerobot-train --sample_weighting.type=rabc` weighs frames by.
+
+    LeRobot's weight of a frame is 1 if progress grows by more than kappa (0.01) over the action chunk that begins
+    there, 0 if it falls, and in between by how the difference compares with those of all frames: docs/streams.md.
+    """
+
+    dataset: SourceConfig = field(default_factory=SourceConfig)
+    """The streams, as recorded or filtered. Train on the same dataset: frames are known by their index."""
+    output: Path | None = None
+    """The parquet file, for --sample_weighting.progress_path."""
+    chunk_size: int | None = None
+    """Actions in a chunk of the policy that will be trained: says how many frames get which weight. The file is
+    the same for every policy."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.chunk_size is not None and self.chunk_size < 1:
+            raise ValueError(f"chunk_size must be >= 1 or null, got {self.chunk_size}")
+
+
 def print_statistics(config: StatisticsConfig) -> None:
     """`cronos-streams statistics`."""
     result = statistics(config.dataset.open(streaming=True))
@@ -147,10 +181,25 @@ def filter_segments(config: FilterConfig) -> None:
     print(f"{written} of {total} segments in {root}")
 
 
+def write_weights(config: WeightsConfig) -> None:
+    """`cronos-streams weights`."""
+    if config.output is None:
+        raise ValueError("name the file to write: --output=<file>.parquet")
+    streams = config.dataset.open(streaming=True)
+    made_with = write_progress(streams, config.output, config)
+    how = ", ".join(f"{name}={value}" for name, value in made_with.items() if name != "dataset")
+    print(f"{config.output}: {streams.meta.total_frames} frames of {len(streams.segments)} segments, {how}")
+    if config.chunk_size is not None:
+        counts = count_weights(config.output, config.chunk_size)
+        text = ", ".join(f"{n} frames {weight}" for weight, n in counts.items())
+        print(f"weights at chunk_size={config.chunk_size}, before each batch is normalised: {text}")
+
+
 COMMANDS: dict[str, tuple[type, Callable[[Any], None]]] = {
     "statistics": (StatisticsConfig, print_statistics),
     "check": (CheckConfig, check),
     "filter": (FilterConfig, filter_segments),
+    "weights": (WeightsConfig, write_weights),
 }
 
 

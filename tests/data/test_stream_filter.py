@@ -181,7 +181,7 @@ def test_command(source, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["chek"], r"unknown command 'chek'; valid commands: \['statistics', 'check', 'filter'\]"),
+        (["chek"], r"unknown command 'chek'; valid commands: \['statistics', 'check', 'filter', 'weights'\]"),
         (["check"], "choose a dataset: --dataset.repo_id"),
         (["check", "--dataset.repo_id=me/s", "--dataset.root=nowhere"], "no LeRobotDataset in nowhere"),
         (

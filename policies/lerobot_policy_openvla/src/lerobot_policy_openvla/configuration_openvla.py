@@ -201,6 +201,11 @@ class OpenVLAConfig(PreTrainedConfig):
         return None
 
     @property
+    def chunk_size(self) -> int:
+        """Actions in a chunk; LeRobot's sample weighting looks so many frames ahead."""
+        return 1
+
+    @property
     def reward_delta_indices(self) -> None:
         """No rewards."""
         return None

@@ -1,0 +1,203 @@
+"""`cronos-streams weights`, against numbers worked out by hand and LeRobot's own reader."""
+
+import json
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import lerobot
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+import torch
+from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.rewards.sarm.rabc import RABCWeights
+from lerobot.utils.sample_weighting import SampleWeightingConfig, make_sample_weighter
+from synthetic_streams import ORIGIN, record
+from weighted_streams import CHUNK, DIFFERENCES, GAMMA, PROGRESS, SOFT, WEIGHTS, record_weighted
+
+from cronos_lerobot.data.stream_filter import SegmentFilter, filter_streams
+from cronos_lerobot.data.stream_weights import (
+    COLUMN,
+    Weighting,
+    count_weights,
+    reward_levels,
+    summed_advantages,
+    write_progress,
+)
+from cronos_lerobot.data.streams import StreamDataset
+from cronos_lerobot.scripts import streams as script
+
+FLAT = np.concatenate(PROGRESS)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("recorded") / "streams"
+    record_weighted(folder)
+    StreamDataset("me/stream", folder, streaming=True).check()
+    return folder
+
+
+def write(root: Path, output: Path, **options) -> pd.DataFrame:
+    write_progress(StreamDataset("me/stream", root, streaming=True), output, Weighting(**options))
+    return pd.read_parquet(output)
+
+
+def test_progress_of_every_frame(root, tmp_path):
+    rows = write(root, tmp_path / "new/progress.parquet", gamma=GAMMA)
+    np.testing.assert_array_equal(rows["index"], np.arange(26))
+    np.testing.assert_array_equal(rows["episode_index"], np.repeat(np.arange(6), [6, 6, 6, 3, 3, 2]))
+    np.testing.assert_array_equal(rows["frame_index"][21:], [0, 1, 2, 0, 1])
+    np.testing.assert_allclose(rows[COLUMN], FLAT, atol=1e-7)
+    made_with = json.loads(pq.read_metadata(tmp_path / "new/progress.parquet").metadata[b"cronos"])
+    assert made_with == {"dataset": "me/stream", "weight_by": "progress", "gamma": GAMMA}
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["progress.parquet"]
+
+
+def test_lerobot_weighs_frames_as_by_hand(root, tmp_path):
+    write(root, tmp_path / "p", gamma=GAMMA)
+    weighter = RABCWeights(tmp_path / "p", chunk_size=CHUNK, device=torch.device("cpu"))
+    by_hand = torch.tensor(np.concatenate(WEIGHTS), dtype=torch.float32)
+    # Backwards, and without the last frame: by their index, whatever the batch is.
+    weights, stats = weighter.compute_batch_weights({"index": torch.arange(25).flip(0)})
+    expected = by_hand[:25].flip(0)
+    torch.testing.assert_close(weights, expected * 25 / expected.sum(), atol=1e-4, rtol=0)
+    assert (stats["num_full_weight"], stats["num_zero_weight"]) == (9, 3)
+    assert weighter.get_stats()["delta_mean"] == pytest.approx(np.concatenate(DIFFERENCES).mean(), abs=1e-6)
+    assert count_weights(tmp_path / "p", CHUNK) == {
+        "of weight 1": 9, "of weight 0": 3, f"between, {SOFT:.2f} on average": 14
+    }  # fmt: skip
+
+
+def test_a_chunk_longer_than_a_segment_ends_with_it(root, tmp_path):
+    write(root, tmp_path / "p", gamma=GAMMA)
+    weights, _ = RABCWeights(tmp_path / "p", 50, device=torch.device("cpu")).compute_batch_weights(
+        {"index": torch.tensor([0, 6, 8, 23])}
+    )
+    # To the last row: 1 - 0.0625, 0 - 0.025, 0 - 0.1, and the last frame itself.
+    assert weights[0] > weights[3] > 0
+    assert weights[1] == weights[2] == 0
+
+
+def test_where_the_level_is_paid_at_every_step(tmp_path):
+    origin = replace(ORIGIN, flags={"protocol.reward": "level"})
+    record_weighted(tmp_path / "d", reward="level", origin=origin)
+    rows = write(tmp_path / "d", tmp_path / "p", gamma=GAMMA)
+    # The grasp that the last segment began with was paid before it, and is not recorded.
+    np.testing.assert_allclose(rows[COLUMN], [*FLAT[:-2], 0, 0], atol=1e-7)
+
+
+def test_levels_of_segments_that_cannot_be_told_from_sums_alone():
+    def levels(rewards, successes):
+        found = reward_levels(np.array(rewards), np.array(successes), "difference")
+        return None if found is None else found.tolist()
+
+    # Undone, and done again; the object was in the hand from the start.
+    assert levels([0.9, -1, 0.1, 0.9], [1, 0, 0, 1]) == [1, 1, 0, 0.1, 1]
+    assert levels([0, 0.9], [0, 1]) == [0.1, 0.1, 1]
+    # Complete until it was undone.
+    assert levels([0, -1], [1, 0]) == [1, 1, 0]
+    # Two grasps at once, a success that was not paid, and one that was paid and is none.
+    assert levels([0.1, 0.1], [0, 0]) is None
+    assert levels([0, 0, 0], [0, 1, 1]) is None
+    assert levels([1, 0], [0, 0]) is None
+
+
+def test_advantages_by_hand():
+    rewards, values = np.array([0, 0.1, 0.9]), np.array([0.2, 0.4, 0.6])
+    # TD errors 0 + 0.5 * 0.4 - 0.2, 0.1 + 0.5 * 0.6 - 0.4, and 0.9 + 0.5 * 0.6 - 0.6 with the last value again.
+    np.testing.assert_allclose(summed_advantages(rewards, values, 0.5, 0), [0, 0, 0.6], atol=1e-6)
+    # Returns 1.2, 0.7 and 0.35 less the values: 0.15, 0.3, 0.6.
+    np.testing.assert_allclose(summed_advantages(rewards, values, 0.5, 1), [0, 0.15, 1.05], atol=1e-6)
+    np.testing.assert_allclose(summed_advantages(rewards[2:], values[2:], 0.5, 1), [0.6], atol=1e-6)
+
+
+def test_advantages_of_a_recording_end_with_each_segment(tmp_path):
+    flags = {"algorithm.gamma": 0.5, "algorithm.gae_lambda": 0.0}
+    record_weighted(tmp_path / "d", value=0.2, origin=replace(ORIGIN, flags=flags))
+    rows = write(tmp_path / "d", tmp_path / "p", weight_by="advantage")
+    # Every action costs 0.2 - 0.5 * 0.2 = 0.1 of value besides what it is paid: in the first segment -0.1, 0,
+    # -0.1, 0.8, -0.1, -0.1; in the last one -0.2, -0.1.
+    np.testing.assert_allclose(rows[COLUMN][:6], [0, -0.1, -0.1, -0.2, 0.6, 0.4], atol=1e-6)
+    np.testing.assert_allclose(rows[COLUMN][24:], [0, -0.3], atol=1e-6)
+
+
+def test_numbers_that_are_not_given():
+    run = {"algorithm.gamma": 0.95, "algorithm.gae_lambda": 0.7}
+    assert Weighting().discounts(run)[0] == 0.98
+    assert Weighting("advantage").discounts(run) == (0.95, 0.7)
+    assert Weighting("advantage", gae_lambda=0).discounts(run) == (0.95, 0)
+    assert Weighting("advantage", gamma=1).discounts({}) == (1, 0.9)
+
+
+def test_a_filtered_dataset_has_weights_of_its_own(root, tmp_path):
+    source = StreamDataset("me/stream", root, streaming=True)
+    filter_streams(
+        source, SegmentFilter(found_complete=False), "me/stream", tmp_path / "d", frames_after_success=0
+    )
+    rows = write(tmp_path / "d", tmp_path / "p", gamma=GAMMA)
+    # The first segment ends with its success, in the fourth frame.
+    np.testing.assert_allclose(rows[COLUMN][:4], [0.0625, 0.125, 0.25, 1], atol=1e-7)
+    np.testing.assert_allclose(rows[COLUMN][4:10], PROGRESS[1], atol=1e-7)
+    assert len(rows) == 26 - 2 - 6
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ((), "error: name the file to write: --output=<file>.parquet"),
+        (("--output=.",), "error: . is a folder; name a file in it, progress.parquet say"),
+        (
+            ("--output=p", "--weight_by=reward"),
+            "error: weight_by must be one of ['progress', 'advantage'], got 'r",
+        ),
+        (("--output=p", "--gamma=1.5"), "error: gamma must be in (0, 1] or null, got 1.5"),
+        (("--output=p", "--gae_lambda=2"), "error: gae_lambda must be in [0, 1] or null, got 2.0"),
+        (("--output=p", "--gae_lambda=1"), "error: gae_lambda=1.0 needs weight_by=advantage, got 'progress'"),
+        (("--output=p", "--chunk_size=0"), "error: chunk_size must be >= 1 or null, got 0"),
+    ],
+)
+def test_wrong_flags(root, tmp_path, monkeypatch, flags, message):
+    monkeypatch.chdir(tmp_path)
+    dataset = ["--dataset.repo_id=me/stream", f"--dataset.root={root}"]
+    monkeypatch.setattr(sys, "argv", ["cronos-streams", "weights", *dataset, *flags])
+    with pytest.raises(SystemExit) as end:
+        script.main()
+    assert str(end.value).startswith(message)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command(root, tmp_path, monkeypatch, capsys):
+    dataset = ["--dataset.repo_id=me/stream", f"--dataset.root={root}", f"--output={tmp_path / 'p'}"]
+    monkeypatch.setattr(sys, "argv", ["cronos-streams", "weights", *dataset, "--gamma=0.5", "--chunk_size=2"])
+    script.main()
+    out = capsys.readouterr().out
+    assert "26 frames of 6 segments, weight_by=progress, gamma=0.5\n" in out
+    assert "9 frames of weight 1, 3 frames of weight 0, 14 frames between, 0.38 on average" in out
+
+
+def test_what_cannot_be_weighed_is_refused(tmp_path):
+    record(tmp_path / "d", repo_id="me/stream")
+    with pytest.raises(ValueError, match=r"stream 0, step 0: the rewards of this segment do not go with next"):
+        write(tmp_path / "d", tmp_path / "p")
+    record_weighted(tmp_path / "no_critic", value=np.nan)
+    with pytest.raises(ValueError, match=r"cronos.value is not finite in 26 of 26 frames.*--weight_by=progress"):
+        write(tmp_path / "no_critic", tmp_path / "p", weight_by="advantage")
+    assert not (tmp_path / "p").exists()
+
+
+def test_policies_that_lerobot_can_weigh_are_those_of_the_docs():
+    docs = (Path(__file__).parents[2] / "docs/streams.md").read_text()
+    named = re.search(r"LeRobot's own: (.*?)\.\n", docs)
+    assert named is not None
+    forward = re.compile(r"def forward\(\s*self,\s*batch[^)]*reduction: str")
+    policies = Path(lerobot.__file__).parent / "policies"
+    found = {path.parent.name for path in policies.glob("*/modeling_*.py") if forward.search(path.read_text())}
+    assert set(re.findall(r"`(\w+)`", named[1])) == found
+    diffusion = SimpleNamespace(config=DiffusionConfig())
+    with pytest.raises(ValueError, match="requires a policy with 'chunk_size' in its config"):
+        make_sample_weighter(SampleWeightingConfig(), diffusion, torch.device("cpu"))  # ty: ignore
