@@ -1,5 +1,6 @@
 """The agents of this package; importing it registers them."""
 
+from cronos_lerobot.agents.imitation import agent as imitation
 from cronos_lerobot.agents.ppo import factory as ppo
 
-__all__ = ["ppo"]
+__all__ = ["imitation", "ppo"]

@@ -15,14 +15,15 @@ from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 
 from cronos_lerobot.agents.base import TrainablePolicy
+from cronos_lerobot.agents.chunk_player import make_player
 from cronos_lerobot.agents.processing import PolicyProcessors, observation_columns
 
 
 class Actor(Protocol):
     """Chooses actions for some of the environments."""
 
-    is_memoryless: bool
-    """Whether an action depends on nothing but the observation; if not, `act` is always asked for all."""
+    is_per_environment: bool
+    """Whether it remembers nothing, or of each environment by itself; if not, `act` is always asked for all."""
 
     def seed(self, seed: int) -> None:
         """Start all randomness that is not handed to `act` anew."""
@@ -53,7 +54,7 @@ class SamplingPolicy:
     chains beside it (up to the rounding of a batch of another size). If not, a generator is drawn from in turn.
     """
 
-    is_memoryless = True
+    is_per_environment = True
 
     def __init__(self, policy: Any, processors: PolicyProcessors, temperature: float) -> None:
         self._policy, self._processors, self._temperature = policy.eval(), processors, temperature
@@ -83,11 +84,12 @@ class SamplingPolicy:
 
 
 class SelectingPolicy:
-    """Any LeRobot policy through `select_action`, prepared and asked as `lerobot-eval` does.
+    """Any LeRobot policy, prepared and asked as `lerobot-eval` does.
 
-    It may queue chunks of actions or look back, and has one memory for the whole batch, which LeRobot can only
-    clear for all at once. So its chains start together, and the memory is cleared whenever a new task begins in
-    all chains that still run: at every switch with `advance=window`.
+    It may queue chunks of actions or look back, with a memory of its own for each environment. The few policies
+    whose plans depend on the plans before them (`make_player`) have one memory for the whole batch, which LeRobot
+    can only clear for all at once: their chains start together, and it is cleared whenever a new task begins in
+    all chains that still run, at every switch with `advance=window`.
 
     Args:
         policy: on its device.
@@ -95,22 +97,21 @@ class SelectingPolicy:
         env_processors: LeRobot's processors between environment and policy, (before, after).
     """
 
-    is_memoryless = False
-
     def __init__(self, policy: Any, processors: PolicyProcessors, env_processors: tuple[Any, Any]) -> None:
         before, self._after_policy = env_processors
-        self._policy, self._processors = policy.eval(), copy(processors)
+        self._player, self._processors = make_player(policy.eval()), copy(processors)
         self._processors.preprocessor = lambda batch: processors.preprocessor(before(batch))
         self._autocast = _autocast(policy, processors)
+        self.is_per_environment = self._player.is_per_stream
 
     def seed(self, seed: int) -> None:
         """Seed the global generators, from which LeRobot's policies draw."""
         set_seed(seed)
 
     def begin(self, ids: np.ndarray, running: np.ndarray) -> None:
-        """Forget chunks and history, if the task is new for all."""
-        if len(ids) == len(running):
-            self._policy.reset()
+        """Forget chunks and history, of all at once only if the task is new for all."""
+        if self.is_per_environment or len(ids) == len(running):
+            self._player.begin(ids.tolist())
 
     @torch.inference_mode()
     def act(
@@ -119,14 +120,14 @@ class SelectingPolicy:
         """See `Actor`."""
         batch = self._processors.batch(observation_columns(observation), instructions)
         with self._autocast():
-            action = self._processors.postprocessor(self._policy.select_action(batch))
+            action = self._processors.postprocessor(self._player.act(batch, ids.tolist()))
         return self._after_policy({ACTION: action})[ACTION].to("cpu", torch.float32).numpy()
 
 
 class ExpertActor:
     """The scripted expert, which looks at the simulation's state: the ceiling of every policy."""
 
-    is_memoryless = True
+    is_per_environment = True
 
     def __init__(self, env: CronosVectorEnv) -> None:
         self._expert = ScriptedExpert(env)

@@ -165,11 +165,10 @@ class ChainRunner:
     def _fill(self, waiting: deque[tuple[int, Chain]], noise: Noise) -> np.ndarray:
         """Start waiting chains in free environments; returns those (k,).
 
-        A policy that remembers has one memory for the whole batch, which can only be cleared for all: its chains
-        are started together.
+        A policy with one memory for the whole batch can only clear it for all: its chains are started together.
         """
         free = self._everyone[self.env.done][: len(waiting)]
-        if not len(free) or not (self.actor.is_memoryless or self.env.done.all()):
+        if not len(free) or not (self.actor.is_per_environment or self.env.done.all()):
             return np.zeros(0, dtype=int)
         started = [waiting.popleft() for _ in free]
         tasks = [chain.tasks for _, chain in started]
@@ -190,7 +189,7 @@ class ChainRunner:
     def _choose(self, running: np.ndarray) -> np.ndarray:
         """Actions (n, 7), zero for those that are not running."""
         env = self.env
-        if self.actor.is_memoryless:
+        if self.actor.is_per_environment:
             ids, observation = running, env.observe(running)
         else:
             ids, observation = self._everyone, env.observe_running(running)

@@ -26,8 +26,8 @@ class ConfigurationEnv(ScriptedEnv):
 class Actor:
     """Does nothing, and keeps what it was told."""
 
-    def __init__(self, is_memoryless=True):
-        self.is_memoryless, self.begun, self.asked, self.uniform = is_memoryless, [], [], []
+    def __init__(self, is_per_environment=True):
+        self.is_per_environment, self.begun, self.asked, self.uniform = is_per_environment, [], [], []
 
     def seed(self, seed):
         pass
@@ -68,10 +68,10 @@ def run(num_envs, actor=None, chains=CHAINS, noise=no_noise, **kwargs):
 
 
 @pytest.mark.parametrize("advance", ["window", "on_success"])
-@pytest.mark.parametrize("is_memoryless", [True, False])
+@pytest.mark.parametrize("is_per_environment", [True, False])
 @pytest.mark.parametrize("num_envs", [1, 2, 3, 5, 7])
-def test_lengths_and_steps_by_hand_whatever_the_batch(num_envs, is_memoryless, advance):
-    results, _ = run(num_envs, Actor(is_memoryless), advance=advance)
+def test_lengths_and_steps_by_hand_whatever_the_batch(num_envs, is_per_environment, advance):
+    results, _ = run(num_envs, Actor(is_per_environment), advance=advance)
     assert [r.chain for r in results] == CHAINS
     assert [r.length for r in results] == LENGTHS
     assert [r.steps for r in results] == STEPS[advance]
@@ -90,7 +90,7 @@ def test_a_failed_chain_makes_room_at_once_and_costs_nothing_any_more():
 
 
 def test_a_policy_with_a_memory_is_started_for_all_at_once_and_always_asked_for_all():
-    actor = Actor(is_memoryless=False)
+    actor = Actor(is_per_environment=False)
     run(2, actor)
     # Batches of chains (0, 1), (2, 3) and (4): as long as the longest of each.
     assert len(actor.asked) == 280 + 320 + 320

@@ -1,0 +1,1 @@
+"""Imitation of a stream's own successes."""

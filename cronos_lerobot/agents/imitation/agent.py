@@ -1,0 +1,173 @@
+"""An agent that imitates what it did when it succeeded: for every policy that `lerobot-train` trains."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cronos_lerobot.agents.base import ActionSample, Batch, Columns, LearningAgent, TrainablePolicy
+from cronos_lerobot.agents.chunk_player import ChunkPlayer, Player, make_player
+from cronos_lerobot.agents.imitation.batches import Demonstrations, join_batches, segment_batch
+from cronos_lerobot.agents.imitation.config import ImitationConfig
+from cronos_lerobot.agents.imitation.memory import OpenSegments, SegmentMemory
+from cronos_lerobot.agents.processing import observation_columns
+from cronos_lerobot.agents.registry import AgentContext, register_agent
+from cronos_lerobot.agents.state import to_arrays, to_tensors
+
+
+@register_agent("imitation")
+class ImitationAgent(LearningAgent):
+    """Acts as the policy does, remembers the segments that succeeded, and clones them.
+
+    The loss is the policy's own `forward`, the optimizer the one of its preset, the batches those that
+    `lerobot-train` would make of a dataset of these segments. An update learns from the segments that were over
+    before it.
+
+    Args:
+        context: of the run; its config is an ImitationConfig.
+
+    Raises:
+        ValueError: the policy has no optimizer preset, or the demonstrations lack what it reads.
+    """
+
+    def __init__(self, context: AgentContext) -> None:
+        self.config: ImitationConfig = context.config
+        self.policy = context.policy.eval()
+        self._processors, self._processes = context.processors, context.processes
+        self._stopwatch, self._streams = context.stopwatch, context.streams
+        self._rng = context.rng("imitation")
+        self._player = self._make_player(context.torch_rng("actions"))
+        self._make_optimizer()
+        policy_config = self.policy.config
+        self._open = OpenSegments(self._streams.stop - self._streams.start)
+        drop_last = getattr(policy_config, "drop_n_last_frames", 0) or 0
+        self.memory = SegmentMemory(int(self.config.memory_gib * 2**30), drop_last)
+        self._demos = None
+        if self.config.demos_share:
+            self._demos = Demonstrations(self.config.demos, policy_config)
+
+    @torch.no_grad()
+    def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
+        """Choose an action for each of its streams; what it does not know of them is 0."""
+        with self._stopwatch("infer"):
+            batch = self._processors.batch(observation_columns(o_t), tau[self._streams])
+            ids = range(self._streams.stop - self._streams.start)
+            action = self._processors.physical_actions(self._player.act(batch, ids))
+        nothing = np.zeros(len(action), np.float32)
+        return ActionSample(action, np.zeros((len(action), 0), np.float32), nothing, nothing)
+
+    def store(
+        self,
+        o_t: dict[str, Any],
+        tau: list[str],
+        a_t: ActionSample,
+        r_t: np.ndarray,
+        o_tp1: dict[str, Any],
+        cut_t: np.ndarray,
+        diverged_t: np.ndarray,
+    ) -> None:
+        """Keep one step of each of its streams, and forget what is left of the plans where the trace is cut."""
+        mine = self._streams
+        self._open.add(self._inputs(o_t), tau[mine], a_t.action, r_t[mine], diverged_t[mine])
+        self._player.begin(np.flatnonzero(cut_t[mine]).tolist())
+
+    def end_step(self, success: np.ndarray) -> None:
+        """Note where the task is complete."""
+        self._open.note(success[self._streams])
+
+    def end_segment(self, success: np.ndarray, found_complete: np.ndarray) -> None:
+        """Remember the successful segments of its streams."""
+        for segment in self._open.close(found_complete[self._streams], self.config.tail_steps):
+            self.memory.add(segment)
+
+    def update(self) -> dict[str, float]:
+        """Take the update's optimizer steps, once there are enough successes."""
+        found = self._processes.concatenate(np.array([[len(self.memory), self.memory.num_frames]]))
+        metrics = {"segments": float(found[:, 0].sum()), "frames": float(found[:, 1].sum())}
+        # All processes take a step, or none.
+        has_batch = self._demos is not None or found[:, 0].all()
+        if found[:, 0].sum() < self.config.warmup_segments or not has_batch:
+            return metrics | {"optimizer_steps": 0.0}
+        with self._stopwatch("update"):
+            self.policy.train()
+            steps = [self._step() for _ in range(self.config.steps_per_update)]
+            self.policy.eval()
+        means = self._processes.concatenate(np.array([steps])).mean(axis=(0, 1))
+        metrics |= {"loss": float(means[0]), "grad_norm": float(means[1])}
+        return metrics | {"optimizer_steps": float(len(steps))}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The segments that each process remembers; see `LearningAgent`."""
+        return {"memory": to_tensors(self._processes.gather(self.memory.state_dict()))}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on with the segments of this process, or with its share if there are more or fewer processes now."""
+        rank, count = self._processes.rank, self._processes.count
+        memories = to_arrays(state["memory"])
+        if len(memories) != count:
+            memories = [[s for memory in memories for s in memory][i::count] for i in range(count)]
+        self.memory.load_state_dict(memories[rank])
+
+    def _make_player(self, generator: torch.Generator) -> Player:
+        if not isinstance(self.policy, TrainablePolicy):
+            return make_player(self.policy)
+
+        def plan(frames: list[Batch]) -> Tensor:
+            sample = self.policy.sample_actions(
+                frames[-1], temperature=self.config.temperature, generator=generator
+            )
+            return sample["action"].unsqueeze(1)
+
+        return ChunkPlayer(plan)
+
+    def _make_optimizer(self) -> None:
+        try:
+            preset = self.policy.config.get_optimizer_preset()
+            params = self.policy.get_optim_params()
+        except NotImplementedError as error:
+            raise ValueError(
+                f"--policy.type={self.policy.config.type} has no optimizer preset or parameters to optimise: "
+                "--algorithm.type=imitation trains the policies that lerobot-train trains."
+            ) from error
+        if self.config.lr is not None:
+            preset = replace(preset, lr=self.config.lr)
+        self.optimizer = preset.build(params)
+        self._max_grad_norm = preset.grad_clip_norm
+        self._trained = [param for param in self.policy.parameters() if param.requires_grad]
+
+    def _inputs(self, observation: dict[str, Any]) -> Columns:
+        """The columns that the policy reads."""
+        inputs = self.policy.config.input_features or {}
+        return {name: column for name, column in observation_columns(observation).items() if name in inputs}
+
+    def _batch(self) -> Batch:
+        size = self.config.batch_size
+        num_demos = round(self.config.demos_share * size) if len(self.memory) else size
+        if self._demos is None or num_demos == 0:
+            return segment_batch(self.memory.draw(size, self._rng), self.policy.config)
+        demos = self._demos.batch(num_demos, self._rng)
+        if num_demos == size:
+            return demos
+        own = segment_batch(self.memory.draw(size - num_demos, self._rng), self.policy.config)
+        return join_batches(own, demos)
+
+    def _step(self) -> tuple[float, float]:
+        """One optimizer step, as `lerobot-train` takes it; returns the loss and the gradient's norm."""
+        loss, _ = self.policy.forward(self._processors.preprocessor(self._batch()))
+        if not torch.isfinite(loss):
+            raise FloatingPointError(f"The loss is {loss.item()}.")
+        optimizers = list(self.optimizer.values()) if isinstance(self.optimizer, dict) else [self.optimizer]
+        loss.backward()
+        self._processes.average_gradients(self._trained)
+        norm = torch.nn.utils.clip_grad_norm_(self._trained, self._max_grad_norm or float("inf"))
+        for optimizer in optimizers:
+            optimizer.step()
+            optimizer.zero_grad()
+        # TD-MPC moves its target networks here.
+        if callable(after_step := getattr(self.policy, "update", None)):
+            after_step()
+        return loss.item(), float(norm)

@@ -1,0 +1,107 @@
+"""Training batches of remembered frames and of demonstrations, as `lerobot-train` would make them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, REWARD
+from torch.utils.data import default_collate
+
+from cronos_lerobot.agents.base import Batch
+from cronos_lerobot.agents.imitation.config import DemosConfig
+from cronos_lerobot.agents.imitation.memory import Segment
+
+
+def segment_batch(draws: Sequence[tuple[Segment, int]], config: PreTrainedConfig) -> Batch:
+    """Return what a LeRobotDataset, with each segment as an episode, gives a data loader for these frames.
+
+    Args:
+        draws: B segments, each with the index of a frame.
+        config: of the policy; its delta indices say which frames around are wanted.
+
+    Returns:
+        Columns (B, ...), or (B, n, ...) and `<column>_is_pad` (B, n) where the config has n delta indices for it:
+        beyond the segment's ends its first and last frames are repeated. Images are (3, H, W) floats in [0, 1].
+        `task`, B strings.
+    """
+    batch: Batch = {"task": [segment.instruction for segment, _ in draws]}
+    for name in draws[0][0].columns:
+        deltas = _delta_indices(name, config)
+        if name == REWARD and deltas is None:
+            continue
+        wanted = [frame + np.array(deltas or [0]) for _, frame in draws]
+        parts = [
+            segment.columns[name][np.clip(frames, 0, len(segment) - 1)]
+            for (segment, _), frames in zip(draws, wanted, strict=True)
+        ]
+        column = _tensor(name, np.stack(parts))
+        if deltas is None:
+            batch[name] = column[:, 0]
+            continue
+        ends = np.array([len(segment) for segment, _ in draws])[:, None]
+        beyond = (np.stack(wanted) < 0) | (np.stack(wanted) >= ends)
+        batch |= {name: column, f"{name}_is_pad": torch.from_numpy(beyond)}
+    return batch
+
+
+class Demonstrations:
+    """A LeRobotDataset to draw frames from.
+
+    Args:
+        config: which one.
+        policy: config of the policy that learns from it.
+
+    Raises:
+        ValueError: the dataset lacks a column that the policy reads, or cannot be read.
+    """
+
+    def __init__(self, config: DemosConfig, policy: PreTrainedConfig) -> None:
+        assert config.repo_id is not None
+        meta = LeRobotDatasetMetadata(config.repo_id, root=config.root)
+        wanted = {*(policy.input_features or {}), ACTION}
+        if policy.reward_delta_indices is not None:
+            wanted.add(REWARD)
+        if missing := sorted(wanted - meta.features.keys()):
+            raise ValueError(
+                f"--algorithm.demos.repo_id={config.repo_id} has no {', '.join(missing)}, which the policy reads; "
+                f"it has {sorted(meta.features)}."
+            )
+        deltas = resolve_delta_timestamps(policy, meta)
+        self._dataset = LeRobotDataset(config.repo_id, root=config.root, delta_timestamps=deltas)
+        drop_last = getattr(policy, "drop_n_last_frames", 0) or 0
+        assert meta.episodes is not None
+        ends = zip(meta.episodes["dataset_from_index"], meta.episodes["dataset_to_index"], strict=True)
+        self._frames = np.concatenate([np.arange(begin, max(begin, end - drop_last)) for begin, end in ends])
+
+    def batch(self, count: int, rng: np.random.Generator) -> Batch:
+        """Return `count` frames, drawn uniformly."""
+        drawn = rng.choice(self._frames, size=count)
+        return default_collate([self._dataset[int(index)] for index in drawn])
+
+
+def join_batches(first: Batch, second: Batch) -> Batch:
+    """Return two batches as one, with the keys that both have."""
+    joined: dict[str, Any] = {}
+    for name in first.keys() & second.keys():
+        a, b = first[name], second[name]
+        joined[name] = torch.cat([a, b]) if isinstance(a, torch.Tensor) else [*a, *b]
+    return joined
+
+
+def _delta_indices(name: str, config: PreTrainedConfig) -> list[int] | None:
+    if name.startswith(OBS_PREFIX):
+        return config.observation_delta_indices
+    return config.action_delta_indices if name == ACTION else config.reward_delta_indices
+
+
+def _tensor(name: str, column: np.ndarray) -> torch.Tensor:
+    tensor = torch.from_numpy(column)
+    if name.startswith(OBS_IMAGES):
+        return tensor.movedim(-1, -3).float().div_(255)
+    return tensor.float()

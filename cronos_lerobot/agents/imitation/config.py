@@ -1,0 +1,64 @@
+"""The settings of imitation, registered with LeRobot's RL algorithms as `imitation`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot.rl.algorithms.configs import RLAlgorithmConfig
+
+
+@dataclass
+class DemosConfig:
+    """Demonstrations that are learned from beside the successes."""
+
+    repo_id: str | None = None
+    """Name of the LeRobotDataset, user/name; null has none."""
+    root: Path | None = None
+    """Its folder; null takes LeRobot's cache or the Hub."""
+
+
+@RLAlgorithmConfig.register_subclass("imitation")
+@dataclass
+class ImitationConfig(RLAlgorithmConfig):
+    """Filtered behaviour cloning of the streams' successes, with the policy's own loss and optimizer.
+
+    Bad values are a ValueError.
+    """
+
+    steps_per_update: int = 100
+    """Optimizer steps between two looks at the streams (protocol.update_interval)."""
+    batch_size: int = 64
+    """Frames in one optimizer step of one process."""
+    lr: float | None = None
+    """Learning rate; null takes the one that the policy has in lerobot-train. It stays as it is."""
+    warmup_segments: int = 32
+    """Successful segments, of all processes together, before the first optimizer step."""
+    tail_steps: int = 4
+    """Control steps of a segment that are kept after its first success."""
+    memory_gib: float = 4.0
+    """Memory of each process for segments [GiB]; the newest stay. A checkpoint holds them."""
+    demos: DemosConfig = field(default_factory=DemosConfig)
+    """Demonstrations."""
+    demos_share: float = 0.0
+    """Share of a batch that is of the demonstrations; all of it as long as there are no successes."""
+    temperature: float = 1.0
+    """Sampling temperature while training, of policies that have one (`sample_actions`)."""
+
+    def __post_init__(self) -> None:
+        for name, low in (("steps_per_update", 1), ("batch_size", 1), ("warmup_segments", 0), ("tail_steps", 0)):
+            if getattr(self, name) < low:
+                raise ValueError(f"algorithm.{name} must be >= {low}, got {getattr(self, name)}.")
+        for name in ("lr", "memory_gib", "temperature"):
+            if (value := getattr(self, name)) is not None and not value > 0:
+                raise ValueError(f"algorithm.{name} must be > 0, got {value}.")
+        if not 0 <= self.demos_share <= 1:
+            raise ValueError(f"algorithm.demos_share must be >= 0 and <= 1, got {self.demos_share}.")
+        if self.demos_share and self.demos.repo_id is None:
+            raise ValueError(f"algorithm.demos_share={self.demos_share} needs --algorithm.demos.repo_id.")
+
+    @classmethod
+    def from_policy_config(cls, policy_cfg: Any) -> ImitationConfig:
+        """Return the defaults: what depends on the policy is asked of it when the agent is made."""
+        return cls()

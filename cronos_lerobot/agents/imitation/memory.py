@@ -1,0 +1,137 @@
+"""The successful segments of reset-free streams, as raw frames."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from lerobot.utils.constants import ACTION, REWARD
+
+from cronos_lerobot.agents.base import Columns
+
+
+@dataclass(frozen=True)
+class Segment:
+    """T successive frames of one stream under one instruction."""
+
+    instruction: str
+    columns: Columns
+    """(T, ...) each: raw observations, `action` float32 in physical units, `next.reward` float32."""
+
+    def __len__(self) -> int:
+        return len(self.columns[ACTION])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of its arrays."""
+        return sum(column.nbytes for column in self.columns.values())
+
+
+class OpenSegments:
+    """What has happened in the segments that are not over.
+
+    Args:
+        num_streams: N of this process.
+    """
+
+    def __init__(self, num_streams: int) -> None:
+        self.num_streams = num_streams
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin a segment of every stream."""
+        self._rows: list[Columns] = []
+        self._success: list[np.ndarray] = []
+        self._instructions: list[str] = []
+        self._begin = np.zeros(self.num_streams, np.int64)
+
+    def add(
+        self,
+        observation: Columns,
+        instructions: list[str],
+        action: np.ndarray,
+        reward: np.ndarray,
+        diverged: np.ndarray,
+    ) -> None:
+        """Copy one step of every stream, arrays (N, ...). What came before a divergence is forgotten."""
+        row = observation | {ACTION: action.astype(np.float32), REWARD: reward.astype(np.float32)}
+        self._rows.append({name: np.array(column) for name, column in row.items()})
+        self._instructions = instructions
+        self._begin[diverged] = len(self._rows)
+
+    def note(self, success: np.ndarray) -> None:
+        """Of the step last added: where the task was complete after it, (N,) bool."""
+        self._success.append(np.array(success))
+
+    def close(self, found_complete: np.ndarray, tail_steps: int) -> list[Segment]:
+        """Return the successful segments, up to `tail_steps` after the first success, and begin new ones.
+
+        One that was found complete is none: nothing had to be done.
+        """
+        success = np.array(self._success).reshape(len(self._rows), self.num_streams)
+        segments = []
+        for i in range(self.num_streams):
+            begin = int(self._begin[i])
+            steps = np.flatnonzero(success[begin:, i])
+            if not len(steps) or steps[0] == 0 or found_complete[i]:
+                continue
+            rows = self._rows[begin : begin + int(steps[0]) + 1 + tail_steps]
+            columns = {name: np.stack([row[name][i] for row in rows]) for name in rows[0]}
+            segments.append(Segment(self._instructions[i], columns))
+        self.clear()
+        return segments
+
+
+class SegmentMemory:
+    """The newest segments, drawn from frame by frame.
+
+    Args:
+        max_bytes: the oldest segments go while there are more; the newest one always stays.
+        drop_last: frames at the end of each segment that are never drawn, as LeRobot's sampler leaves out the
+            last frames of an episode for policies that say `drop_n_last_frames`; they are in others' chunks.
+    """
+
+    def __init__(self, max_bytes: int, drop_last: int = 0) -> None:
+        self.max_bytes = max_bytes
+        self.drop_last = drop_last
+        self.segments: deque[Segment] = deque()
+        self._bytes = 0
+
+    def __len__(self) -> int:
+        """Segments."""
+        return len(self.segments)
+
+    @property
+    def num_frames(self) -> int:
+        """Frames that can be drawn."""
+        return sum(len(segment) - self.drop_last for segment in self.segments)
+
+    def add(self, segment: Segment) -> None:
+        """Keep a segment, unless no frame of it could be drawn."""
+        if len(segment) <= self.drop_last:
+            return
+        self.segments.append(segment)
+        self._bytes += segment.nbytes
+        while self._bytes > self.max_bytes and len(self.segments) > 1:
+            self._bytes -= self.segments.popleft().nbytes
+
+    def draw(self, count: int, rng: np.random.Generator) -> list[tuple[Segment, int]]:
+        """Return `count` uniform draws of a segment and the index of a frame in it."""
+        ends = np.cumsum([len(segment) - self.drop_last for segment in self.segments])
+        picks = rng.integers(ends[-1], size=count)
+        numbers = np.searchsorted(ends, picks, side="right")
+        begins = np.concatenate([[0], ends])[numbers]
+        return [(self.segments[n], int(pick)) for n, pick in zip(numbers, picks - begins, strict=True)]
+
+    def state_dict(self) -> list[dict[str, Any]]:
+        """Every segment, oldest first."""
+        return [{"instruction": s.instruction, "columns": s.columns} for s in self.segments]
+
+    def load_state_dict(self, state: list[dict[str, Any]]) -> None:
+        """Go on from `state_dict`."""
+        self.segments.clear()
+        self._bytes = 0
+        for segment in state:
+            self.add(Segment(**segment))

@@ -1,0 +1,175 @@
+"""What is remembered of streams, and that batches of it are those of a LeRobotDataset of the same frames."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.factory import resolve_delta_timestamps
+
+from cronos_lerobot.agents.imitation.batches import Demonstrations, join_batches, segment_batch
+from cronos_lerobot.agents.imitation.config import DemosConfig, ImitationConfig
+from cronos_lerobot.agents.imitation.memory import OpenSegments, Segment, SegmentMemory
+
+TAPE = {
+    # One character for each step: S the task is complete after it, D the simulation diverged in it.
+    "first success and one more": ("..SS..", [0, 1, 2, 3]),
+    "success at the end": (".....S", [0, 1, 2, 3, 4, 5]),
+    "found complete": ("SS....", []),
+    "none": ("......", []),
+    "success after a divergence": (".D..S.", [2, 3, 4, 5]),
+    "success before a divergence": (".S.D..", []),
+    "divergence at the end": ("..S..D", []),
+}
+
+
+def test_the_memory_keeps_successes_up_to_a_step_after_the_first():
+    streams = len(TAPE)
+    segments = OpenSegments(streams)
+    for _ in range(2):  # The second segment knows nothing of the first one.
+        for step in range(6):
+            marks = np.array([tape[step] for tape, _ in TAPE.values()])
+            state = np.array([[10 * stream + step] for stream in range(streams)], np.float32)
+            segments.add(
+                {"observation.state": state},
+                [f"task {stream}" for stream in range(streams)],
+                -state,
+                np.full(streams, step, np.float32),
+                marks == "D",
+            )
+            state[:] = -1  # The environment may write into its own arrays.
+            segments.note(marks == "S")
+        found = [tape[0] == "S" for tape, _ in TAPE.values()]
+        kept = segments.close(np.array(found), tail_steps=1)
+    assert [segment.instruction for segment in kept] == ["task 0", "task 1", "task 4"]
+    for segment, stream in zip(kept, (0, 1, 4), strict=True):
+        steps = list(TAPE.values())[stream][1]
+        assert segment.columns["observation.state"].tolist() == [[10 * stream + step] for step in steps]
+        assert segment.columns["action"].tolist() == [[-10 * stream - step] for step in steps]
+        assert segment.columns["next.reward"].tolist() == steps
+
+
+def make_segment(length, number):
+    column = np.full((length, 2), number, np.float32)  # 8 bytes a frame
+    return Segment(f"task {number}", {"action": column})
+
+
+def test_the_newest_stay_and_frames_are_drawn_uniformly():
+    memory = SegmentMemory(max_bytes=8 * 10, drop_last=1)
+    for number, length in enumerate((5, 1, 4, 3)):
+        memory.add(make_segment(length, number))
+    # 5 + 4 + 3 frames are two too many; of the segment of one frame none could be drawn.
+    assert [segment.instruction for segment in memory.segments] == ["task 2", "task 3"]
+    assert memory.num_frames == 3 + 2
+    drawn = [(s.instruction, frame) for s, frame in memory.draw(5000, np.random.default_rng(0))]
+    frames = [("task 2", 0), ("task 2", 1), ("task 2", 2), ("task 3", 0), ("task 3", 1)]
+    assert set(drawn) == set(frames)
+    assert [drawn.count(frame) for frame in frames] == pytest.approx([1000] * 5, abs=120)
+    other = SegmentMemory(max_bytes=8 * 10, drop_last=1)
+    other.load_state_dict(memory.state_dict())
+    other.add(make_segment(4, 4))
+    assert [segment.instruction for segment in other.segments] == ["task 3", "task 4"]
+
+
+LENGTHS = (5, 3)
+DELTAS = {
+    "act": {"observation": None, "action": [0, 1, 2, 3], "reward": None},
+    "diffusion": {"observation": [-1, 0], "action": [-1, 0, 1, 2, 3], "reward": None},
+    "tdmpc": {"observation": [0, 1, 2], "action": [0, 1], "reward": [0, 1]},
+    "one step": {"observation": None, "action": None, "reward": None},
+}
+
+
+def policy_config(name):
+    deltas = {f"{column}_delta_indices": indices for column, indices in DELTAS[name].items()}
+    inputs = {"observation.state": None, "observation.images.front": None}
+    return SimpleNamespace(**deltas, input_features=inputs)
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    rng = np.random.default_rng(0)
+    return [
+        Segment(
+            f"task {number}",
+            {
+                "observation.state": rng.normal(size=(length, 4)).astype(np.float32),
+                "observation.images.front": rng.integers(0, 256, (length, 8, 6, 3), dtype=np.uint8),
+                "action": rng.normal(size=(length, 7)).astype(np.float32),
+                "next.reward": rng.normal(size=length).astype(np.float32),
+            },
+        )
+        for number, length in enumerate(LENGTHS)
+    ]
+
+
+@pytest.fixture(scope="module")
+def dataset_root(episodes, tmp_path_factory):
+    root = tmp_path_factory.mktemp("demos") / "dataset"
+    features = {
+        "observation.state": {"dtype": "float32", "shape": (4,), "names": None},
+        "observation.images.front": {
+            "dtype": "image",
+            "shape": (8, 6, 3),
+            "names": ["height", "width", "channel"],
+        },
+        "action": {"dtype": "float32", "shape": (7,), "names": None},
+        "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
+    }
+    dataset = LeRobotDataset.create("me/demos", fps=5, features=features, root=root, use_videos=False)
+    for episode in episodes:
+        for i in range(len(episode)):
+            frame = {name: column[i] for name, column in episode.columns.items()}
+            frame["next.reward"] = frame["next.reward"][None]
+            dataset.add_frame(frame | {"task": episode.instruction})
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+@pytest.mark.parametrize("name", DELTAS)
+def test_a_batch_is_that_of_a_dataset_of_the_same_frames(name, episodes, dataset_root):
+    config = policy_config(name)
+    dataset = LeRobotDataset("me/demos", root=dataset_root)
+    deltas = resolve_delta_timestamps(config, dataset.meta)
+    dataset = LeRobotDataset("me/demos", root=dataset_root, delta_timestamps=deltas)
+    draws = [(episode, i) for episode in episodes for i in range(len(episode))]
+    batch = segment_batch(draws, config)
+    expected = [dataset[i] for i in range(len(draws))]
+    assert batch["task"] == [item["task"] for item in expected]
+    own = {key for key in expected[0] if key.startswith(("observation", "action"))}
+    own |= {key for key in expected[0] if key.startswith("next.reward") and config.reward_delta_indices}
+    assert batch.keys() == own | {"task"}
+    for key in own:
+        theirs = torch.stack([item[key] for item in expected])
+        assert batch[key].dtype == theirs.dtype, key
+        assert torch.equal(batch[key], theirs), key
+    # Both joined are a batch of the policy's columns.
+    demos = Demonstrations(DemosConfig("me/demos", dataset_root), config).batch(2, np.random.default_rng(0))
+    joined = join_batches(batch, demos)
+    assert joined.keys() == batch.keys()
+    assert {len(column) for column in joined.values()} == {len(draws) + 2}
+
+
+def test_a_dataset_without_what_the_policy_reads_is_refused(dataset_root):
+    config = policy_config("act")
+    config.input_features["observation.environment_state"] = None
+    with pytest.raises(ValueError, match=r"me/demos has no observation\.environment_state, .* it has \['action'"):
+        Demonstrations(DemosConfig("me/demos", dataset_root), config)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps_per_update": 0}, "algorithm.steps_per_update must be >= 1, got 0"),
+        ({"tail_steps": -1}, "algorithm.tail_steps must be >= 0, got -1"),
+        ({"lr": 0.0}, "algorithm.lr must be > 0, got 0.0"),
+        ({"memory_gib": float("nan")}, "algorithm.memory_gib must be > 0, got nan"),
+        ({"demos_share": 1.5}, "algorithm.demos_share must be >= 0 and <= 1, got 1.5"),
+        ({"demos_share": 0.5}, "algorithm.demos_share=0.5 needs --algorithm.demos.repo_id"),
+    ],
+)
+def test_bad_values_are_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        ImitationConfig(**options)

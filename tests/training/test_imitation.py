@@ -1,0 +1,209 @@
+"""Whole runs of the imitation agent: on the dummies, where it succeeds, and with ACT on the real scene."""
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from dummies import DummyEnv, DummyPolicy, DummyPolicyConfig, identity_processors
+from forked_processes import together
+from lerobot.configs import PreTrainedConfig
+from lerobot.optim import AdamWConfig
+from lerobot.utils.random_utils import set_seed
+from lerobot_env_cronos import CronosEnvConfig
+from test_cronos_train import cronos_train
+from test_trainer import (
+    STEPS_PER_UPDATE,
+    KilledError,
+    MortalEnv,
+    assert_same_run,
+    config,
+    metrics,
+    weights,
+)
+
+from cronos_lerobot.agents.imitation.config import ImitationConfig
+from cronos_lerobot.agents.processing import PolicyProcessors
+from cronos_lerobot.evaluation.actors import SelectingPolicy
+from cronos_lerobot.processes import Processes
+from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig, record_demos
+from cronos_lerobot.training.trainer import Trainer
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
+
+
+@PreTrainedConfig.register_subclass("dummy_cloned")
+@dataclass
+class ClonedConfig(DummyPolicyConfig):
+    """Learns from two actions at a time."""
+
+    action_delta_indices = (0, 1)
+
+    def get_optimizer_preset(self):
+        return AdamWConfig(lr=1e-2, grad_clip_norm=1.0)
+
+
+class ClonedPolicy(DummyPolicy):
+    """A policy that samples, and can be cloned with dropout: its randomness is PyTorch's own."""
+
+    config_class, name = ClonedConfig, "dummy_cloned"
+
+    def __init__(self, seed=0):
+        super().__init__(ClonedConfig(), seed)
+
+    def forward(self, batch):
+        assert self.training
+        inputs = torch.nn.functional.dropout(self._inputs(batch), 0.2)
+        bins = torch.distributions.Categorical(logits=self.actor(inputs).reshape(-1, 7, 3))
+        return -bins.log_prob(batch["action"][:, 0] + 1).mean(), {}
+
+    def get_optim_params(self):
+        return self.actor.parameters()
+
+
+def settings(folder, **options):
+    algorithm = ImitationConfig(steps_per_update=5, batch_size=8, warmup_segments=3, tail_steps=1)
+    return config(
+        folder, **{"policy": ClonedConfig(), "algorithm": algorithm, "steps": 6 * STEPS_PER_UPDATE} | options
+    )
+
+
+def train(cfg, env_class=DummyEnv, processes=None, policy_seed=0):
+    processes = processes or Processes()
+    mine = processes.share_of(cfg.num_envs)
+    set_seed(cfg.seed + processes.rank)
+    env = env_class(mine.stop - mine.start, diverge_at={(5, 1)})
+    trainer = Trainer(cfg, env, DummyEnv, ClonedPolicy(policy_seed), *identity_processors(), processes)
+    try:
+        trainer.train()
+    except KilledError:
+        return None
+    return trainer
+
+
+def test_a_resumed_run_equals_the_unbroken_one_and_learns(tmp_path):
+    unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
+    trainer = train(settings(unbroken))
+    updates = [line for line in metrics(unbroken) if line["kind"] == "update"]
+    kept = [line["agent"]["segments"] for line in updates]
+    assert kept == sorted(kept)
+    assert kept[-1] >= 3
+    # As many as succeeded without being found complete; an update does not see its own last segments yet.
+    rollouts = [line["rollout"] for line in updates]
+    won = np.cumsum([r["success"] * r["segments"] - r["found_complete"][0] for r in rollouts])
+    assert len(trainer.agent.memory) == won[-1]
+    assert all(low <= k <= high for low, k, high in zip([0, *won], kept, won, strict=False))
+    assert won[1] >= 1  # in the memory of the checkpoint that the killed run goes on from
+    # Below three segments there is no step, from there on five for each update.
+    steps = [line["agent"]["optimizer_steps"] for line in updates]
+    assert steps == [5.0 * (segments >= 3) for segments in kept]
+    assert steps[0] == 0
+    assert {len(segment) for segment in trainer.agent.memory.segments} <= {2, 3, 4}
+    assert train(settings(broken), MortalEnv) is None
+    resumed = settings(broken)
+    resumed.checkpoint_path = (broken / "checkpoints/last").resolve()
+    torch.manual_seed(999)
+    train(resumed, policy_seed=8)
+    assert_same_run(unbroken, broken)
+    assert not torch.equal(weights(unbroken)["actor.weight"], ClonedPolicy().actor.weight)
+    assert torch.equal(weights(unbroken)["critic.weight"], ClonedPolicy().critic.weight)
+
+
+def in_processes(processes, cfg, env_class=DummyEnv):
+    trainer = train(cfg, env_class, processes)
+    if trainer is None:
+        return None
+    return trainer.policy.actor.weight.tolist(), len(trainer.agent.memory)
+
+
+def test_two_processes_learn_together_and_resume(tmp_path):
+    """Each from its own streams' successes, with the mean of their gradients."""
+    first, second = together(in_processes, settings(tmp_path / "unbroken"))
+    assert first[0] == second[0]
+    last = [line for line in metrics(tmp_path / "unbroken") if line["kind"] == "update"][-1]
+    assert last["agent"]["optimizer_steps"] == 5
+    assert last["agent"]["segments"] <= first[1] + second[1]
+    assert together(in_processes, settings(tmp_path / "broken"), MortalEnv) == [None, None]
+    resumed = settings(tmp_path / "broken")
+    resumed.checkpoint_path = (tmp_path / "broken/checkpoints/last").resolve()
+    assert together(in_processes, resumed) == [first, second]
+    assert_same_run(tmp_path / "unbroken", tmp_path / "broken")
+
+
+def test_a_policy_without_optimizer_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"--policy\.type=dummy_linear has no optimizer preset"):
+        Trainer(settings(tmp_path), DummyEnv(4), DummyEnv, DummyPolicy(), *identity_processors())
+
+
+OBSERVATIONS = {"obs_type": "environment_state_agent_pos", "task_observation": "one_hot"}
+ACT = (
+    "--policy.type=act", "--policy.device=cpu", "--policy.chunk_size=6", "--policy.n_action_steps=3",
+    "--policy.dim_model=16", "--policy.n_heads=2", "--policy.dim_feedforward=32", "--policy.n_encoder_layers=1",
+    "--policy.n_decoder_layers=1", "--policy.latent_dim=4", "--policy.n_vae_encoder_layers=1",
+    "--env.type=cronos", *(f"--env.{name}={value}" for name, value in OBSERVATIONS.items()), "--num_envs=4",
+    "--protocol.task_switch_interval=10", "--protocol.update_interval=20", "--protocol.scene_reset_interval=20",
+    "--save_freq=80", "--eval_freq=0", "--tensorboard=false", "--algorithm.type=imitation",
+    "--algorithm.warmup_segments=0", "--algorithm.demos_share=0.5", "--algorithm.demos.repo_id=me/demos",
+    "--algorithm.steps_per_update=4", "--algorithm.batch_size=8",
+)  # fmt: skip
+
+
+def test_act_trains_saves_resumes_and_is_a_lerobot_policy(tmp_path, monkeypatch):
+    """With demonstrations: a policy from scratch has no success in 320 steps."""
+    env = CronosEnvConfig(**OBSERVATIONS)
+    record_demos(
+        RecordDemosConfig(env=env, dataset=DemoDatasetConfig("me/demos", tmp_path / "demos", 2), num_envs=2)
+    )
+    flags = (*ACT, f"--algorithm.demos.root={tmp_path / 'demos'}")
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    cronos_train(monkeypatch, *flags, "--steps=320", f"--output_dir={whole}")
+    cronos_train(monkeypatch, *flags, "--steps=160", f"--output_dir={broken}")
+    before = weights(broken)
+    last = broken / "checkpoints/last/pretrained_model"
+    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=320")
+    assert_same_run(whole, broken)
+    assert any(not torch.equal(tensor, before[name]) for name, tensor in weights(whole).items())
+    (agent,) = {json.dumps(sorted(line["agent"])) for line in metrics(whole)}
+    assert json.loads(agent) == ["frames", "grad_norm", "loss", "optimizer_steps", "segments"]
+
+    from lerobot.policies.act.modeling_act import ACTPolicy
+    from lerobot.policies.factory import make_pre_post_processors
+
+    folder = whole / "checkpoints/last/pretrained_model"
+    policy = ACTPolicy.from_pretrained(folder)
+    preprocessor, postprocessor = make_pre_post_processors(policy.config, str(folder))
+    shapes = {name: feature.shape for name, feature in policy.config.input_features.items()}
+    batch = {name: torch.zeros(2, *shape) for name, shape in shapes.items()}
+    assert postprocessor(policy.select_action(preprocessor(batch))).shape == (2, 7)
+
+
+def test_an_evaluation_keeps_the_environments_apart():
+    """What a policy without `sample_actions` has planned for one episode is not played in the next."""
+
+    class Planner(torch.nn.Module):
+        """Sees one number, and plans to play it three times."""
+
+        config = ClonedConfig()
+
+        def reset(self):
+            pass
+
+        def predict_action_chunk(self, batch):
+            return batch["observation.state"][:, None, :1].expand(-1, 3, 7)
+
+    actor = SelectingPolicy(Planner(), PolicyProcessors(*identity_processors()), (dict, dict))
+    assert actor.is_per_environment
+
+    def act(numbers, ids):
+        state = np.array([[number, 0] for number in numbers], np.float32)
+        answer = actor.act({"agent_pos": state}, ["go"] * len(ids), np.zeros((len(ids), 7)), np.array(ids))
+        return answer[:, 0].tolist()
+
+    actor.begin(np.array([0, 1]), np.array([0, 1]))
+    assert act([1, 2], [0, 1]) == [1, 2]
+    actor.begin(np.array([1]), np.array([0, 1]))
+    assert act([3, 4], [0, 1]) == [1, 4]
+    assert act([5], [1]) == [4]
+    assert act([6, 7], [0, 1]) == [1, 4]
+    assert act([8, 9], [0, 1]) == [8, 9]
