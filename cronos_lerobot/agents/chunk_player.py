@@ -93,14 +93,18 @@ class SharedPlayer:
 
     def __init__(self, policy: Any) -> None:
         self._policy = policy
+        self._is_new = True
 
     def begin(self, ids: Sequence[int]) -> None:
         """Forget everything: LeRobot can only clear the memory for all streams at once."""
-        if len(ids):
-            self._policy.reset()
+        self._is_new |= len(ids) > 0
 
     def act(self, batch: Batch, ids: Sequence[int]) -> Tensor:
         """See `Player`."""
+        # Only now: an evaluation in between has left its own plans in the policy.
+        if self._is_new:
+            self._policy.reset()
+            self._is_new = False
         return self._policy.select_action(batch)
 
 
@@ -118,7 +122,8 @@ def make_player(policy: Any) -> ChunkPlayer | SharedPlayer:
     def plan(frames: list[Batch]) -> Tensor:
         # Whatever the policy remembers is of other streams.
         policy.reset()
-        frames = [dict(frame) for frame in frames]
+        # A preprocessed observation has an empty action, for which these policies have a queue.
+        frames = [{key: value for key, value in frame.items() if key != ACTION} for frame in frames]
         for frame in frames:
             if OBS_IMAGES in observed:
                 frame[OBS_IMAGES] = torch.stack([frame[key] for key in config.image_features], dim=-4)

@@ -8,7 +8,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.factory import get_policy_class, make_policy_config
 
-from cronos_lerobot.agents.chunk_player import ChunkPlayer, SharedPlayer, make_player
+from cronos_lerobot.agents.chunk_player import ChunkPlayer, SharedPlayer, make_player, take_rows
 
 
 def play(player, seen, ids=None):
@@ -59,7 +59,8 @@ TINY = {
     "diffusion": {
         "n_obs_steps": 2, "horizon": 8, "n_action_steps": 3, "down_dims": [16, 32], "n_groups": 4,
         "diffusion_step_embed_dim": 8, "num_inference_steps": 2, "noise_scheduler_type": "DDIM",
-        "drop_n_last_frames": 4, "crop_shape": None, "use_group_norm": True, "spatial_softmax_num_keypoints": 4,
+        "drop_n_last_frames": 4, "pretrained_backbone_weights": None, "use_group_norm": True,
+        "spatial_softmax_num_keypoints": 4,
     },
     "vqbet": {
         "n_obs_steps": 3, "n_action_pred_token": 2, "action_chunk_size": 3, "gpt_n_layer": 1, "gpt_n_head": 2,
@@ -90,7 +91,10 @@ def observations(steps, streams):
         yield {
             "observation.state": torch.randn(streams, 4, generator=generator),
             "observation.images.front": torch.rand(streams, 3, 32, 32, generator=generator),
+            # As LeRobot's preprocessors leave it.
             "task": ["go"] * streams,
+            "action": None,
+            "next.reward": 0.0,
         }
 
 
@@ -126,7 +130,7 @@ def test_a_late_stream_does_what_it_does_alone():
         for step, batch in enumerate(seen):
             if step in begins:
                 policy.reset()
-            own = {key: value[stream : stream + 1] for key, value in batch.items()}
+            own = take_rows(batch, [stream])
             torch.testing.assert_close(found[step][stream], policy.select_action(own)[0], rtol=0, atol=1e-5)
 
 
@@ -139,5 +143,8 @@ def test_plans_that_depend_on_plans_are_left_to_the_policy():
     assert not player.is_per_stream
     assert player.act({"x": 3}, [0]) == 3
     player.begin([])
-    player.begin([1])
+    assert player.act({"x": 4}, [0]) == 4
     assert len(policy.resets) == 1
+    player.begin([1])
+    assert player.act({"x": 5}, [0]) == 5
+    assert len(policy.resets) == 2
