@@ -97,6 +97,12 @@ class ActionSample:
     """(N,) float32, that policy's value of the observation."""
 
 
+def plain_sample(action: np.ndarray) -> ActionSample:
+    """Actions (N, A) float32 in physical units, of an agent that knows no more of them: the rest is 0."""
+    nothing = np.zeros(len(action), np.float32)
+    return ActionSample(action, np.zeros((len(action), 0), np.float32), nothing, nothing)
+
+
 class Agent(Protocol):
     """Lines 11, 13 and 16 to 18 of Algorithm 1."""
 

@@ -95,8 +95,42 @@ def test_strategy_and_order_of_the_docs(tmp_path):
     assert last["interventions_by_kind"]["task_switch"] == 12
 
 
+def test_agent_of_the_docs(tmp_path):
+    """The example of docs/extending.md, word for word: it learns, and a resumed run is the unbroken one."""
+    docs = (Path(__file__).parents[2] / "docs/extending.md").read_text()
+    code = re.search(
+        r"```python\n(from dataclasses import dataclass\n\nimport numpy.*?register_agent.*?)```", docs, re.DOTALL
+    )
+    assert code is not None
+    package = tmp_path / "my_agent"
+    package.mkdir()
+    (package / "__init__.py").write_text(code[1])
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    script = str(Path(sys.executable).with_name("cronos-train"))
+
+    def run(*flags):
+        command = [script, "--discover_packages_path=my_agent", *flags]
+        subprocess.run(command, check=True, env=os.environ | {"PYTHONPATH": path})
+
+    small = [flag for flag in SMALL if not flag.startswith("--algorithm.")]
+    # Every action is cloned: no task is complete so early.
+    flags = (*small, *OBSERVATIONS["state"], "--algorithm.type=rewarded", "--algorithm.threshold=-9")
+    run(*flags, f"--output_dir={tmp_path / 'whole'}")
+    run(*flags, f"--output_dir={tmp_path / 'broken'}", "--steps=16")
+    before = weights(tmp_path / "broken")
+    last = tmp_path / "broken/checkpoints/last/pretrained_model"
+    run("--resume=true", f"--config_path={last}/train_config.json", "--steps=32")
+    after = weights(tmp_path / "whole")
+    assert any(not torch.equal(before[name], after[name]) for name in before)
+    for name, tensor in weights(tmp_path / "broken").items():
+        assert torch.equal(tensor, after[name]), name
+    updates = [json.loads(line) for line in (tmp_path / "whole/metrics.jsonl").read_text().splitlines()]
+    # Two streams, 8 steps an update.
+    assert [line["agent"]["frames"] for line in updates] == [16, 16]
+
+
 def test_policy_of_another_kind_is_refused(tmp_path, monkeypatch):
-    with pytest.raises(SystemExit, match=r"^error: .*sample_actions"):
+    with pytest.raises(SystemExit, match=r"^error: .*sample_actions.*--algorithm.type=imitation"):
         cronos_train(
             monkeypatch, "--policy.type=act", "--policy.device=cpu", "--policy.pretrained_backbone_weights=null",
             "--env.type=cronos", "--num_envs=2", f"--output_dir={tmp_path / 'run'}",

@@ -9,7 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cronos_lerobot.agents.base import ActionSample, Batch, Columns, LearningAgent, TrainablePolicy
+from cronos_lerobot.agents.base import (
+    ActionSample,
+    Batch,
+    Columns,
+    LearningAgent,
+    TrainablePolicy,
+    plain_sample,
+)
 from cronos_lerobot.agents.chunk_player import ChunkPlayer, Player, make_player
 from cronos_lerobot.agents.imitation.batches import Demonstrations, join_batches, segment_batch
 from cronos_lerobot.agents.imitation.config import ImitationConfig
@@ -57,8 +64,7 @@ class ImitationAgent(LearningAgent):
             batch = self._processors.batch(observation_columns(o_t), tau[self._streams])
             ids = range(self._streams.stop - self._streams.start)
             action = self._processors.physical_actions(self._player.act(batch, ids))
-        nothing = np.zeros(len(action), np.float32)
-        return ActionSample(action, np.zeros((len(action), 0), np.float32), nothing, nothing)
+        return plain_sample(action)
 
     def store(
         self,

@@ -20,7 +20,8 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
     try:
         check_trainable(context.policy)
     except TypeError as error:
-        raise ValueError(str(error)) from error
+        other = "--algorithm.type=imitation learns with any policy that lerobot-train trains."
+        raise ValueError(f"{error} {other}") from error
     mine = context.streams
     # Every process draws its own minibatches and actions.
     ppo = PPO(context.policy, context.processors, context.config, context.rng("minibatches"), context.processes)
