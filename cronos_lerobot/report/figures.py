@@ -23,12 +23,15 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#55
 """Okabe and Ito's palette: told apart by the colour-blind too."""
 SPLIT_LABELS = {"train": "training configurations", "held_out": "held-out configurations"}
 INK, GRID = "#333333", "#e4e4e4"
-PPO_PANELS = (
+AGENT_PANELS = (
     ("KL divergence per update [nats]", "approx_kl"),
     ("entropy [nats]", "entropy"),
     ("explained variance of the value", "explained_variance"),
     ("clip fraction", "clip_fraction"),
     ("learning rate of the policy", "policy_lr"),
+    ("loss", "loss"),
+    ("gradient norm", "grad_norm"),
+    ("successful segments remembered", "segments"),
 )
 
 
@@ -103,18 +106,25 @@ def segment_history_figure(groups: list[Group]) -> Figure | None:
     return figure
 
 
-def ppo_figure(groups: list[Group]) -> Figure | None:
-    """PPO's diagnostics, one panel each, by policy update."""
-    figure = Figure(figsize=(10, 4.6), layout="constrained")
-    axes = list(figure.subplots(2, 3).flat)
-    panels = [*((title, _metric(name)) for title, name in PPO_PANELS), ("reward per segment", _reward)]
-    for ax, (title, value) in zip(axes, panels, strict=True):
-        for i, group in enumerate(groups):
-            draw_curve(ax, update_curve(group, value), i, _label(group), width=1.2)
+def agent_figure(groups: list[Group]) -> Figure | None:
+    """The agents' diagnostics, one panel for each that some run has, by policy update."""
+    wanted = [*((title, _metric(name)) for title, name in AGENT_PANELS), ("reward per segment", _reward)]
+    panels = [(title, [update_curve(group, value) for group in groups]) for title, value in wanted]
+    panels = [(title, curves) for title, curves in panels if any(curves)]
+    if not panels:
+        return None
+    rows = -(-len(panels) // 3)
+    figure = Figure(figsize=(10, 2.3 * rows), layout="constrained")
+    axes = list(figure.subplots(rows, 3, squeeze=False).flat)
+    for unused in axes[len(panels) :]:
+        unused.remove()
+    for ax, (title, curves) in zip(axes, panels, strict=False):
+        for i, (group, curve) in enumerate(zip(groups, curves, strict=True)):
+            draw_curve(ax, curve, i, _label(group), width=1.2)
         style_axes(ax, "")
         ax.set_title(title, fontsize=9, color=INK, loc="left")
     _legend(figure, axes[0], groups)
-    return figure if any(ax.lines for ax in axes) else None
+    return figure
 
 
 def _metric(name: str) -> Callable[[dict[str, Any]], float | None]:

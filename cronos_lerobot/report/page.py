@@ -48,7 +48,7 @@ FIGURES: tuple[tuple[str, str, str, Callable[[list[Group]], Figure | None]], ...
         "Bright is success. Rows further up are longer without a reset; time runs to the right.",
         figures.segment_history_figure,
     ),
-    ("ppo", "PPO diagnostics", "One point for each policy update.", figures.ppo_figure),
+    ("agent", "Agent's diagnostics", "One point for each policy update.", figures.agent_figure),
 )
 
 

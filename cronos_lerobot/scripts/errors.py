@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import sys
 from argparse import ArgumentError
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
 from typing import Any, NoReturn
@@ -48,7 +48,11 @@ def reason(error: Exception | str) -> str:
     return text or type(error).__name__
 
 
-def parse_command_line(config_class: type[Any], types: Mapping[str, str] | None = None) -> Any:
+def parse_command_line(
+    config_class: type[Any],
+    types: Mapping[str, str] | None = None,
+    check_type: Mapping[str, Callable[[str], None]] | None = None,
+) -> Any:
     """Return the config that the command line describes, read as `lerobot-train` reads it.
 
     `--<field>.path`, `--config_path` and `--<field>.discover_packages_path` are understood. An unknown flag ends
@@ -57,6 +61,8 @@ def parse_command_line(config_class: type[Any], types: Mapping[str, str] | None 
     Args:
         config_class: of the config.
         types: types of choice fields by name, for a command line that sets their fields without `--<field>.type`.
+        check_type: by name of a choice field, what raises a ValueError that names its valid types: argparse names
+            every registered one.
     """
 
     def keep(config: Any) -> Any:
@@ -79,6 +85,9 @@ def parse_command_line(config_class: type[Any], types: Mapping[str, str] | None 
         if exit_.code != 2 or not wrong:
             sys.stderr.write(said.getvalue())
             raise
+        for field, check in (check_type or {}).items():
+            if name := parser.get_type_arg(field, given[1:]):
+                check(name)
         # argparse prints all flags before it.
         sys.stderr.write(f"error: {reason(wrong)}; --help lists the flags\n")
         raise

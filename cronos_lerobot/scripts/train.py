@@ -14,6 +14,7 @@ from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import init_logging
 from lerobot_env_cronos import SequentialVectorEnv
 
+from cronos_lerobot.agents.registry import check_agent
 from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.processes import join_processes
 from cronos_lerobot.scripts.errors import error_line, parse_command_line
@@ -70,7 +71,7 @@ def main() -> None:
     """Parse the command line and train."""
     register_third_party_plugins()
     with error_line():
-        config = parse_command_line(CronosTrainConfig, {"algorithm": "ppo"})
+        config = parse_command_line(CronosTrainConfig, {"algorithm": "ppo"}, {"algorithm": check_agent})
     train(config)
 
 

@@ -211,7 +211,7 @@ def test_page_is_self_contained(report_folder):
     assert all(source.startswith("data:") for source in sources)
     videos = [base64.b64decode(s.split(",")[1]) for s in sources if s.startswith("data:video")]
     assert videos == [b"old video", b"new video"] * 4
-    for name in ("evaluation", "training", "segments", "segment_history", "ppo"):
+    for name in ("evaluation", "training", "segments", "segment_history", "agent"):
         content = base64.b64encode((folder / f"{name}.png").read_bytes()).decode()
         assert f"data:image/png;base64,{content}" in page
 

@@ -75,6 +75,7 @@ def test_steps_are_rounded_up_to_whole_updates():
         (["--env.type=cronos", "--policy.path=/nowhere"], "--policy.path=/nowhere: no such folder"),
         (["--policy.path=/nowhere", "--policy.type=act"], "Cannot specify both --policy.path and --policy.type"),
         (["--env.type=cronos", "--algorithm.type=sac"], r"one of \[.*'ppo', 'ppo_paper'.*\], got 'sac'"),
+        (["--env.type=cronos", "--algorithm.type=nobody"], r"one of \[.*'ppo', 'ppo_paper'.*\], got 'nobody'"),
     ],
 )
 def test_bad_values_are_named_on_the_command_line(arguments, message, monkeypatch):
