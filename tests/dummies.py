@@ -189,7 +189,12 @@ class DummyPolicy(PreTrainedPolicy):
         tokens = tokens.reshape(-1, 7)
         log_prob = distribution.log_prob(tokens).sum(dim=1)
         action = tokens.float() - 1
-        return {"action": action, "tokens": tokens, "log_prob": log_prob, "value": self.predict_values(batch)}
+        return {
+            "actions": action[:, None],
+            "trace": tokens,
+            "log_prob": log_prob,
+            "value": self.predict_values(batch),
+        }
 
     def evaluate_actions(self, batch, tokens, *, temperature=1.0):
         distribution = self._distribution(batch, temperature)
@@ -218,7 +223,7 @@ class DummyPolicy(PreTrainedPolicy):
         raise NotImplementedError
 
     def select_action(self, batch, **kwargs):
-        return self.sample_actions(batch, temperature=0)["action"]
+        return self.sample_actions(batch, temperature=0)["actions"][:, 0]
 
     def reset(self):
         pass

@@ -26,7 +26,13 @@ POLICY_METHODS = ("sample_actions", "evaluate_actions", "predict_values", "rl_pa
 
 @runtime_checkable
 class TrainablePolicy(Protocol):
-    """A LeRobot policy that PPO can train: it says how likely its own actions were.
+    """A LeRobot policy that PPO can train: it says how likely its own decisions were.
+
+    A decision is what the policy answers to one observation: n actions, played one after the other without looking
+    (n = 1: it looks at every control step), and a trace, which is all that `evaluate_actions` needs to know which
+    decision it was: tokens, a sample before it was squashed, a denoising chain.
+
+    A policy that decides on more than one action says on how many: its attribute `decision_steps`.
 
     A policy whose first layers are frozen may also have `encode_observation(batch) -> Batch` (or None there),
     which replaces inputs by what those layers make of them. It is called once for each observation; what it
@@ -47,14 +53,20 @@ class TrainablePolicy(Protocol):
     def sample_actions(
         self, batch: Batch, *, temperature: float = 1.0, generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
-        """Return `action` (B, A) normalised, `tokens` (B, ...), `log_prob` (B,) [nats], `value` (B,).
+        """Return `actions` (B, n, A) normalised, `trace` (B, ...), `log_prob` [nats], `value` (B,).
 
-        `tokens` is whatever `evaluate_actions` needs to know which action it was; it keeps its type and shape.
+        The trace keeps its type and shape. `log_prob` is (B,), or (B, L) by factor: those of the L parts of the
+        decision, such as the steps of a denoising chain, whose sum is the decision's.
         """
         ...
 
-    def evaluate_actions(self, batch: Batch, tokens: Tensor, *, temperature: float = 1.0) -> dict[str, Tensor]:
-        """Return, differentiably, `log_prob` (B,), `entropy` (B,) (mean over dimensions), `value` (B,)."""
+    def evaluate_actions(
+        self, batch: Batch, trace: Tensor, *, temperature: float = 1.0
+    ) -> dict[str, Tensor | None]:
+        """Return, differentiably, `log_prob` (B,) or (B, L), `entropy` (B,), `value` (B,).
+
+        The entropy is the mean over the dimensions [nats], or None of a policy that cannot say it.
+        """
         ...
 
     def predict_values(self, batch: Batch) -> Tensor:
@@ -83,18 +95,51 @@ def check_trainable(policy: Any) -> None:
         )
 
 
+def decision_steps(policy: Any, task_switch_interval: int | None = None) -> int:
+    """How many actions a policy decides on at once, n.
+
+    Args:
+        policy: a TrainablePolicy.
+        task_switch_interval: K, if it is known: no decision may reach beyond a task switch.
+
+    Raises:
+        ValueError: n does not divide K.
+    """
+    n = int(getattr(policy, "decision_steps", 1))
+    if task_switch_interval is not None and task_switch_interval % n:
+        fitting = [m for m in range(1, task_switch_interval + 1) if task_switch_interval % m == 0 and m <= 2 * n]
+        raise ValueError(
+            f"the policy plays {n} actions at once, which does not divide --protocol.task_switch_interval="
+            f"{task_switch_interval}: it would act on the old task's decision after a switch. Choose --policy."
+            f"n_action_steps from {fitting}, or another interval."
+        )
+    return n
+
+
 @dataclass(frozen=True)
 class ActionSample:
-    """Actions of N streams and what is needed to learn from them."""
+    """Actions of N streams for one control step, and what a recording says of them."""
 
     action: np.ndarray
     """(N, A) float32 in physical units, as the environment takes them."""
-    tokens: np.ndarray
-    """(N, ...), the action as the policy drew it, in its own type."""
     log_prob: np.ndarray
-    """(N,) float32 [nats], under the policy that drew it."""
+    """(N,) float32 [nats], of the decision that the action is of, under the policy that drew it."""
     value: np.ndarray
-    """(N,) float32, that policy's value of the observation."""
+    """(N,) float32, that policy's value of the observation that was decided on."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Decisions of k streams, as their policy made them."""
+
+    actions: np.ndarray
+    """(k, n, A) float32 in physical units."""
+    trace: np.ndarray
+    """(k, ...), in the policy's own type."""
+    log_prob: np.ndarray
+    """(k,) or (k, L) float32 [nats]."""
+    value: np.ndarray
+    """(k,) float32."""
 
 
 def plain_sample(action: np.ndarray) -> ActionSample:

@@ -30,6 +30,8 @@ class AgentContext:
     """N, of all processes together."""
     update_interval: int
     """U: control steps of each stream between two updates."""
+    task_switch_interval: int
+    """K: control steps of each stream between two task switches; U is a multiple of it."""
     rng: Callable[[str], np.random.Generator]
     """Returns the NumPy generator of a name, this process's own. Ask for all of them when the agent is made: the
     checkpoint holds them and continues them."""

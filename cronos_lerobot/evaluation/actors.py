@@ -14,7 +14,7 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 
-from cronos_lerobot.agents.base import TrainablePolicy
+from cronos_lerobot.agents.base import Columns, TrainablePolicy
 from cronos_lerobot.agents.chunk_player import make_player
 from cronos_lerobot.agents.processing import PolicyProcessors, observation_columns
 
@@ -50,6 +50,8 @@ class Actor(Protocol):
 class SamplingPolicy:
     """A `TrainablePolicy`, sampled at a temperature.
 
+    A decision on several actions is played to its end, in each environment for itself, unless a new task begins.
+
     If its `sample_actions` takes `uniform`, what a chain does depends on the seed and on itself only, not on the
     chains beside it (up to the rounding of a batch of another size). If not, a generator is drawn from in turn.
     """
@@ -60,6 +62,7 @@ class SamplingPolicy:
         self._policy, self._processors, self._temperature = policy.eval(), processors, temperature
         self._takes_uniform = "uniform" in inspect.signature(policy.sample_actions).parameters
         self._generator = torch.Generator(device=processors.device)
+        self._left: dict[int, list[np.ndarray]] = {}
         self._autocast = _autocast(policy, processors)
 
     def seed(self, seed: int) -> None:
@@ -67,20 +70,32 @@ class SamplingPolicy:
         self._generator.manual_seed(seed)
 
     def begin(self, ids: np.ndarray, running: np.ndarray) -> None:
-        """Nothing to forget."""
+        """What was decided for another task is not played."""
+        for i in ids:
+            self._left.pop(int(i), None)
 
     @torch.inference_mode()
     def act(
         self, observation: dict[str, Any], instructions: list[str], uniform: np.ndarray, ids: np.ndarray
     ) -> np.ndarray:
         """See `Actor`."""
-        batch = self._processors.batch(observation_columns(observation), instructions)
+        undecided = [row for row, i in enumerate(ids) if not self._left.get(int(i))]
+        if undecided:
+            columns = {name: col[undecided] for name, col in observation_columns(observation).items()}
+            decided = self._decide(columns, [instructions[row] for row in undecided], uniform[undecided])
+            self._left |= {int(ids[row]): list(actions) for row, actions in zip(undecided, decided, strict=True)}
+        return np.stack([self._left[int(i)].pop(0) for i in ids])
+
+    def _decide(self, columns: Columns, instructions: list[str], uniform: np.ndarray) -> np.ndarray:
+        """Decisions (k, n, 7) in physical units."""
+        batch = self._processors.batch(columns, instructions)
         randomness: dict[str, Any] = {"generator": self._generator}
         if self._takes_uniform:
             randomness = {"uniform": torch.from_numpy(uniform).to(self._processors.device)}
         with self._autocast():
             sample = self._policy.sample_actions(batch, temperature=self._temperature, **randomness)
-        return self._processors.physical_actions(sample["action"])
+        actions = sample["actions"]
+        return self._processors.physical_actions(actions.flatten(0, 1)).reshape(actions.shape)
 
 
 class SelectingPolicy:

@@ -56,7 +56,7 @@ class Spectator:
         """See `Agent`."""
         action = self.choose(o_t, tau)
         zeros = np.zeros(len(action), np.float32)
-        return ActionSample(action, np.zeros(action.shape, np.int64), zeros, zeros)
+        return ActionSample(action, zeros, zeros)
 
     def store(
         self,

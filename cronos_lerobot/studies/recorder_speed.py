@@ -89,7 +89,7 @@ class Recording:
                 observation = observation | {"pixels": dict.fromkeys(observation["pixels"], self.positions[t])}
             recorder.on_step(
                 Step(
-                    t, observation, self.env.instructions, ActionSample(action, numbers[:, None], zeros, zeros),
+                    t, observation, self.env.instructions, ActionSample(action, zeros, zeros),
                     reward, success, diverged=no, cut=np.full(n, t == len(self.steps) - 1), piece=numbers,
                     segments_since_reset=numbers, interventions=numbers, policy_version=0,
                     preceded_by=np.full(n, Intervention.NONE if t else Intervention.INITIAL),

@@ -115,7 +115,7 @@ def inference_rate(num_envs: int, scene: str, seconds: float) -> float:
     def step() -> int:
         with torch.inference_mode():
             sample = policy.sample_actions(processors.batch(columns, instructions))
-            processors.physical_actions(sample["action"])
+            processors.physical_actions(sample["actions"][:, 0])
         return num_envs
 
     return rate(step, seconds)

@@ -94,6 +94,7 @@ class Trainer:
                 processors=self.processors,
                 num_streams=self.config.num_envs,
                 update_interval=self.config.protocol.update_interval,
+                task_switch_interval=self.config.protocol.task_switch_interval,
                 rng=lambda name: self.generators.for_numpy(own(name)),
                 torch_rng=lambda name: self.generators.for_torch(own(name)),
                 processes=self.processes,

@@ -55,3 +55,13 @@ def test_streams_do_not_mix():
 def test_open_end_is_refused():
     with pytest.raises(ValueError, match=r"streams \[1\]"):
         compute_gae(*np.zeros((2, 1, 2)), np.array([[True, False]]), np.zeros((1, 2)), 0.99, 0.95)
+
+
+def test_a_decision_of_several_steps_discounts_what_follows_by_its_length():
+    # Decisions of 2, 1 and 3 steps; their rewards are sums already. gamma^d = .25, .5, .125.
+    # delta_2 = 1 + .125 * 8 - 2 = 0; delta_1 = 0 + .5 * 2 - 4 = -3; delta_0 = 1 + .25 * 4 - 2 = 0
+    # A_2 = 0; A_1 = -3 + .5 * .5 * 0 = -3; A_0 = 0 + .25 * .5 * -3 = -.375
+    columns = (np.array(c, float)[:, None] for c in ([1, 0, 1], [2, 4, 2], [0, 0, 1], [-9, -9, 8], [2, 1, 3]))
+    rewards, values, boundaries, bootstrap, durations = columns
+    advantages, _ = compute_gae(rewards, values, boundaries.astype(bool), bootstrap, 0.5, 0.5, durations)
+    assert advantages[:, 0].tolist() == [-0.375, -3, 0]

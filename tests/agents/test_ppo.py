@@ -248,7 +248,7 @@ def test_an_update_changes_the_buffers_advantages_and_returns_alone():
     ppo = make_ppo()
     buffer = rollout(ppo, reward_for_up)
     kept = {
-        name: getattr(buffer, name).copy() for name in ("rewards", "values", "log_probs", "tokens", "boundaries")
+        name: getattr(buffer, name).copy() for name in ("rewards", "values", "log_probs", "traces", "boundaries")
     }
     ppo.update(buffer)
     assert all(np.array_equal(getattr(buffer, name), array) for name, array in kept.items())

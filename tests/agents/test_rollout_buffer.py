@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from cronos_lerobot.agents.base import ActionSample
+from cronos_lerobot.agents.base import Decision
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
 
 U, N = 5, 3
@@ -15,7 +15,7 @@ def filled(rows=U):
             "observation.images.front": np.broadcast_to(ids[:, None, None, None], (N, 2, 2, 3)).astype(np.uint8),
             "observation.state": ids[:, None].astype(np.float32),
         }
-        sample = ActionSample(
+        sample = Decision(
             np.zeros((N, 7), np.float32), np.tile(ids[:, None], 7), ids.astype(np.float32), 2.0 * ids
         )
         boundary = np.full(N, t == rows - 1)
@@ -44,7 +44,7 @@ def test_columns_of_a_minibatch_belong_together():
         assert minibatch.observation["observation.images.front"].dtype == np.uint8
         np.testing.assert_array_equal(minibatch.observation["observation.images.front"][:, 0, 0, 0], ids)
         np.testing.assert_array_equal(minibatch.observation["observation.state"][:, 0], ids)
-        np.testing.assert_array_equal(minibatch.tokens[:, 3], ids)
+        np.testing.assert_array_equal(minibatch.trace[:, 3], ids)
         np.testing.assert_array_equal(minibatch.log_prob, ids)
         np.testing.assert_array_equal(minibatch.value, 2 * ids)
         assert minibatch.instructions == [f"task {i}" for i in ids]
@@ -66,7 +66,7 @@ def test_normalised_advantages():
 def test_full_and_cleared():
     buffer = filled()
     assert len(buffer) == U * N
-    one = ActionSample(*(np.zeros((N, 7), np.float32),) * 2, np.zeros(N), np.zeros(N))
+    one = Decision(*(np.zeros((N, 7), np.float32),) * 2, np.zeros(N), np.zeros(N))
     with pytest.raises(RuntimeError, match="5 rows"):
         buffer.add({}, [""] * N, one, np.zeros(N), np.zeros(N, bool), np.zeros(N))
     buffer.clear()
@@ -78,11 +78,11 @@ def test_actions_keep_their_type_and_shape():
     buffer = RolloutBuffer(2, N)
     drawn = np.linspace(-1, 1, 2 * N * 8, dtype=np.float32).reshape(2, N, 4, 2)
     for t in range(2):
-        sample = ActionSample(np.zeros((N, 7), np.float32), drawn[t], np.zeros(N), np.zeros(N))
+        sample = Decision(np.zeros((N, 7), np.float32), drawn[t], np.zeros(N), np.zeros(N))
         buffer.add({}, ["a"] * N, sample, np.zeros(N), np.full(N, True), np.zeros(N))
     (minibatch,) = buffer.minibatches(100, np.random.default_rng(0))
-    assert minibatch.tokens.dtype == np.float32
-    np.testing.assert_array_equal(minibatch.tokens, drawn.reshape(2 * N, 4, 2)[minibatch.indices])
+    assert minibatch.trace.dtype == np.float32
+    np.testing.assert_array_equal(minibatch.trace, drawn.reshape(2 * N, 4, 2)[minibatch.indices])
 
 
 @pytest.mark.parametrize("batch_size", [1, 2 * N, 100])

@@ -41,7 +41,7 @@ ORIGIN = Origin(STREAMS_KIND, "lerobot_env_cronos/kitchen_2x2-v1", "0123456789ab
 def make_step(t, *, actions, log_prob, value, **changes) -> Step:
     """A step of the main loop of n streams; what is not given is nothing in particular."""
     n = len(actions)
-    action = ActionSample(actions, np.zeros((n, 7), np.int64), log_prob, value)
+    action = ActionSample(actions, log_prob, value)
     zeros, no = np.zeros(n, np.int64), np.zeros(n, np.bool_)
     rest = {
         "instructions": ["task"] * n, "reward": zeros, "success": no, "diverged": no, "cut": no, "piece": zeros,

@@ -6,6 +6,7 @@ import torch
 from dummies import TASKS, DummyEnv, DummyPolicy, identity_processors
 
 from cronos_lerobot.agents.processing import PolicyProcessors
+from cronos_lerobot.evaluation.actors import SamplingPolicy
 from cronos_lerobot.evaluation.independent import evaluate_independent
 
 PROCESSORS = PolicyProcessors(*identity_processors())
@@ -93,3 +94,32 @@ def test_a_broken_simulation_ends_its_episode_and_is_no_success():
     first = TASKS[0].instruction
     assert (whole["per_task"][first]["success"], broken["per_task"][first]["success"]) == (1, 0.5)
     assert broken["steps"] == whole["steps"] - 5
+
+
+def test_decisions_of_several_actions_are_played_by_each_environment_for_itself():
+    class Counting:
+        """Decides on the next three whole numbers after what it sees."""
+
+        config = None
+
+        def eval(self):
+            return self
+
+        def sample_actions(self, batch, *, temperature=1.0, generator=None):
+            first = batch["observation.state"][:, :1]
+            return {"actions": (first + torch.arange(3.0))[..., None].repeat(1, 1, 7)}
+
+    actor = SamplingPolicy(Counting(), PolicyProcessors(lambda batch: batch, lambda action: action), 1.0)
+
+    def act(ids, seen):
+        columns = {"agent_pos": np.array(seen, np.float32)[:, None]}
+        return actor.act(columns, [""] * len(ids), np.zeros((len(ids), 7), np.float32), np.array(ids))[
+            :, 0
+        ].tolist()
+
+    assert act([0, 1, 2], [0, 10, 20]) == [0, 10, 20]
+    assert act([0, 2], [5, 25]) == [1, 21]
+    # A new task begins in 2 and 1 has been waiting; 0 plays on.
+    actor.begin(np.array([2]), np.array([0, 1, 2]))
+    assert act([0, 1, 2], [6, 16, 26]) == [2, 11, 26]
+    assert act([0, 1, 2], [7, 17, 27]) == [7, 12, 27]

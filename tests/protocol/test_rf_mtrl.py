@@ -21,7 +21,7 @@ class DummyAgent:
     def act(self, o_t, tau):
         self.calls.append("act")
         zeros = np.zeros((self.num_streams, 7), np.float32)
-        return ActionSample(zeros, zeros.astype(np.int64), zeros[:, 0], zeros[:, 0])
+        return ActionSample(zeros, zeros[:, 0], zeros[:, 0])
 
     def store(self, o_t, tau, a_t, r_t, o_tp1, cut_t, diverged_t):
         self.calls.append("store")

@@ -92,4 +92,4 @@ class ScriptedPolicy(DummyPolicy):
         tokens = ((noise + 1) / 2 * 3).long().clamp(0, 2)
         log_prob = self._distribution(batch, temperature or 1.0).log_prob(tokens).sum(dim=1)
         value = self.predict_values(batch)
-        return {"action": tokens.float() - 1, "tokens": tokens, "log_prob": log_prob, "value": value}
+        return {"actions": tokens.float()[:, None] - 1, "trace": tokens, "log_prob": log_prob, "value": value}

@@ -19,7 +19,7 @@ from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
 from test_trainer import STEPS_PER_UPDATE, STREAMS, KilledError, assert_same_run, config, metrics, weights
 
 from cronos_lerobot import processes as processes_module
-from cronos_lerobot.agents.base import ActionSample
+from cronos_lerobot.agents.base import Decision
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
@@ -145,7 +145,7 @@ def test_every_process_draws_its_own_actions(tmp_path):
         trainer = Trainer(cfg, DummyEnv(mine.stop - mine.start), DummyEnv, DummyPolicy(), *identity_processors(),
                           processes)  # fmt: skip
         tau = [TASKS[0].instruction] * cfg.num_envs
-        return trainer.agent.act(trainer.env.observe(), tau).tokens.tolist()
+        return trainer.agent.act(trainer.env.observe(), tau).action.tolist()
 
     tokens = together(first_actions, settings(tmp_path / "run", 16))
     assert np.shape(tokens) == (2, 2, 7)
@@ -161,7 +161,7 @@ def rollout(first, last):
         instructions = [TASKS[i].instruction for i in rng.integers(4, size=6)][mine]
         tokens, reward = rng.integers(3, size=(6, 7)), rng.normal(size=6).astype(np.float32)
         log_prob, value = -7.7 + 0.1 * rng.normal(size=(2, 6)).astype(np.float32)
-        sample = ActionSample(np.zeros((last - first, 7), np.float32), tokens[mine], log_prob[mine], value[mine])
+        sample = Decision(np.zeros((last - first, 1, 7), np.float32), tokens[mine], log_prob[mine], value[mine])
         buffer.add(
             columns, instructions, sample, reward[mine], np.full(last - first, True), np.zeros(last - first)
         )

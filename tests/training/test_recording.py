@@ -174,7 +174,7 @@ def test_filmed_streams_are_a_dataset_of_their_own(tmp_path):
         next_obs, reward, *_, info = filmed.step(action)
         recorder.on_step(
             Step(
-                t, observation, env.instructions, ActionSample(action, action, np.zeros(3), np.zeros(3)), reward,
+                t, observation, env.instructions, ActionSample(action, np.zeros(3), np.zeros(3)), reward,
                 info["is_success"], info["diverged"], cut=np.full(3, t == 4), piece=np.zeros(3, int),
                 segments_since_reset=np.zeros(3, int), preceded_by=np.full(3, 0 if t else 6),
                 interventions=np.zeros(3, int), policy_version=0,

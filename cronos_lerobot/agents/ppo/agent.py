@@ -1,4 +1,4 @@
-"""The agent of Algorithm 1: a policy that acts, remembers and learns with PPO."""
+"""The agent of Algorithm 1: a policy that decides, remembers and learns with PPO."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from cronos_lerobot.agents.base import ActionSample, Columns, LearningAgent
+from cronos_lerobot.agents.base import ActionSample, Columns, Decision, LearningAgent, decision_steps
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
 from cronos_lerobot.agents.ppo.state import join_rollouts, set_optimizer
@@ -19,9 +19,13 @@ from cronos_lerobot.stopwatch import Stopwatch
 class PPOAgent(LearningAgent):
     """Acts, stores and updates.
 
+    All streams decide at the same control steps, on n actions that are played open loop. A stream that diverges in
+    between has ended its decision there; it decides anew, and what it does until the others decide, at most n - 1
+    steps, is not learned from.
+
     Args:
         ppo: holds the policy, its processors and the optimizer.
-        buffer: holds the transitions since the last update.
+        buffer: holds the decisions since the last update.
         generator: draws the actions.
         stopwatch: told the time spent in `act` ("infer") and `update` ("update").
         streams: of all N, those that this agent acts in; observations are of these, all else is of all N.
@@ -41,26 +45,27 @@ class PPOAgent(LearningAgent):
         self.generator = generator
         self.stopwatch = stopwatch or Stopwatch()
         self.streams = streams
+        self.num_steps = decision_steps(ppo.policy)
+        self._step = 0
         self._encoded: Columns = {}
+        self._decision: Decision | None = None
         # Dropout and the like stay off in the update too, or the ratio would not be 1 before its first step.
         ppo.policy.eval()
 
     @torch.inference_mode()
     def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
-        """Sample an action for each of its streams."""
+        """The next action of each of its streams; a decision where none is left."""
         tau = tau[self.streams]
         with self.stopwatch("infer"):
-            self._encoded = self.ppo.processors.encode(observation_columns(o_t), tau)
-            batch = self.ppo.processors.encoded_batch(self._encoded, tau)
-            sample = self.ppo.policy.sample_actions(
-                batch, temperature=self.ppo.config.temperature, generator=self.generator
-            )
-            return ActionSample(
-                action=self.ppo.processors.physical_actions(sample["action"]),
-                tokens=sample["tokens"].cpu().numpy(),
-                log_prob=sample["log_prob"].float().cpu().numpy(),
-                value=sample["value"].float().cpu().numpy(),
-            )
+            if self._step == 0:
+                self._begin(*self._decide(observation_columns(o_t), tau))
+            elif self._fresh.any():
+                self._decide_anew(observation_columns(o_t), tau)
+            assert self._decision is not None
+            everyone = np.arange(len(tau))
+            action = self._actions[everyone, self._step - self._since]
+            log_prob = self._decision.log_prob
+            return ActionSample(action, log_prob.reshape(len(tau), -1).sum(1), self._decision.value)
 
     def store(
         self,
@@ -72,16 +77,30 @@ class PPOAgent(LearningAgent):
         cut_t: np.ndarray,
         diverged_t: np.ndarray,
     ) -> None:
-        """Keep one transition of each of its streams, with the value to bootstrap from where the trace is cut.
+        """Take in one control step; with its last one a decision is kept, as `act` encoded what it was made on.
 
-        `o_t` is kept as `act` encoded it.
+        Where the trace is cut, it is bootstrapped from the value of `o_tp1`, or of `o_t` if there is no outcome.
         """
         mine = self.streams
         tau, r_t, cut_t, diverged_t = tau[mine], r_t[mine], cut_t[mine], diverged_t[mine]
-        bootstrap = a_t.value
-        if (cut_t & ~diverged_t).any():
-            bootstrap = np.where(diverged_t, a_t.value, self._values(o_tp1, tau))
-        self.buffer.add(self._encoded, tau, a_t, r_t, cut_t, bootstrap)
+        self._reward += np.where(self._open, self.ppo.config.gamma**self._step * r_t, 0.0)
+        self._duration += self._open
+        cut = self._open & cut_t
+        if (cut & ~diverged_t).any():
+            self._bootstrap = np.where(cut & ~diverged_t, self._values(o_tp1, tau), self._bootstrap)
+        if (cut & diverged_t).any():
+            before = a_t.value if self._step == 0 else self._values(o_t, tau)
+            self._bootstrap = np.where(cut & diverged_t, before, self._bootstrap)
+        self._cut |= cut
+        self._open &= ~cut_t
+        self._fresh = cut_t.copy()
+        self._step += 1
+        if self._step == self.num_steps:
+            assert self._decision is not None
+            self.buffer.add(
+                self._encoded, tau, self._decision, self._reward, self._cut, self._bootstrap, self._duration
+            )
+            self._step = 0
 
     def update(self) -> dict[str, float]:
         """Learn from the buffer and clear it."""
@@ -108,6 +127,44 @@ class PPOAgent(LearningAgent):
         if self.ppo.base_policy is not None:
             self.ppo.base_policy.load(state["base_policy"])
         self.buffer.load_state_dict(to_arrays(state["rollout"]), self.streams)
+
+    def _decide(self, columns: Columns, tau: list[str]) -> tuple[Columns, Decision]:
+        encoded = self.ppo.processors.encode(columns, tau)
+        batch = self.ppo.processors.encoded_batch(encoded, tau)
+        sample = self.ppo.policy.sample_actions(
+            batch, temperature=self.ppo.config.temperature, generator=self.generator
+        )
+        actions = sample["actions"]
+        if actions.shape[1] != self.num_steps:
+            raise ValueError(
+                f"{type(self.ppo.policy).__name__} decided on {actions.shape[1]} actions; its decision_steps says "
+                f"{self.num_steps}."
+            )
+        return encoded, Decision(
+            actions=self.ppo.processors.physical_actions(actions.flatten(0, 1)).reshape(actions.shape),
+            trace=sample["trace"].cpu().numpy(),
+            log_prob=sample["log_prob"].float().cpu().numpy(),
+            value=sample["value"].float().cpu().numpy(),
+        )
+
+    def _begin(self, encoded: Columns, decision: Decision) -> None:
+        """All streams have decided."""
+        n = len(decision.value)
+        # The environment may write the next observation where this one lies.
+        self._encoded = {name: col.copy() for name, col in encoded.items()} if self.num_steps > 1 else encoded
+        self._decision, self._actions = decision, decision.actions
+        self._since = np.zeros(n, np.int64)
+        self._reward, self._bootstrap = np.zeros(n), np.zeros(n, np.float32)
+        self._duration = np.zeros(n, np.int64)
+        self._cut, self._fresh, self._open = np.zeros(n, bool), np.zeros(n, bool), np.ones(n, bool)
+
+    def _decide_anew(self, columns: Columns, tau: list[str]) -> None:
+        """Streams whose decision ended too early decide on what they do until the others decide."""
+        who = np.flatnonzero(self._fresh)
+        _, decision = self._decide({name: col[who] for name, col in columns.items()}, [tau[i] for i in who])
+        self._actions = self._actions.copy()
+        self._actions[who] = decision.actions
+        self._since[who] = self._step
 
     @torch.inference_mode()
     def _values(self, observation: dict[str, Any], tau: list[str]) -> np.ndarray:

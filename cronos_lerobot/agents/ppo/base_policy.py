@@ -29,10 +29,10 @@ class BasePolicy:
         self._evaluate = _Evaluate(policy)
 
     @torch.no_grad()
-    def log_prob(self, batch: Any, tokens: Tensor, temperature: float) -> Tensor:
-        """Log-probability of drawn actions, (B,) [nats]."""
+    def log_prob(self, batch: Any, trace: Tensor, temperature: float) -> Tensor:
+        """Log-probability of decisions, (B,) or (B, L) [nats]."""
         parameters = {f"policy.{name}": param for name, param in self.parameters.items()}
-        return functional_call(self._evaluate, parameters, (batch, tokens, temperature))
+        return functional_call(self._evaluate, parameters, (batch, trace, temperature))
 
     def load(self, parameters: dict[str, Tensor]) -> None:
         """Go on with the parameters of a checkpoint.
@@ -54,5 +54,5 @@ class _Evaluate(nn.Module):
         super().__init__()
         self.policy: Any = policy
 
-    def forward(self, batch: Any, tokens: Tensor, temperature: float) -> Tensor:
-        return self.policy.evaluate_actions(batch, tokens, temperature=temperature)["log_prob"]
+    def forward(self, batch: Any, trace: Tensor, temperature: float) -> Tensor:
+        return self.policy.evaluate_actions(batch, trace, temperature=temperature)["log_prob"]

@@ -10,6 +10,7 @@ from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
 LR_SCHEDULES = ("fixed", "kl_step", "kl_update")
 VALUE_LOSSES = ("huber", "mse")
+RATIOS = ("decision", "factor")
 
 
 @dataclass(frozen=True)
@@ -79,11 +80,14 @@ class PPOConfig(RLAlgorithmConfig):
     value_warmup_updates: int = 2
     """Updates at the start of a run that train the value alone, because it starts from noise."""
     minibatch_size: int = 2048
-    """Transitions in one backward pass of one process."""
+    """Decisions in one backward pass of one process."""
     grad_accumulation: int = 1
     """Minibatches of each process in one optimizer step."""
     clip: float = 0.2
     """The probability ratio is clipped to 1 - clip .. 1 + clip."""
+    ratio: str = "decision"
+    """What has a ratio: the whole `decision`, or each `factor` of it, if the policy tells them apart (the steps of
+    a denoising chain)."""
     gamma: float = 0.99
     """Discount factor per control step (0.2 s)."""
     gae_lambda: float = 0.9
@@ -138,7 +142,7 @@ class PPOConfig(RLAlgorithmConfig):
             value = getattr(self, name)
             if value is not None and value not in interval:
                 raise ValueError(f"algorithm.{name} must be {interval}, got {value}.")
-        for name, choices in (("lr_schedule", LR_SCHEDULES), ("value_loss", VALUE_LOSSES)):
+        for name, choices in (("lr_schedule", LR_SCHEDULES), ("value_loss", VALUE_LOSSES), ("ratio", RATIOS)):
             if getattr(self, name) not in choices:
                 raise ValueError(f"algorithm.{name} must be one of {choices}, got {getattr(self, name)!r}.")
         if self.target_kl is None and self.lr_schedule != "fixed":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cronos_lerobot.agents.base import check_trainable
+from cronos_lerobot.agents.base import check_trainable, decision_steps
 from cronos_lerobot.agents.ppo.agent import PPOAgent
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
@@ -15,7 +15,7 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
     """Return the agent.
 
     Raises:
-        ValueError: the policy does not say how likely its actions were.
+        ValueError: the policy does not say how likely its decisions were, or decides beyond a task switch.
     """
     try:
         check_trainable(context.policy)
@@ -25,5 +25,6 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
     mine = context.streams
     # Every process draws its own minibatches and actions.
     ppo = PPO(context.policy, context.processors, context.config, context.rng("minibatches"), context.processes)
-    buffer = RolloutBuffer(context.update_interval, mine.stop - mine.start)
+    steps = decision_steps(context.policy, context.task_switch_interval)
+    buffer = RolloutBuffer(context.update_interval // steps, mine.stop - mine.start)
     return PPOAgent(ppo, buffer, context.torch_rng("actions"), context.stopwatch, mine)

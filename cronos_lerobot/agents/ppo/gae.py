@@ -27,6 +27,7 @@ def compute_gae(
     bootstrap_values: np.ndarray,
     gamma: float,
     gae_lambda: float,
+    durations: np.ndarray | int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (advantages, returns), each (T, N) float32.
 
@@ -36,7 +37,9 @@ def compute_gae(
         boundaries: (T, N) bool, the trace is cut after row t.
         bootstrap_values: (T, N), read where `boundaries` is set: see the table above.
         gamma: discount factor, per control step.
-        gae_lambda: weight of the longer returns.
+        gae_lambda: weight of the longer returns, per row.
+        durations: (T, N) or a number, control steps that a row took. A row of several is a decision that was
+            played open loop, its reward the sum of gamma^i r_{t+i}: a semi-Markov problem (Sutton et al., 1999).
 
     Raises:
         ValueError: the last row is not a boundary: there is nothing to bootstrap it from.
@@ -45,15 +48,16 @@ def compute_gae(
         streams = np.flatnonzero(~boundaries[-1]).tolist()
         raise ValueError(f"The last row must be a boundary of every stream; it is not of streams {streams}.")
     advantages = np.zeros(rewards.shape, np.float64)
+    discounts = np.broadcast_to(gamma ** np.asarray(durations, np.float64), rewards.shape)
     next_advantage = np.zeros(rewards.shape[1], np.float64)
     next_value = np.zeros(rewards.shape[1], np.float64)
     for t in reversed(range(len(rewards))):
         # V_{t+1} = bootstrap where the trace is cut, else V(o_{t+1}, tau_{t+1})
         next_value = np.where(boundaries[t], bootstrap_values[t], next_value)
-        # delta_t = r_t + gamma V_{t+1} - V_t
-        delta = rewards[t] + gamma * next_value - values[t]
-        # A_t = delta_t + gamma lambda A_{t+1}, without the last term where the trace is cut
-        next_advantage = delta + gamma * gae_lambda * np.where(boundaries[t], 0.0, next_advantage)
+        # delta_t = r_t + gamma^d V_{t+1} - V_t, d the row's duration
+        delta = rewards[t] + discounts[t] * next_value - values[t]
+        # A_t = delta_t + gamma^d lambda A_{t+1}, without the last term where the trace is cut
+        next_advantage = delta + discounts[t] * gae_lambda * np.where(boundaries[t], 0.0, next_advantage)
         advantages[t] = next_advantage
         next_value = values[t]
     # R_t = A_t + V_t

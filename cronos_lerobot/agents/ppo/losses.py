@@ -13,6 +13,17 @@ LOG_RATIO_LIMIT = 20.0
 """Largest |log r|: e^20 times any advantage is finite in float32, and any early stop stops long before."""
 
 
+def by_factor(log_prob: Tensor, ratio: str) -> Tensor:
+    """Log-probabilities (B,) or (B, L) as those whose ratios are clipped, (B, 1) or (B, L) [nats].
+
+    Args:
+        log_prob: of decisions, or of their L factors.
+        ratio: `decision` clips one ratio for each decision, the product of its factors'; `factor` clips each.
+    """
+    log_prob = log_prob.reshape(len(log_prob), -1)
+    return log_prob if ratio == "factor" else log_prob.sum(1, keepdim=True)
+
+
 def bounded_log_ratio(new_log_prob: Tensor, old_log_prob: Tensor) -> Tensor:
     """log r of the probability ratio r = new / old, (B,), within LOG_RATIO_LIMIT: no gradient beyond it [nats]."""
     return (new_log_prob - old_log_prob).clamp(-LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)

@@ -20,6 +20,7 @@ from cronos_lerobot.agents.ppo.learning_rate import AdaptiveLR
 from cronos_lerobot.agents.ppo.losses import (
     approximate_kl,
     bounded_log_ratio,
+    by_factor,
     clipped_objective,
     explained_variance,
     kl_to_base,
@@ -94,7 +95,7 @@ class PPO:
         self.base_policy = BasePolicy(policy, self._params["policy"]) if config.kl_base_coef else None
 
     def update(self, buffer: RolloutBuffer) -> dict[str, float]:
-        """Learn from every transition in `buffer`, and return metrics.
+        """Learn from every decision in `buffer`, and return metrics.
 
         The buffer's `advantages` and `returns` are filled in, the advantages normalised if the config says so;
         all else in it stays as it is.
@@ -207,25 +208,34 @@ class PPO:
     def _loss(self, minibatch: Minibatch) -> Loss:
         config = self.config
         batch = self.processors.encoded_batch(minibatch.observation, minibatch.instructions)
-        tokens, old_log_prob = self._tensor(minibatch.tokens), self._tensor(minibatch.log_prob)
-        new = self.policy.evaluate_actions(batch, tokens, temperature=config.temperature)
-        log_ratio = bounded_log_ratio(new["log_prob"], old_log_prob)
-        policy_loss = -clipped_objective(log_ratio, self._tensor(minibatch.advantage), config.clip).mean()
+        trace, old_log_prob = self._tensor(minibatch.trace), self._tensor(minibatch.log_prob)
+        new = self.policy.evaluate_actions(batch, trace, temperature=config.temperature)
+        new_log_prob, old_log_prob = (by_factor(x, config.ratio) for x in (new["log_prob"], old_log_prob))
+        log_ratio = bounded_log_ratio(new_log_prob, old_log_prob)
+        advantage = self._tensor(minibatch.advantage)[:, None]
+        policy_loss = -clipped_objective(log_ratio, advantage, config.clip).mean()
         value_loss = self._value_error(new["value"], minibatch)
-        entropy = new["entropy"].mean()
-        total = policy_loss + config.value_coef * value_loss - config.entropy_coef * entropy
+        total = policy_loss + config.value_coef * value_loss
         ratio = log_ratio.detach().exp()
-        kl = approximate_kl(log_ratio.detach()).mean().item()
+        # Factors are drawn one after the other: the divergences of all add up to the decision's.
+        kl = approximate_kl(log_ratio.detach()).sum(1).mean().item()
         means = {
             "policy_loss": policy_loss.item(),
             "value_loss": value_loss.item(),
-            "entropy": entropy.item(),
             "approx_kl": kl,
             "clip_fraction": ((ratio - 1).abs() > config.clip).float().mean().item(),
         }
+        if new["entropy"] is not None:
+            entropy = new["entropy"].mean()
+            total = total - config.entropy_coef * entropy
+            means["entropy"] = entropy.item()
+        elif config.entropy_coef:
+            raise ValueError(
+                f"algorithm.entropy_coef={config.entropy_coef}, but the policy's entropy is not known."
+            )
         if self.base_policy is not None:
-            base_log_prob = self.base_policy.log_prob(batch, tokens, config.temperature)
-            base_kl = kl_to_base(new["log_prob"], old_log_prob, base_log_prob).mean()
+            base_log_prob = by_factor(self.base_policy.log_prob(batch, trace, config.temperature), config.ratio)
+            base_kl = kl_to_base(new_log_prob, old_log_prob, base_log_prob).sum(1).mean()
             total = total + config.kl_base_coef * base_kl
             means["base_kl"] = base_kl.item()
         return Loss(total, means, {"ratio_max": ratio.max().item()}, kl)

@@ -1,4 +1,4 @@
-"""Storage for the U x N transitions between two policy updates."""
+"""Storage for the decisions of N streams between two policy updates."""
 
 from __future__ import annotations
 
@@ -8,22 +8,24 @@ from typing import Any
 
 import numpy as np
 
-from cronos_lerobot.agents.base import ActionSample, Columns
+from cronos_lerobot.agents.base import Columns, Decision
 from cronos_lerobot.agents.ppo.gae import compute_gae
 
-STORED = ("rewards", "values", "log_probs", "boundaries", "bootstrap_values", "instruction_ids", "tokens")
+STORED = (
+    "rewards", "values", "log_probs", "boundaries", "bootstrap_values", "durations", "instruction_ids", "traces"
+)  # fmt: skip
 """Arrays of a buffer that are filled as the streams go on."""
 
 
 @dataclass(frozen=True)
 class Minibatch:
-    """B transitions in random order."""
+    """B decisions in random order."""
 
     indices: np.ndarray
     """(B,) row * num_streams + stream."""
     observation: Columns
     instructions: list[str]
-    tokens: np.ndarray
+    trace: np.ndarray
     log_prob: np.ndarray
     value: np.ndarray
     advantage: np.ndarray
@@ -34,7 +36,7 @@ class RolloutBuffer:
     """Preallocated at the first `add`; every column keeps its type and shape, instructions are kept as indices.
 
     Args:
-        num_rows: U, transitions of each stream.
+        num_rows: decisions of each stream, U control steps' worth.
         num_streams: N.
     """
 
@@ -46,22 +48,23 @@ class RolloutBuffer:
         """Rows in use."""
         self.rewards = np.zeros(shape, np.float32)
         self.values = np.zeros(shape, np.float32)
-        self.log_probs = np.zeros(shape, np.float32)
         self.boundaries = np.zeros(shape, np.bool_)
         self.bootstrap_values = np.zeros(shape, np.float32)
+        self.durations = np.ones(shape, np.int64)
         self.advantages = np.zeros(shape, np.float32)
         self.returns = np.zeros(shape, np.float32)
         self.instruction_ids = np.zeros(shape, np.int64)
-        self.tokens: np.ndarray | None = None
+        self.traces: np.ndarray | None = None
+        self.log_probs: np.ndarray | None = None
         self.observations: Columns = {}
         self._instructions: list[str] = []
 
     def __len__(self) -> int:
-        """Transitions in the buffer, over all streams."""
+        """Decisions in the buffer, over all streams."""
         return self.rows * self.num_streams
 
     def state_dict(self) -> dict[str, Any]:
-        """The transitions in use, stream by stream: arrays (N, rows, ...) of their types; {} if there are none."""
+        """The decisions in use, stream by stream: arrays (N, rows, ...) of their types; {} if there are none."""
         if not self.rows:
             return {}
         stored = {name: getattr(self, name) for name in STORED} | {"observations": self.observations}
@@ -94,39 +97,43 @@ class RolloutBuffer:
         self,
         observation: Columns,
         instructions: list[str],
-        sample: ActionSample,
+        decision: Decision,
         reward: np.ndarray,
         boundary: np.ndarray,
         bootstrap_value: np.ndarray,
+        duration: np.ndarray | int = 1,
     ) -> None:
-        """Copy one transition of every stream.
+        """Copy one decision of every stream.
 
         Args:
-            observation: what was acted on, columns (N, ...).
-            instructions: N instructions acted under.
-            sample: the action, its log-probability, and the value of the observation.
-            reward: (N,).
-            boundary: (N,) bool, the trace is cut after this transition.
+            observation: what was decided on, columns (N, ...).
+            instructions: N instructions decided under.
+            decision: with its log-probability, and the value of the observation.
+            reward: (N,), of several control steps the discounted sum.
+            boundary: (N,) bool, the stream's trace is cut after this decision.
             bootstrap_value: (N,), read where `boundary` is set.
+            duration: (N,) or a number, control steps that were played.
 
         Raises:
             RuntimeError: the buffer is full.
         """
         if self.rows == self.num_rows:
             raise RuntimeError(f"The rollout buffer is full: it holds {self.num_rows} rows; update and clear it.")
-        if self.tokens is None:
-            self._allocate(observation, sample)
-        assert self.tokens is not None
+        if self.traces is None:
+            self._allocate(observation, decision)
+        assert self.traces is not None
+        assert self.log_probs is not None
         row = self.rows
         for name, column in observation.items():
             self.observations[name][row] = column
         self.instruction_ids[row] = [self._instruction_id(text) for text in instructions]
-        self.tokens[row] = sample.tokens
-        self.log_probs[row] = sample.log_prob
-        self.values[row] = sample.value
+        self.traces[row] = decision.trace
+        self.log_probs[row] = decision.log_prob
+        self.values[row] = decision.value
         self.rewards[row] = reward
         self.boundaries[row] = boundary
         self.bootstrap_values[row] = bootstrap_value
+        self.durations[row] = duration
         self.rows += 1
 
     def compute_advantages(self, gamma: float, gae_lambda: float) -> None:
@@ -139,6 +146,7 @@ class RolloutBuffer:
             self.bootstrap_values[used],
             gamma,
             gae_lambda,
+            self.durations[used],
         )
 
     def results(self) -> Columns:
@@ -154,10 +162,10 @@ class RolloutBuffer:
     def minibatches(
         self, batch_size: int, rng: np.random.Generator, observations: Columns | None = None
     ) -> Iterator[Minibatch]:
-        """Yield every transition exactly once, in an order drawn from `rng`; the last batch may be smaller.
+        """Yield every decision exactly once, in an order drawn from `rng`; the last batch may be smaller.
 
         Args:
-            batch_size: transitions in one.
+            batch_size: decisions in one.
             rng: draws the order.
             observations: columns (rows, num_streams, ...) in place of the stored ones.
         """
@@ -185,26 +193,28 @@ class RolloutBuffer:
         return {name: col.reshape(self.rows, self.num_streams, *col.shape[1:]) for name, col in whole.items()}
 
     def clear(self) -> None:
-        """Forget the transitions; the memory is kept."""
+        """Forget the decisions; the memory is kept."""
         self.rows = 0
 
     def _gather(self, indices: np.ndarray, observations: Columns) -> Minibatch:
-        assert self.tokens is not None
+        assert self.traces is not None
+        assert self.log_probs is not None
         row, stream = np.divmod(indices, self.num_streams)
         return Minibatch(
             indices=indices,
             observation={name: column[row, stream] for name, column in observations.items()},
             instructions=[self._instructions[i] for i in self.instruction_ids[row, stream]],
-            tokens=self.tokens[row, stream],
+            trace=self.traces[row, stream],
             log_prob=self.log_probs[row, stream],
             value=self.values[row, stream],
             advantage=self.advantages[row, stream],
             return_=self.returns[row, stream],
         )
 
-    def _allocate(self, observation: Columns, sample: ActionSample) -> None:
+    def _allocate(self, observation: Columns, decision: Decision) -> None:
         shape = (self.num_rows, self.num_streams)
-        self.tokens = np.zeros((*shape, *sample.tokens.shape[1:]), sample.tokens.dtype)
+        self.traces = np.zeros((*shape, *decision.trace.shape[1:]), decision.trace.dtype)
+        self.log_probs = np.zeros((*shape, *decision.log_prob.shape[1:]), np.float32)
         self.observations = {
             name: np.zeros((*shape, *column.shape[1:]), column.dtype) for name, column in observation.items()
         }

@@ -36,7 +36,7 @@ def test_log_probabilities_are_those_of_the_published_modules(base, parts):
 
 def test_greedy_tokens_with_the_cache_are_those_without(base, parts):
     batch = make_batch(3, seed=1)
-    tokens = base.sample_actions(batch, temperature=0.0)["tokens"]
+    tokens = base.sample_actions(batch, temperature=0.0)["trace"]
     pixels = prepare_images(batch[CAMERA], base.architecture, crop=False)
     for row, (image, text) in enumerate(zip(pixels, batch["task"], strict=True)):
         drawn: list[int] = []
@@ -62,7 +62,7 @@ def test_images_may_be_levels_or_fractions(published):
     for crop in (False, True):
         policy = make_policy(published, center_crop=crop)
         levels, floats = (policy.sample_actions(images, uniform=uniform) for images in (batch, fractions))
-        assert torch.equal(levels["tokens"], floats["tokens"])
+        assert torch.equal(levels["trace"], floats["trace"])
         torch.testing.assert_close(floats["log_prob"], levels["log_prob"], atol=1e-2, rtol=0)
 
 
@@ -72,16 +72,16 @@ def test_ratio_is_one_before_the_first_update(kind, request):
     batch = make_batch(5)
     sample = policy.sample_actions(batch, temperature=0.8, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        again = policy.evaluate_actions(batch, sample["tokens"], temperature=0.8)
+        again = policy.evaluate_actions(batch, sample["trace"], temperature=0.8)
         values = policy.predict_values(batch)
     ratio = (again["log_prob"] - sample["log_prob"]).exp()
     torch.testing.assert_close(ratio, torch.ones(5), atol=1e-4, rtol=0)
     torch.testing.assert_close(again["value"], sample["value"], atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(values, sample["value"], atol=1e-4, rtol=1e-4)
     assert sample["value"].std() > 1e-3
-    assert sample["tokens"].min() >= VOCABULARY - BINS
-    assert sample["tokens"].max() < VOCABULARY
-    assert sample["action"].abs().max() <= 1
+    assert sample["trace"].min() >= VOCABULARY - BINS
+    assert sample["trace"].max() < VOCABULARY
+    assert sample["actions"].abs().max() <= 1
 
 
 def test_a_sample_does_not_depend_on_its_batch(published):
@@ -92,16 +92,16 @@ def test_a_sample_does_not_depend_on_its_batch(published):
     together = policy.sample_actions(batch, uniform=uniform)
     for row in range(5):
         alone = policy.sample_actions(take(batch, [row]), uniform=uniform[row : row + 1])
-        assert torch.equal(alone["tokens"][0], together["tokens"][row])
+        assert torch.equal(alone["trace"][0], together["trace"][row])
         torch.testing.assert_close(alone["log_prob"][0], together["log_prob"][row], atol=1e-4, rtol=0)
     first, second = (policy.sample_actions(batch, generator=torch.Generator().manual_seed(3)) for _ in range(2))
-    assert torch.equal(first["tokens"], second["tokens"])
-    assert not torch.equal(first["tokens"], together["tokens"])
+    assert torch.equal(first["trace"], second["trace"])
+    assert not torch.equal(first["trace"], together["trace"])
 
 
 def test_image_and_instruction_matter(base):
     batch = make_batch(2)
-    tokens = base.sample_actions(batch)["tokens"]
+    tokens = base.sample_actions(batch)["trace"]
     before = base.evaluate_actions(batch, tokens)["log_prob"]
     swapped = base.evaluate_actions(batch | {"task": batch["task"][::-1]}, tokens)["log_prob"]
     darker = base.evaluate_actions(batch | {CAMERA: batch[CAMERA] // 2}, tokens)["log_prob"]
@@ -111,7 +111,7 @@ def test_image_and_instruction_matter(base):
 
 def test_fresh_adapters_change_nothing_and_trained_ones_do(published, base):
     batch = make_batch(2)
-    tokens = base.sample_actions(batch)["tokens"]
+    tokens = base.sample_actions(batch)["trace"]
     with torch.no_grad():
         expected = base.evaluate_actions(batch, tokens)["log_prob"]
         fresh = make_policy(published, stir=False, lora_rank=4)
@@ -136,7 +136,7 @@ def test_what_is_trained(lora, published):
     assert {n.split(".")[1] for n, p in some.named_parameters() if ".lora_" in n} == {"projector"}
     # Every trained parameter gets a gradient: nothing that is never used is adapted.
     batch = make_batch(2)
-    result = lora.evaluate_actions(batch, lora.sample_actions(batch)["tokens"])
+    result = lora.evaluate_actions(batch, lora.sample_actions(batch)["trace"])
     (result["log_prob"].sum() + result["value"].sum()).backward()
     assert [n for n, p in lora.named_parameters() if p.requires_grad and p.grad is None] == []
     lora.zero_grad(set_to_none=True)
@@ -164,7 +164,7 @@ def test_kept_features_stand_for_the_image(published, dtype):
     uniform = torch.rand(3, 7)
     from_image = policy.sample_actions(batch, uniform=uniform)
     from_kept = policy.sample_actions({"task": batch["task"], FEATURES: kept}, uniform=uniform)
-    assert torch.equal(from_image["tokens"], from_kept["tokens"])
+    assert torch.equal(from_image["trace"], from_kept["trace"])
     assert torch.equal(from_image["log_prob"], from_kept["log_prob"])
     assert make_policy(published, lora_rank=4).encode_observation is None
 
@@ -173,7 +173,7 @@ def test_gradient_checkpointing_gives_the_same_gradients(published):
     batch, gradients = make_batch(2), []
     for enabled in (False, True):
         policy = make_policy(published, lora_rank=4, gradient_checkpointing=enabled)
-        tokens = policy.sample_actions(batch, uniform=torch.full((2, 7), 0.5))["tokens"]
+        tokens = policy.sample_actions(batch, uniform=torch.full((2, 7), 0.5))["trace"]
         calls = count_forwards(policy.network.language_model.model.layers[0].mlp)
         result = policy.evaluate_actions(batch, tokens)
         (result["log_prob"].sum() + result["value"].sum()).backward()
@@ -205,7 +205,7 @@ def test_prompt_is_read_once_for_all_seven_tokens(base):
 def test_bfloat16_is_close_and_its_adapters_are_float32(published):
     batch = make_batch(4)
     policies = [make_policy(published, lora_rank=4, dtype=dtype) for dtype in ("float32", "bfloat16")]
-    tokens = policies[0].sample_actions(batch)["tokens"]
+    tokens = policies[0].sample_actions(batch)["trace"]
     with torch.no_grad():
         exact, rough = (policy.evaluate_actions(batch, tokens)["log_prob"] for policy in policies)
     assert (exact - rough).abs().max() < 0.1 * exact.abs().max()

@@ -78,7 +78,7 @@ def test_what_lerobot_train_leaves(cloned, published):
     own = OpenVLAPolicy.from_pretrained(cloned)
     assert isinstance(own, OpenVLAPolicy)
     batch = make_batch(2)
-    tokens = own.sample_actions(batch)["tokens"]
+    tokens = own.sample_actions(batch)["trace"]
     with torch.no_grad():
         expected = own.evaluate_actions(batch, tokens)["log_prob"]
         torch.testing.assert_close(wrapped.eval().evaluate_actions(batch, tokens)["log_prob"], expected)

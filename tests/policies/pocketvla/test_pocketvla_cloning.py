@@ -48,7 +48,7 @@ def test_augmentation_is_for_training_only():
     assert torch.equal(policy.forward(batch)[0], policy.forward(batch)[0])
     policy.train()
     assert not torch.equal(policy.forward(batch)[0], policy.forward(batch)[0])
-    tokens = policy.sample_actions(batch)["tokens"]
+    tokens = policy.sample_actions(batch)["trace"]
     first, second = (policy.evaluate_actions(batch, tokens)["log_prob"] for _ in range(2))
     assert torch.equal(first, second)
 

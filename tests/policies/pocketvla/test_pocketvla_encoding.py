@@ -21,7 +21,7 @@ def test_encodings_stand_in_for_the_images(policy):
     batch = make_batch(6)
     encoded = policy.encode_observation(batch)
     assert not [key for key in encoded if "images" in key]
-    tokens = policy.sample_actions(batch)["tokens"]
+    tokens = policy.sample_actions(batch)["trace"]
     expected, got = (policy.evaluate_actions(b, tokens) for b in (batch, encoded))
     for name in ("log_prob", "entropy", "value"):
         torch.testing.assert_close(got[name], expected[name])
@@ -50,7 +50,7 @@ def test_what_is_frozen_gathers_no_gradient(policy):
         np.random.default_rng(0),
     )
     batch = policy.encode_observation(make_batch(4))
-    result = policy.evaluate_actions(batch, policy.sample_actions(batch)["tokens"])
+    result = policy.evaluate_actions(batch, policy.sample_actions(batch)["trace"])
     (result["log_prob"].sum() + result["value"].sum()).backward()
     grown = {name.rsplit(".", 1)[0] for name, p in policy.named_parameters() if p.grad is not None}
     assert grown

@@ -22,7 +22,7 @@ def test_the_ratio_is_one_before_the_first_update(head, image, dtype, temperatur
     policy.train()
     # Minibatches are other mixtures of the samples than the rollout's batches were.
     for rows in ([5, 0, 17, 23, 9, 2, 11], list(range(24))):
-        got = policy.evaluate_actions(take(batch, rows), sampled["tokens"][rows], temperature=temperature)
+        got = policy.evaluate_actions(take(batch, rows), sampled["trace"][rows], temperature=temperature)
         torch.testing.assert_close(got["log_prob"].exp(), sampled["log_prob"][rows].exp(), rtol=1e-4, atol=0)
         torch.testing.assert_close(got["value"], sampled["value"][rows], rtol=1e-4, atol=1e-5)
     assert sampled["log_prob"].std() > 0.1
@@ -32,10 +32,10 @@ def test_the_ratio_is_one_before_the_first_update(head, image, dtype, temperatur
 def test_sampled_actions_are_the_bin_centres_of_the_tokens_and_inside_the_range():
     policy = make_policy(image=False)
     out = policy.sample_actions(make_batch(16))
-    assert out["action"].dtype == torch.float32
-    assert out["tokens"].dtype == torch.int64
-    torch.testing.assert_close(out["action"], -1 + (2 * out["tokens"] + 1) / 256)
-    assert set(out["tokens"][:, 6].tolist()) <= {0, 255}
+    assert out["actions"][:, 0].dtype == torch.float32
+    assert out["trace"].dtype == torch.int64
+    torch.testing.assert_close(out["actions"][:, 0], -1 + (2 * out["trace"] + 1) / 256)
+    assert set(out["trace"][:, 6].tolist()) <= {0, 255}
     assert out["log_prob"].shape == out["value"].shape == (16,)
 
 
@@ -44,7 +44,7 @@ def test_the_generator_decides_the_sample_and_the_global_one_is_left_alone():
     draws = []
     before = torch.random.get_rng_state()
     for seed in (1, 1, 2):
-        draws.append(policy.sample_actions(batch, generator=torch.Generator().manual_seed(seed))["tokens"])
+        draws.append(policy.sample_actions(batch, generator=torch.Generator().manual_seed(seed))["trace"])
     assert torch.equal(draws[0], draws[1])
     assert not torch.equal(draws[0], draws[2])
     assert torch.equal(before, torch.random.get_rng_state())
@@ -56,9 +56,9 @@ def test_greedy_actions_repeat_and_sampled_ones_spread_with_the_temperature():
         policy.head.project.weight.zero_()
     batch = {k: v * 400 if isinstance(v, list) else v.expand(400, *v.shape[1:]) for k, v in batch.items()}
     greedy = policy.sample_actions(batch, temperature=0.0)
-    assert (greedy["tokens"] == greedy["tokens"][0]).all()
+    assert (greedy["trace"] == greedy["trace"][0]).all()
     assert (greedy["log_prob"] == 0).all()
-    torch.testing.assert_close(policy.select_action(batch, temperature=0.0), greedy["action"])
+    torch.testing.assert_close(policy.select_action(batch, temperature=0.0), greedy["actions"][:, 0])
     narrow = policy.select_action(batch, temperature=0.25)[:, :6].std(0)
     wide = policy.select_action(batch, temperature=1.0)[:, :6].std(0)
     # The mean is near 0, far from the edges; a quarter of the temperature is half of sigma.
@@ -190,7 +190,7 @@ def test_a_saved_policy_is_the_same_policy(image, tmp_path):
     policy.save_pretrained(tmp_path)
     loaded = PocketVLAPolicy.from_pretrained(tmp_path)
     batch = make_batch(6)
-    tokens = policy.sample_actions(batch)["tokens"]
+    tokens = policy.sample_actions(batch)["trace"]
     before, after = policy.evaluate_actions(batch, tokens), loaded.evaluate_actions(batch, tokens)
     for key in before:
         assert torch.equal(before[key], after[key])

@@ -193,7 +193,7 @@ class OpenVLAPolicy(PreTrainedPolicy):
             generator: random source; None is torch's global one.
         """
         temperature = self.config.temperature if temperature is None else temperature
-        return self.sample_actions(batch, temperature=temperature, generator=generator)["action"]
+        return self.sample_actions(batch, temperature=temperature, generator=generator)["actions"][:, 0]
 
     def predict_action_chunk(self, batch: Batch, **kwargs: Any) -> Tensor:
         """`select_action` as a chunk of one action, (B, 1, A)."""
@@ -280,8 +280,9 @@ class OpenVLAPolicy(PreTrainedPolicy):
                 depend on the others of its batch.
 
         Returns:
-            `action` (B, A) float32, normalised; `tokens` (B, A) int64, of the vocabulary; `log_prob` (B,), summed
-            over the tokens, at this temperature; `value` (B,). Temperature 0 is greedy, its `log_prob` is 0.
+            `actions` (B, 1, A) float32, normalised; `trace` (B, A) int64, tokens of the vocabulary; `log_prob`
+            (B,), summed over the tokens, at this temperature; `value` (B,). Temperature 0 is greedy, its
+            `log_prob` is 0.
         """
         if uniform is None:
             shape = (len(batch["task"]), self.action_dim)
@@ -298,8 +299,8 @@ class OpenVLAPolicy(PreTrainedPolicy):
                 self.network, self._prompts(batch), self._patches(batch), self.action_dim, choose
             )
         return {
-            "action": self.action_tokenizer.decode(tokens),
-            "tokens": tokens,
+            "actions": self.action_tokenizer.decode(tokens).unsqueeze(1),
+            "trace": tokens,
             "log_prob": self._distribution(logits, temperature).log_prob(tokens),
             "value": self._values(hidden),
         }

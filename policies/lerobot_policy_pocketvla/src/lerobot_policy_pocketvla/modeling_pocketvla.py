@@ -259,16 +259,16 @@ class PocketVLAPolicy(PreTrainedPolicy):
                 depend on the others of its batch.
 
         Returns:
-            `action` (B, D) float32, normalised; `tokens` (B, D) int64; `log_prob` (B,), summed over the
-            dimensions, at this temperature; `value` (B,). Temperature 0 is greedy, its `log_prob` is 0.
+            `actions` (B, 1, D) float32, normalised; `trace` (B, D) int64, the bins; `log_prob` (B,), summed over
+            the dimensions, at this temperature; `value` (B,). Temperature 0 is greedy, its `log_prob` is 0.
         """
         with self._full_precision():
             features = self._features(batch)
             distribution = BinDistribution(self.head(features))
             tokens = distribution.sample(temperature, generator, uniform)
             return {
-                "action": tokens_to_actions(tokens, self.config.num_bins),
-                "tokens": tokens,
+                "actions": tokens_to_actions(tokens, self.config.num_bins).unsqueeze(1),
+                "trace": tokens,
                 "log_prob": distribution.log_prob(tokens, temperature),
                 "value": self._values(batch, features),
             }
