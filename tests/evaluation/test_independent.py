@@ -23,7 +23,7 @@ class ScriptedPolicy(DummyPolicy):
         actions = torch.zeros(len(batch["task"]), 7)
         goals = torch.tensor([float(text.removeprefix("go to ")) for text in batch["task"]])
         actions[:, 0] = (goals > 0) * torch.sign(goals - batch["observation.state"][:, 0])
-        return {"action": actions}
+        return {"actions": actions[:, None]}
 
 
 def evaluate(env, policy, **options):
@@ -62,7 +62,7 @@ def test_repetitions_are_as_many_episodes_with_random_numbers_of_their_own():
 
         def sample_actions(self, batch, *, temperature=1.0, generator=None):
             draws.append(float(torch.rand(1, generator=generator)))
-            return {"action": torch.zeros(len(batch["task"]), 7)}
+            return {"actions": torch.zeros(len(batch["task"]), 7)[:, None]}
 
     draws = []
     result = evaluate(DummyEnv(4), Restless(), n_episodes=1, repetitions=3)
