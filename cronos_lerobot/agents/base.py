@@ -145,7 +145,7 @@ class Decision:
 def plain_sample(action: np.ndarray) -> ActionSample:
     """Actions (N, A) float32 in physical units, of an agent that knows no more of them: the rest is 0."""
     nothing = np.zeros(len(action), np.float32)
-    return ActionSample(action, np.zeros((len(action), 0), np.float32), nothing, nothing)
+    return ActionSample(action, nothing, nothing)
 
 
 class Agent(Protocol):

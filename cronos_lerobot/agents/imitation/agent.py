@@ -126,7 +126,7 @@ class ImitationAgent(LearningAgent):
             sample = self.policy.sample_actions(
                 frames[-1], temperature=self.config.temperature, generator=generator
             )
-            return sample["action"].unsqueeze(1)
+            return sample["actions"]
 
         return ChunkPlayer(plan)
 
