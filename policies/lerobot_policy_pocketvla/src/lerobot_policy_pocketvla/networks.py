@@ -75,10 +75,12 @@ class Film(nn.Module):
 
     def forward(self, x: Tensor, task: TaskEmbedding) -> Tensor:
         """Scale and shift x, (B, features) or (B, features, H, W), by the task."""
-        scale, shift = (task.spread(part) for part in self.project(task.unique).chunk(2, dim=-1))
+        scale, shift = self.project(task.unique).to(x.dtype).chunk(2, dim=-1)
+        # What depends on the task alone is done once for each task, not for each of B rows.
+        factor, shift = task.spread(1.0 + scale), task.spread(shift)
         if x.ndim == 4:
-            scale, shift = scale[..., None, None], shift[..., None, None]
-        return x * (1.0 + scale.to(x.dtype)) + shift.to(x.dtype)
+            factor, shift = factor[..., None, None], shift[..., None, None]
+        return torch.addcmul(shift, x, factor)
 
 
 class FilmMLP(nn.Module):
