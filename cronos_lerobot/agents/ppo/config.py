@@ -73,9 +73,9 @@ RANGES = {
 class PPOConfig(RLAlgorithmConfig):
     """PPO with settings for PocketVLA, a small network trained on a laptop CPU. Bad values are a ValueError."""
 
-    epochs: int = 4
+    epochs: int = 3
     """Passes over the rollout that train the policy and the value."""
-    value_epochs: int = 3
+    value_epochs: int = 1
     """Passes after them that train the value alone."""
     value_warmup_updates: int = 2
     """Updates at the start of a run that train the value alone, because it starts from noise."""
