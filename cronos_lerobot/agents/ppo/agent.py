@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import torch
 
+from cronos_lerobot.agents.adapters.registry import Adapter, trained_tensors
 from cronos_lerobot.agents.base import ActionSample, Columns, Decision, LearningAgent, decision_steps
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
@@ -40,7 +42,8 @@ class PPOAgent(LearningAgent):
         streams: slice = slice(None),
     ) -> None:
         self.ppo = ppo
-        self.policy, self.optimizer = ppo.policy, ppo.optimizer
+        self._adapter = ppo.policy if isinstance(ppo.policy, Adapter) else None
+        self.policy, self.optimizer = getattr(self._adapter, "policy", ppo.policy), ppo.optimizer
         self.buffer = buffer
         self.generator = generator
         self.stopwatch = stopwatch or Stopwatch()
@@ -109,6 +112,10 @@ class PPOAgent(LearningAgent):
             self.buffer.clear()
             return metrics
 
+    def shared_tensors(self) -> Iterable[torch.Tensor]:
+        """The policy's parameters and those beside it."""
+        return trained_tensors(self.ppo.policy)
+
     def state_dict(self) -> dict[str, Any]:
         """The rollout that a budget's end left, the base policy, the count of updates; see `LearningAgent`."""
         ppo = self.ppo
@@ -117,6 +124,7 @@ class PPOAgent(LearningAgent):
             "num_updates": ppo.num_updates,
             "config": {"policy_lr": ppo.config.policy_lr, "value_lr": ppo.config.value_lr},
             "base_policy": base,
+            "adapter": {} if self._adapter is None else self._adapter.own_parameters(),
             "rollout": to_tensors(join_rollouts(self.buffer.state_dict(), ppo.processes)),
         }
 
@@ -126,6 +134,8 @@ class PPOAgent(LearningAgent):
         set_optimizer(self.ppo.optimizer, self.ppo.config, state["config"])
         if self.ppo.base_policy is not None:
             self.ppo.base_policy.load(state["base_policy"])
+        if self._adapter is not None:
+            self._adapter.load_own_parameters(state["adapter"])
         self.buffer.load_state_dict(to_arrays(state["rollout"]), self.streams)
 
     def _decide(self, columns: Columns, tau: list[str]) -> tuple[Columns, Decision]:

@@ -64,6 +64,7 @@ RANGES = {
     "beta2": DECAY,
     "weight_decay": FROM_0,
     "temperature": ABOVE_0,
+    "noise_std": ABOVE_0,
 }
 """Valid values of the numbers; those that may be null are free to be."""
 
@@ -136,6 +137,9 @@ class PPOConfig(RLAlgorithmConfig):
     """AdamW's weight decay."""
     temperature: float = 1.0
     """Sampling temperature while training."""
+    noise_std: float = 0.1
+    """Standard deviation at the start, in normalised units, of the noise around the actions of a policy that has
+    none of its own (ACT); it is learned."""
 
     def __post_init__(self) -> None:
         for name, interval in RANGES.items():

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from cronos_lerobot.agents.base import check_trainable, decision_steps
+from cronos_lerobot.agents.adapters import act as _act  # noqa: F401 -- registers its adapter
+from cronos_lerobot.agents.adapters.registry import Adapter, AdapterOptions, make_trainable
+from cronos_lerobot.agents.base import decision_steps
 from cronos_lerobot.agents.ppo.agent import PPOAgent
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
@@ -17,14 +19,12 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
     Raises:
         ValueError: the policy does not say how likely its decisions were, or decides beyond a task switch.
     """
-    try:
-        check_trainable(context.policy)
-    except TypeError as error:
-        other = "--algorithm.type=imitation learns with any policy that lerobot-train trains."
-        raise ValueError(f"{error} {other}") from error
+    policy = make_trainable(context.policy, AdapterOptions(noise_std=context.config.noise_std))
+    if isinstance(policy, Adapter):
+        context.processes.copy_from_main([*policy.own_parameters().values()])
     mine = context.streams
     # Every process draws its own minibatches and actions.
-    ppo = PPO(context.policy, context.processors, context.config, context.rng("minibatches"), context.processes)
-    steps = decision_steps(context.policy, context.task_switch_interval)
+    ppo = PPO(policy, context.processors, context.config, context.rng("minibatches"), context.processes)
+    steps = decision_steps(policy, context.task_switch_interval)
     buffer = RolloutBuffer(context.update_interval // steps, mine.stop - mine.start)
     return PPOAgent(ppo, buffer, context.torch_rng("actions"), context.stopwatch, mine)

@@ -1,0 +1,1 @@
+"""What makes LeRobot's own policies say how likely their decisions were."""

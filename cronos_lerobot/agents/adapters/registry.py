@@ -1,0 +1,106 @@
+"""Adapters by policy type, open to users as agents are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from cronos_lerobot.agents.base import TrainablePolicy, check_trainable
+
+
+@dataclass(frozen=True)
+class AdapterOptions:
+    """What an agent asks of an adapter."""
+
+    noise_std: float = 0.1
+    """Standard deviation at the start, in normalised units, of the noise that an adapter adds to actions."""
+
+
+class Adapter(nn.Module):
+    """A TrainablePolicy around a LeRobot policy: the policy acts and is saved, the rest is beside it.
+
+    Args:
+        policy: the LeRobot policy; the adapter trains its parameters in place.
+
+    Attributes:
+        policy: the same.
+        decision_steps: how many actions it decides on at once.
+    """
+
+    decision_steps: int = 1
+
+    def __init__(self, policy: Any) -> None:
+        super().__init__()
+        self.policy = policy
+        self.config = policy.config
+
+    def own_parameters(self) -> dict[str, Tensor]:
+        """What is not the policy's, without gradient: noise scales, the critic. A run's checkpoint holds it."""
+        return {name: p.detach() for name, p in self.named_parameters() if not name.startswith("policy.")}
+
+    @torch.no_grad()
+    def load_own_parameters(self, parameters: dict[str, Tensor]) -> None:
+        """Go on with `own_parameters` of a checkpoint.
+
+        Raises:
+            ValueError: they are those of another adapter.
+        """
+        own = self.own_parameters()
+        if own.keys() != parameters.keys():
+            raise ValueError(f"The adapter's parameters are {sorted(own)}, those saved are {sorted(parameters)}.")
+        for name, param in parameters.items():
+            own[name].copy_(param)
+
+
+AdapterFactory = Callable[[Any, AdapterOptions], Adapter]
+
+ADAPTERS: dict[str, AdapterFactory] = {}
+"""What makes a LeRobot policy of a type trainable."""
+
+
+def register_adapter(policy_type: str) -> Callable[[AdapterFactory], AdapterFactory]:
+    """Make policies of a `--policy.type` trainable by agents that need likelihoods.
+
+    It decorates an Adapter whose constructor, or a function that, takes the policy and AdapterOptions.
+
+    Raises:
+        ValueError: the type has an adapter.
+    """
+
+    def register(factory: AdapterFactory) -> AdapterFactory:
+        if policy_type in ADAPTERS:
+            raise ValueError(f"there is an adapter for {policy_type!r} already; types: {sorted(ADAPTERS)}.")
+        ADAPTERS[policy_type] = factory
+        return factory
+
+    return register
+
+
+def make_trainable(policy: Any, options: AdapterOptions) -> Any:
+    """Return `policy` if it is a TrainablePolicy, or its adapter.
+
+    Raises:
+        ValueError: it is neither; the message says who can train it all the same.
+    """
+    if isinstance(policy, TrainablePolicy):
+        return policy
+    policy_type = getattr(policy.config, "type", None)
+    if policy_type in ADAPTERS:
+        return ADAPTERS[policy_type](policy, options)
+    try:
+        check_trainable(policy)
+    except TypeError as error:
+        raise ValueError(
+            f"{error} There are adapters for --policy.type={', '.join(sorted(ADAPTERS))}. "
+            "--algorithm.type=imitation learns with any policy that lerobot-train trains."
+        ) from error
+    return policy
+
+
+def trained_tensors(policy: Any) -> Iterable[Tensor]:
+    """The parameters of a trainable policy, those beside an adapter's among them, that have a gradient."""
+    return (param for param in policy.parameters() if param.requires_grad)
