@@ -188,7 +188,7 @@ class Bench:
         """Mean |log ratio| before the first update: what the network's format leaves of 0 [nats]."""
         batch = self.observe(self.args.streams)
         sample = self.policy.sample_actions(batch)
-        again = self.policy.evaluate_actions(batch, sample["tokens"])
+        again = self.policy.evaluate_actions(batch, sample["trace"])
         return float((again["log_prob"] - sample["log_prob"]).abs().mean())
 
     def backward(self, batch: dict[str, Any]) -> None:

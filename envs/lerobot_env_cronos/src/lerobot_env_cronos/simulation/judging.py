@@ -191,9 +191,10 @@ class Judge:
         return (self.rests[:, i] == place) & (self.carried_to[:, i] == place)
 
     def is_on_table(self, obj: str) -> np.ndarray:
-        """The object was released, came to rest on the table and has not left it, no receptacle carrying any of it
-        (n,)."""
-        return self.rests[:, self.scene.objects.index(obj)] == ON_TABLE
+        """The object was released, came to rest on the table, no receptacle carrying any of it, has not left it and
+        is in no hand again (n,)."""
+        i = self.scene.objects.index(obj)
+        return (self.rests[:, i] == ON_TABLE) & ~self.grasped[:, i]
 
     def get_state(self) -> dict[str, np.ndarray]:
         """What the next reading depends on, as arrays with a leading dimension n."""

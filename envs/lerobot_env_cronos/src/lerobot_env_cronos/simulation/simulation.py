@@ -115,7 +115,7 @@ class Simulation:
         return broken
 
     def _limit_body_speeds(self, ids: np.ndarray) -> None:
-        velocity = self.qvel[ids, NUM_ROBOT_JOINTS:].reshape(len(ids), -1, 2, 3)
+        velocity = self.qvel[ids, NUM_ROBOT_JOINTS:].reshape(len(ids), len(self.scene.bodies), 2, 3)
         # No component is above limit / sqrt(3): hardly ever is there more to look at.
         if (np.abs(velocity) < _SLOW_COMPONENTS).all():
             return
