@@ -191,7 +191,7 @@ class Judge:
         return (self.rests[:, i] == place) & (self.carried_to[:, i] == place)
 
     def is_on_table(self, obj: str) -> np.ndarray:
-        """The object was released, came to rest on the table, no receptacle carrying any of it, has not left it and
+        """It was released, came to rest on the table, no receptacle carrying any of it, has not left it and
         is in no hand again (n,)."""
         i = self.scene.objects.index(obj)
         return (self.rests[:, i] == ON_TABLE) & ~self.grasped[:, i]
