@@ -130,9 +130,9 @@ def test_agent_of_the_docs(tmp_path):
 
 
 def test_policy_of_another_kind_is_refused(tmp_path, monkeypatch):
-    with pytest.raises(SystemExit, match=r"^error: .*sample_actions.*--algorithm.type=imitation"):
+    with pytest.raises(SystemExit, match=r"^error: .*sample_actions.*--policy.type=act.*=imitation"):
         cronos_train(
-            monkeypatch, "--policy.type=act", "--policy.device=cpu", "--policy.pretrained_backbone_weights=null",
+            monkeypatch, "--policy.type=vqbet", "--policy.device=cpu", "--policy.pretrained_backbone_weights=null",
             "--env.type=cronos", "--num_envs=2", f"--output_dir={tmp_path / 'run'}",
         )  # fmt: skip
 
