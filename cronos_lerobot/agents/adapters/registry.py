@@ -18,6 +18,8 @@ class AdapterOptions:
 
     noise_std: float = 0.1
     """Standard deviation at the start, in normalised units, of the noise that an adapter adds to actions."""
+    noise_level: float = 0.5
+    """Noise of a flow policy's denoising; 0 has none, 1 about that of the policy's own first noise."""
 
 
 class Adapter(nn.Module):

@@ -65,6 +65,7 @@ RANGES = {
     "weight_decay": FROM_0,
     "temperature": ABOVE_0,
     "noise_std": ABOVE_0,
+    "noise_level": ABOVE_0,
 }
 """Valid values of the numbers; those that may be null are free to be."""
 
@@ -140,6 +141,8 @@ class PPOConfig(RLAlgorithmConfig):
     noise_std: float = 0.1
     """Standard deviation at the start, in normalised units, of the noise around the actions of a policy that has
     none of its own (ACT); it is learned."""
+    noise_level: float = 0.5
+    """Noise of the denoising of a flow policy (PocketVLA's flow head, SmolVLA, pi0), which has none of its own."""
 
     def __post_init__(self) -> None:
         for name, interval in RANGES.items():

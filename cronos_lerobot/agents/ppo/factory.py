@@ -19,7 +19,8 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
     Raises:
         ValueError: the policy does not say how likely its decisions were, or decides beyond a task switch.
     """
-    policy = make_trainable(context.policy, AdapterOptions(noise_std=context.config.noise_std))
+    options = AdapterOptions(noise_std=context.config.noise_std, noise_level=context.config.noise_level)
+    policy = make_trainable(context.policy, options)
     if isinstance(policy, Adapter):
         context.processes.copy_from_main([*policy.own_parameters().values()])
     mine = context.streams
