@@ -1,6 +1,5 @@
 """Queues and histories of streams that begin at different times."""
 
-from importlib.util import find_spec
 from types import SimpleNamespace
 
 import pytest
@@ -102,8 +101,6 @@ def observations(steps, streams):
 @pytest.mark.parametrize("name", TINY)
 @torch.no_grad()
 def test_streams_in_step_do_what_lerobots_select_action_does(name):
-    if name == "diffusion" and find_spec("diffusers") is None:
-        pytest.skip("diffusers is not installed")
     policy = tiny(name)
     policy.reset()
     torch.manual_seed(5)
