@@ -75,6 +75,7 @@ def test_without_noise_it_is_lerobots_integration(options):
     # Two of three steps are played, two of four dimensions are the action's.
     assert torch.equal(sample["actions"], own[:, :2, :2])
     assert torch.equal(sample["log_prob"], torch.zeros(5, 10))
+    assert torch.equal(adapter.denoise(None, noise), own[:, :2, :2])
 
 
 def test_likelihood_of_a_chain_by_hand():

@@ -91,6 +91,13 @@ class FlowAdapter(Adapter):
         actions = self.scored(chain[:, -1])
         return {"actions": actions, "trace": chain, "log_prob": log_prob, "value": self.critic(features)}
 
+    def denoise(self, context: Any, noise: Tensor) -> Tensor:
+        """See `Steerable`."""
+        step, x = self._step(context, 0.0), noise
+        for k in range(self.num_steps):
+            x = step(k, x)[0]
+        return self.scored(x)
+
     def evaluate_actions(
         self, batch: Batch, trace: Tensor, *, temperature: float = 1.0
     ) -> dict[str, Tensor | None]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
-from cronos_lerobot.agents.base import TrainablePolicy, check_trainable
+from cronos_lerobot.agents.base import Batch, TrainablePolicy, check_trainable
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,24 @@ class Adapter(nn.Module):
             own[name].copy_(param)
 
 
+@runtime_checkable
+class Steerable(Protocol):
+    """A policy, or an adapter, whose actions follow from a noise that can be chosen, as of flows and diffusions."""
+
+    decision_steps: int
+    """n, how many actions it decides on at once."""
+    shape: tuple[int, int]
+    """(H, D) of the noise of a chunk; dimensions beyond those of the action are padding."""
+
+    def observe(self, batch: Batch) -> tuple[Any, Tensor]:
+        """Return what `denoise` needs of an observation, in any type, and its features (B, F), detached."""
+        ...
+
+    def denoise(self, context: Any, noise: Tensor) -> Tensor:
+        """Return the actions (B, n, A), normalised, that the policy itself makes of a noise (B, H, D)."""
+        ...
+
+
 AdapterFactory = Callable[[Any, AdapterOptions], Adapter]
 
 ADAPTERS: dict[str, AdapterFactory] = {}
@@ -101,6 +119,26 @@ def make_trainable(policy: Any, options: AdapterOptions) -> Any:
             "--algorithm.type=imitation learns with any policy that lerobot-train trains."
         ) from error
     return policy
+
+
+def make_steerable(policy: Any) -> Any:
+    """Return `policy` if it is Steerable, or its adapter.
+
+    Raises:
+        ValueError: neither is; the message names the types of policies that are.
+    """
+    policy_type = getattr(policy.config, "type", None)
+    if isinstance(policy, Steerable):
+        return policy
+    if policy_type in ADAPTERS and isinstance(
+        adapter := ADAPTERS[policy_type](policy, AdapterOptions()), Steerable
+    ):
+        return adapter
+    types = sorted(name for name, factory in ADAPTERS.items() if hasattr(factory, "denoise"))
+    raise ValueError(
+        f"--policy.type={policy_type} has no noise that could be chosen: --algorithm.type=steering is for flow and "
+        f"diffusion policies, {', '.join(types)}. Others learn with --algorithm.type=ppo or imitation."
+    )
 
 
 def trained_tensors(policy: Any) -> Iterable[Tensor]:
