@@ -60,7 +60,7 @@ class Adapter(nn.Module):
 
 @runtime_checkable
 class Steerable(Protocol):
-    """A policy, or an adapter, whose actions follow from a noise that can be chosen, as of flows and diffusions."""
+    """A policy, or an adapter, whose actions follow from a noise that can be chosen: a flow or a diffusion."""
 
     decision_steps: int
     """n, how many actions it decides on at once."""
@@ -136,8 +136,8 @@ def make_steerable(policy: Any) -> Any:
         return adapter
     types = sorted(name for name, factory in ADAPTERS.items() if hasattr(factory, "denoise"))
     raise ValueError(
-        f"--policy.type={policy_type} has no noise that could be chosen: --algorithm.type=steering is for flow and "
-        f"diffusion policies, {', '.join(types)}. Others learn with --algorithm.type=ppo or imitation."
+        f"--policy.type={policy_type} has no noise that could be chosen: --algorithm.type=steering is for flow "
+        f"and diffusion policies, {', '.join(types)}. Others learn with --algorithm.type=ppo or imitation."
     )
 
 

@@ -10,6 +10,7 @@ import torch
 
 from cronos_lerobot.agents.adapters.registry import Adapter, trained_tensors
 from cronos_lerobot.agents.base import ActionSample, Columns, Decision, LearningAgent, decision_steps
+from cronos_lerobot.agents.decisions import DecisionClock
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
 from cronos_lerobot.agents.ppo.state import join_rollouts, set_optimizer
@@ -21,9 +22,7 @@ from cronos_lerobot.stopwatch import Stopwatch
 class PPOAgent(LearningAgent):
     """Acts, stores and updates.
 
-    All streams decide at the same control steps, on n actions that are played open loop. A stream that diverges in
-    between has ended its decision there; it decides anew, and what it does until the others decide, at most n - 1
-    steps, is not learned from.
+    When streams decide, and what is learned from: see `DecisionClock`.
 
     Args:
         ppo: holds the policy, its processors and the optimizer.
@@ -49,7 +48,7 @@ class PPOAgent(LearningAgent):
         self.stopwatch = stopwatch or Stopwatch()
         self.streams = streams
         self.num_steps = decision_steps(ppo.policy)
-        self._step = 0
+        self.clock = DecisionClock(self.num_steps)
         self._encoded: Columns = {}
         self._decision: Decision | None = None
         # Dropout and the like stay off in the update too, or the ratio would not be 1 before its first step.
@@ -60,13 +59,12 @@ class PPOAgent(LearningAgent):
         """The next action of each of its streams; a decision where none is left."""
         tau = tau[self.streams]
         with self.stopwatch("infer"):
-            if self._step == 0:
+            if self.clock.step == 0:
                 self._begin(*self._decide(observation_columns(o_t), tau))
-            elif self._fresh.any():
+            elif self.clock.fresh.any():
                 self._decide_anew(observation_columns(o_t), tau)
             assert self._decision is not None
-            everyone = np.arange(len(tau))
-            action = self._actions[everyone, self._step - self._since]
+            action = self.clock.action()
             log_prob = self._decision.log_prob
             return ActionSample(action, log_prob.reshape(len(tau), -1).sum(1), self._decision.value)
 
@@ -86,24 +84,17 @@ class PPOAgent(LearningAgent):
         """
         mine = self.streams
         tau, r_t, cut_t, diverged_t = tau[mine], r_t[mine], cut_t[mine], diverged_t[mine]
-        self._reward += np.where(self._open, self.ppo.config.gamma**self._step * r_t, 0.0)
-        self._duration += self._open
-        cut = self._open & cut_t
-        if (cut & ~diverged_t).any():
-            self._bootstrap = np.where(cut & ~diverged_t, self._values(o_tp1, tau), self._bootstrap)
-        if (cut & diverged_t).any():
-            before = a_t.value if self._step == 0 else self._values(o_t, tau)
-            self._bootstrap = np.where(cut & diverged_t, before, self._bootstrap)
-        self._cut |= cut
-        self._open &= ~cut_t
-        self._fresh = cut_t.copy()
-        self._step += 1
-        if self._step == self.num_steps:
+        is_first, clock = self.clock.step == 0, self.clock
+        is_over = clock.store(
+            r_t, cut_t, diverged_t, self.ppo.config.gamma,
+            before=lambda: a_t.value if is_first else self._values(o_t, tau),
+            after=lambda: self._values(o_tp1, tau),
+        )  # fmt: skip
+        if is_over:
             assert self._decision is not None
             self.buffer.add(
-                self._encoded, tau, self._decision, self._reward, self._cut, self._bootstrap, self._duration
+                self._encoded, tau, self._decision, clock.reward, clock.cut, clock.following, clock.duration
             )
-            self._step = 0
 
     def update(self) -> dict[str, float]:
         """Learn from the buffer and clear it."""
@@ -159,22 +150,16 @@ class PPOAgent(LearningAgent):
 
     def _begin(self, encoded: Columns, decision: Decision) -> None:
         """All streams have decided."""
-        n = len(decision.value)
         # The environment may write the next observation where this one lies.
         self._encoded = {name: col.copy() for name, col in encoded.items()} if self.num_steps > 1 else encoded
-        self._decision, self._actions = decision, decision.actions
-        self._since = np.zeros(n, np.int64)
-        self._reward, self._bootstrap = np.zeros(n), np.zeros(n, np.float32)
-        self._duration = np.zeros(n, np.int64)
-        self._cut, self._fresh, self._open = np.zeros(n, bool), np.zeros(n, bool), np.ones(n, bool)
+        self._decision = decision
+        self.clock.begin(decision.actions)
 
     def _decide_anew(self, columns: Columns, tau: list[str]) -> None:
         """Streams whose decision ended too early decide on what they do until the others decide."""
-        who = np.flatnonzero(self._fresh)
+        who = np.flatnonzero(self.clock.fresh)
         _, decision = self._decide({name: col[who] for name, col in columns.items()}, [tau[i] for i in who])
-        self._actions = self._actions.copy()
-        self._actions[who] = decision.actions
-        self._since[who] = self._step
+        self.clock.begin_anew(decision.actions)
 
     @torch.inference_mode()
     def _values(self, observation: dict[str, Any], tau: list[str]) -> np.ndarray:
