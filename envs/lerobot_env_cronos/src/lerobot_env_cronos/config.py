@@ -75,7 +75,7 @@ class CronosEnvConfig(EnvConfig):
     """Of observations and videos: classic (OpenGL), or filament (physically based, with shadows; needs Vulkan, and
     is slow without a GPU)."""
     num_threads: int = 0
-    """Physics threads, 0 for all cores; results are the same at any number."""
+    """Physics threads, and processes that draw in software; 0 for all cores; results do not depend on it."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
 

@@ -36,7 +36,8 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         camera_name: camera(s) of the observation, comma-separated: `front`, `bridge`.
         reward: `level` pays 0.1 while the right object is grasped and 1.0 on success each step (paper, Section
             4); `difference` pays the change of that level between two steps (RL4VLA's code).
-        num_threads: physics threads, 0 for all cores; results do not depend on it.
+        num_threads: physics threads, and processes that draw in software; 0 for all cores; results do not depend
+            on it.
         render_size: (height, width) of `render()` [px].
         renderer: `classic` (OpenGL) or `filament` (physically based, with shadows; slow without a GPU), of
             observations and of `render()`.

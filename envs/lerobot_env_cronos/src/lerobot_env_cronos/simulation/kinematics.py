@@ -30,26 +30,44 @@ def forward_kinematics(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     n = len(q)
     R = np.broadcast_to(np.eye(3), (n, 3, 3))
     p = np.zeros((n, 3))
-    origins, axes = np.empty((6, n, 3)), np.empty((6, n, 3))
-    cos, sin = np.cos(q), np.sin(q)
+    origins, axes = np.empty((6, 3, n)), np.empty((6, 3, n))
+    turns = _joint_rotations(q)
     for j in range(6):
         p = p + R @ _OFFSETS[j]
-        origins[j], axes[j] = p, R[:, :, _AXIS_INDEX[j]]
-        R = R @ _axis_rotation(_AXIS_INDEX[j], cos[:, j], sin[:, j])
+        origins[j], axes[j] = p.T, R[:, :, _AXIS_INDEX[j]].T
+        R = R @ turns[j]
     p = p + R @ EE_OFFSET
-    jacobian = np.empty((n, 6, 6))
-    jacobian[:, :3] = np.cross(axes, p - origins).transpose(1, 2, 0)
-    jacobian[:, 3:] = axes.transpose(1, 2, 0)
-    return p, R, jacobian
+    (ax, ay, az), (x, y, z) = axes.swapaxes(0, 1), (p.T - origins).swapaxes(0, 1)
+    # The cross product of each axis with its lever, written out: this is called several times a control step.
+    linear = np.stack([ay * z - az * y, az * x - ax * z, ax * y - ay * x])
+    jacobian = np.concatenate([linear, axes.swapaxes(0, 1)]).transpose(2, 0, 1)
+    return p, R, np.ascontiguousarray(jacobian)
 
 
-def _axis_rotation(axis: int, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
-    R = np.zeros((len(cos), 3, 3))
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    R[:, axis, axis] = 1.0
-    R[:, i, i], R[:, j, j] = cos, cos
-    R[:, i, j], R[:, j, i] = -sin, sin
-    return R
+def _joint_rotations(q: np.ndarray) -> np.ndarray:
+    """Rotations (6, n, 3, 3) of the joints at positions (n, 6)."""
+    joints, k = np.arange(6), _AXIS_INDEX
+    i, j = (k + 1) % 3, (k + 2) % 3
+    cos, sin = np.cos(q).T, np.sin(q).T
+    turns = np.zeros((6, len(q), 3, 3))
+    turns[joints, :, k, k] = 1.0
+    turns[joints, :, i, i] = turns[joints, :, j, j] = cos
+    turns[joints, :, i, j], turns[joints, :, j, i] = -sin, sin
+    return turns
+
+
+class LastPose:
+    """`forward_kinematics` that remembers its last answer: a control step asks for the same arm more than once."""
+
+    def __init__(self) -> None:
+        self._q = np.empty((0, 6))
+        self._pose = forward_kinematics(self._q)
+
+    def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `forward_kinematics`; what it returns must not be changed."""
+        if not np.array_equal(q, self._q):
+            self._q, self._pose = q.copy(), forward_kinematics(q)
+        return self._pose
 
 
 def rotation_vector_to_matrix(w: np.ndarray) -> np.ndarray:
@@ -92,7 +110,12 @@ def _skew(w: np.ndarray) -> np.ndarray:
 
 
 def inverse_kinematics(
-    q: np.ndarray, p_target: np.ndarray, R_target: np.ndarray, iterations: int = 4, damping: float = 0.02
+    q: np.ndarray,
+    p_target: np.ndarray,
+    R_target: np.ndarray,
+    iterations: int = 4,
+    damping: float = 0.02,
+    pose: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
 ) -> np.ndarray:
     """Damped least squares from `q` towards a target pose (Nakamura and Hanafusa 1986).
 
@@ -100,12 +123,15 @@ def inverse_kinematics(
         q: (n, 6) joint positions to start from [rad].
         p_target: (n, 3) [m].
         R_target: (n, 3, 3).
+        iterations: steps towards it.
+        damping: of the least squares.
+        pose: `forward_kinematics(q)`, if it is known.
 
     Returns:
         (n, 6) joint positions between TARGET_LOW and TARGET_HIGH; the closest that `iterations` steps found.
     """
-    for _ in range(iterations):
-        p, R, jacobian = forward_kinematics(q)
+    for k in range(iterations):
+        p, R, jacobian = pose if k == 0 and pose is not None else forward_kinematics(q)
         error = np.concatenate([p_target - p, matrix_to_rotation_vector(R_target @ R.transpose(0, 2, 1))], axis=1)
         # Rotations weigh 0.3 m/rad, so that a position error is not traded for a tiny rotation error.
         weight = np.array([1, 1, 1, 0.3, 0.3, 0.3])

@@ -144,7 +144,8 @@ class ObservationBuilder:
     def _renderer(self, size: tuple[int, int], camera: str) -> BatchRenderer:
         key = (size, camera)
         if key not in self._renderers:
-            self._renderers[key] = make_renderer(self.renderer, self.simulation.render_model, *size, camera)
+            model, processes = self.simulation.render_model, self.simulation.num_threads
+            self._renderers[key] = make_renderer(self.renderer, model, *size, camera, processes)
         return self._renderers[key]
 
     def __getstate__(self) -> dict[str, Any]:

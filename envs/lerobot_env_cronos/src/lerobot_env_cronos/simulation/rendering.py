@@ -7,6 +7,7 @@ once.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import weakref
 from concurrent.futures import ThreadPoolExecutor
@@ -16,9 +17,13 @@ import mujoco
 import numpy as np
 
 from lerobot_env_cronos.simulation import gl
+from lerobot_env_cronos.simulation.canvas import Canvas
 from lerobot_env_cronos.simulation.filament import FilamentRenderer
+from lerobot_env_cronos.simulation.render_pool import MIN_FRAMES, RenderPool
 
 RENDERERS = ("classic", "filament")
+SOFTWARE = "llvmpipe"
+"""Mesa's rasteriser, by OpenGL's name of what it draws with."""
 
 _GL_THREAD = ThreadPoolExecutor(1, thread_name_prefix="opengl")
 
@@ -34,8 +39,17 @@ class BatchRenderer(Protocol):
         """Free what it draws with."""
 
 
-def make_renderer(name: str, model: mujoco.MjModel, height: int, width: int, camera: str) -> BatchRenderer:
+def make_renderer(
+    name: str, model: mujoco.MjModel, height: int, width: int, camera: str, processes: int = 1
+) -> BatchRenderer:
     """Return the renderer `name` of `RENDERERS` for one camera and size.
+
+    Args:
+        name: see above.
+        model: what to draw.
+        height, width: of a frame [px].
+        camera: name of the camera.
+        processes: for many frames at a time, where OpenGL draws in software; the frames do not depend on it.
 
     Raises:
         KeyError: the model has no such camera.
@@ -43,7 +57,7 @@ def make_renderer(name: str, model: mujoco.MjModel, height: int, width: int, cam
     """
     gl.claim_process()
     if name == "classic":
-        return ClassicRenderer(model, height, width, camera)
+        return ClassicRenderer(model, height, width, camera, processes=processes)
     return FilamentRenderer(model, height, width, camera)
 
 
@@ -58,49 +72,58 @@ class ClassicRenderer:
         RuntimeError: no OpenGL context can be opened.
     """
 
-    def __init__(self, model: mujoco.MjModel, height: int, width: int, camera: str, *, shadows: bool = False):
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        height: int,
+        width: int,
+        camera: str,
+        *,
+        shadows: bool = False,
+        processes: int = 1,
+    ):
         self.model, self.height, self.width = model, height, width
         self.camera = model.camera(camera).id
-        self._data = mujoco.MjData(model)
-        self._renderer = _GL_THREAD.submit(_open, model, height, width, shadows).result()
-        self._finalizer = weakref.finalize(self, _close, self._renderer, os.getpid())
+        self._canvas = _GL_THREAD.submit(_open, model, height, width, self.camera, shadows).result()
+        self._finalizer = weakref.finalize(self, _close, self._canvas, os.getpid())
+        in_software = processes > 1 and SOFTWARE in _GL_THREAD.submit(self._canvas.driver).result()
+        self._processes = processes if in_software and not shadows else 1
+        self._pool: RenderPool | None = None
 
     def render(self, qpos: np.ndarray) -> np.ndarray:
         """Render states `qpos` (n, nq) to uint8 frames (n, height, width, 3)."""
         gl.claim_process()
-        return _GL_THREAD.submit(self._render, qpos).result()
-
-    def _render(self, qpos: np.ndarray) -> np.ndarray:
+        if self._processes > 1 and len(qpos) >= MIN_FRAMES * self._processes:
+            return self._pool_for(len(qpos)).render(qpos)
         frames = np.empty((len(qpos), self.height, self.width, 3), np.uint8)
-        for frame, q in zip(frames, qpos, strict=True):
-            self._data.qpos[:] = q
-            mujoco.mj_kinematics(self.model, self._data)
-            mujoco.mj_camlight(self.model, self._data)
-            self._renderer.update_scene(self._data, camera=self.camera)
-            self._renderer.render(out=frame)
+        _GL_THREAD.submit(self._canvas.draw, qpos, frames).result()
         return frames
 
+    def _pool_for(self, count: int) -> RenderPool:
+        if self._pool is None or count > self._pool.capacity:
+            if self._pool is not None:
+                self._pool.close()
+            self._pool = RenderPool(self.model, self.height, self.width, self.camera, self._processes, count)
+        return self._pool
+
     def close(self) -> None:
-        """Free the OpenGL context; also done when the renderer is garbage-collected."""
+        """Free the OpenGL context and end the processes; also done when the renderer is garbage-collected."""
+        if self._pool is not None:
+            self._pool.close()
         self._finalizer()
 
 
-def _open(model: mujoco.MjModel, height: int, width: int, shadows: bool) -> mujoco.Renderer:
+def _open(model: mujoco.MjModel, height: int, width: int, camera: int, shadows: bool) -> Canvas:
     try:
-        renderer = mujoco.Renderer(model, height, width, max_geom=500)
+        return Canvas(model, height, width, camera, shadows)
     except Exception as error:  # The platforms raise whatever their bindings do.
         raise RuntimeError(gl.HELP.format(platform=os.environ.get("MUJOCO_GL"))) from error
-    renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
-    renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = shadows
-    return renderer
 
 
-def _close(renderer: mujoco.Renderer, opened_by: int) -> None:
+def _close(canvas: Canvas, opened_by: int) -> None:
     # A forked process has neither the thread nor the context.
     if opened_by != os.getpid():
         return
     # Nobody waits for it: the garbage collector may run in the OpenGL thread itself.
-    try:
-        _GL_THREAD.submit(renderer.close)
-    except RuntimeError:  # At interpreter exit the thread is gone, and so is its hold on the context.
-        renderer.close()
+    with contextlib.suppress(RuntimeError):  # At interpreter exit the thread is gone, and soon the context.
+        _GL_THREAD.submit(canvas.close)

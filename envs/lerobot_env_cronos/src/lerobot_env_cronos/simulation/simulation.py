@@ -5,6 +5,7 @@ previous target, not to the measured pose) and a gripper command. Targets become
 kinematics and are ramped over most of the control step.
 """
 
+import os
 from functools import cached_property
 
 import mujoco
@@ -17,7 +18,7 @@ from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, FINGER_CLOSED, FINGE
 from lerobot_env_cronos.scene.scenes import Scene
 from lerobot_env_cronos.simulation.judging import Judge
 from lerobot_env_cronos.simulation.kinematics import (
-    forward_kinematics,
+    LastPose,
     inverse_kinematics,
     quaternion_to_matrix,
     rotation_vector_to_matrix,
@@ -40,10 +41,16 @@ SETTLE_MAX_CHUNKS, SETTLE_SPEED = 10, 0.02
 """After an arm teleport bodies fall for at most 1 s, checked every 0.1 s, until slower than 0.02 m/s."""
 
 
+def _num_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class Simulation:
     """`num_sims` copies of `scene`, stepped together on `num_threads` threads (bit-identical at any number).
 
-    Attributes are live arrays: `qpos` (n, nq), `qvel` (n, nv), `sensordata` (n, nsensor).
+    Attributes are live arrays: `qpos` (n, nq), `qvel` (n, nv), `sensordata` (n, nsensor). `num_threads` is at
+    least 1, with all cores counted.
     """
 
     def __init__(self, scene: Scene, num_sims: int, num_threads: int = 0, physics: Physics = PHYSICS):
@@ -51,6 +58,7 @@ class Simulation:
             raise ValueError(f"num_threads must be 0 (all cores) or more, got {num_threads}")
         self.scene, self.physics = scene, physics
         self.num_sims = num_sims
+        self.num_threads = num_threads or _num_cores()
         self.model = build_model(scene, looks=False, physics=physics)
         self._batch = Batch(self.model, num_sims, num_threads, persistent=True)
         self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
@@ -62,6 +70,7 @@ class Simulation:
         self._sensor_slice = self._find_sensors()
         self.arm_target = np.tile(HOME_QPOS, (num_sims, 1))
         self.gripper_target = np.full(num_sims, FINGER_OPEN)
+        self._measured_pose, self._target_pose = LastPose(), LastPose()
         self.judge = Judge(scene, self.model, self.sensordata, self.qpos)
 
     @cached_property
@@ -130,12 +139,12 @@ class Simulation:
         self.qvel[ids[mine], NUM_ROBOT_JOINTS:] = limited.reshape(len(limited), -1)
 
     def _next_arm_target(self, q: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        p, R, _ = forward_kinematics(q)
+        pose = p, R, _ = self._target_pose(q)
         R = rotation_vector_to_matrix(actions[:, 3:6]) @ R
         p = np.clip(p + actions[:, :3], EE_LOW, EE_HIGH)
         # The fingertips' target stays above the table, however the hand is tilted.
         p[:, 2] = np.maximum(p[:, 2], 0.001 - FINGERTIP_REACH * np.minimum(R[:, 2, 0], 0.0))
-        return inverse_kinematics(q, p, R)
+        return inverse_kinematics(q, p, R, pose=pose)
 
     def _is_diverged(self, ids: np.ndarray) -> np.ndarray:
         finite = np.isfinite(self.qpos[ids]).all(1) & np.isfinite(self.qvel[ids]).all(1)
@@ -212,12 +221,12 @@ class Simulation:
 
     def end_effector(self) -> tuple[np.ndarray, np.ndarray]:
         """Measured pose of the end-effector site: p_we (n, 3) [m] and R_we (n, 3, 3)."""
-        p, R, _ = forward_kinematics(self.qpos[:, :NUM_ARM_JOINTS])
+        p, R, _ = self._measured_pose(self.qpos[:, :NUM_ARM_JOINTS])
         return p, R
 
     def target_position(self) -> np.ndarray:
         """Position of the end effector's target (n, 3) [m]."""
-        return forward_kinematics(self.arm_target)[0]
+        return self._target_pose(self.arm_target)[0]
 
     def gripper_opening(self) -> np.ndarray:
         """Opening of the gripper (n,), 0 closed to 1 open."""
@@ -238,7 +247,7 @@ class Simulation:
 
     def _read(self, ids: np.ndarray, *, settled: bool = False) -> None:
         """Let the judge see the simulations `ids` as they are now."""
-        _, R, _ = forward_kinematics(self.qpos[ids, :NUM_ARM_JOINTS])
+        _, R, _ = self._measured_pose(self.qpos[ids, :NUM_ARM_JOINTS])
         self.judge.read(ids, R[:, :, 1], settled=settled)
 
     def is_grasped(self, obj: str) -> np.ndarray:

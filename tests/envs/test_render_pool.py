@@ -1,0 +1,82 @@
+"""Drawing in processes of their own: the same frames, and nothing left behind."""
+
+import contextlib
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos.simulation.render_pool import MIN_FRAMES, RenderPool
+from lerobot_env_cronos.simulation.rendering import ClassicRenderer
+
+SIZE = (48, 64)
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    env = CronosVectorEnv(5, obs_type="environment_state_agent_pos")
+    env.reset(seed=0)
+    return env.simulation
+
+
+@pytest.fixture
+def pool(simulation):
+    model = simulation.render_model
+    pool = RenderPool(model, *SIZE, model.camera("front").id, processes=2, capacity=5)
+    yield pool
+    pool.close()
+
+
+def children() -> set[int]:
+    """Drawing processes of this one."""
+    pids = set()
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            parent = (folder / "stat").read_text().rsplit(")", 1)[1].split()[1]
+            if int(parent) == os.getpid() and b"canvas.py" in (folder / "cmdline").read_bytes():
+                pids.add(int(folder.name))
+    return pids
+
+
+def test_frames_are_those_of_one_process(simulation, pool):
+    alone = ClassicRenderer(simulation.render_model, *SIZE, "front").render(simulation.qpos)
+    assert len(np.unique(alone.reshape(-1, 3), axis=0)) > 50  # A picture, not an empty canvas.
+    assert np.array_equal(pool.render(simulation.qpos), alone)
+    assert np.array_equal(pool.render(simulation.qpos[3:]), alone[3:])
+
+
+def test_a_renderer_hands_over_what_is_worth_it(simulation):
+    renderer = ClassicRenderer(simulation.render_model, *SIZE, "front", processes=2)
+    if renderer._processes == 1:
+        pytest.skip("drawn by a GPU, which needs no processes")
+    before = children()
+    few = renderer.render(simulation.qpos)
+    assert children() == before
+    many = np.tile(simulation.qpos, (2 * MIN_FRAMES, 1))
+    frames = renderer.render(many)
+    assert len(children() - before) == 2
+    assert np.array_equal(frames, np.tile(few, (2 * MIN_FRAMES, 1, 1, 1)))
+    renderer.close()
+    assert children() == before
+
+
+def test_a_killed_process_is_an_error_and_not_a_wait(simulation, pool):
+    os.kill(pool._processes[1].pid, signal.SIGKILL)
+    with pytest.raises(RuntimeError, match=r"a rendering process ended \(-9\)"):
+        pool.render(simulation.qpos)
+
+
+def test_a_process_that_cannot_draw_says_why(simulation, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "no such platform")
+    model = simulation.render_model
+    with pytest.raises(RuntimeError, match="no such platform"):
+        RenderPool(model, *SIZE, model.camera("front").id, processes=1, capacity=5)
+
+
+def test_they_end_with_the_process_that_asked(pool):
+    """However it dies, its end of the pipes is closed."""
+    for process in pool._processes:
+        process.stdin.close()
+        assert process.wait(timeout=20) == 0
