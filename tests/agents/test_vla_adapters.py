@@ -1,0 +1,264 @@
+"""SmolVLA, pi0 and pi0.5 as policies that PPO can train, against LeRobot's own classes on tiny checkpoints."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tiny_vlas import CHUNK, DIMS, KINDS, PADDED, PLAYED, STATE, STEPS, make_batch, make_processors, make_vla, save_vla
+
+from cronos_lerobot.agents.adapters.registry import AdapterOptions, make_trainable
+from cronos_lerobot.agents.chunk_player import take_rows
+from cronos_lerobot.agents.ppo import factory  # noqa: F401 -- registers the adapters
+from cronos_lerobot.agents.ppo.agent import PPOAgent
+from cronos_lerobot.agents.ppo.config import PPOConfig
+from cronos_lerobot.agents.ppo.ppo import PPO
+from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
+from cronos_lerobot.agents.processing import make_processors as around
+from cronos_lerobot.agents.processing import observation_columns
+
+OPTIONS = AdapterOptions(noise_level=0.8)
+THAWED = {"smolvla": {"train_expert_only": False, "freeze_vision_encoder": False}}
+"""What makes the vision-language model trainable; that of pi0 is by default."""
+FROZEN = {"train_expert_only": True, "freeze_vision_encoder": True}
+NOISE = (3, CHUNK, PADDED)
+
+
+def generator(seed=2):
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.fixture(params=KINDS)
+def kind(request):
+    return request.param
+
+
+@pytest.fixture
+def adapter(kind, tmp_path):
+    return make_trainable(make_vla(kind, tmp_path, **THAWED.get(kind, {})), OPTIONS)
+
+
+@torch.no_grad()
+def test_without_noise_it_acts_as_lerobots_select_action(adapter):
+    batch, noise = make_batch(), torch.randn(NOISE, generator=generator())
+    actions = adapter.sample_actions(batch, temperature=0, noise=noise)["actions"]
+    assert adapter.decision_steps == PLAYED
+    assert actions.shape == (3, PLAYED, DIMS)
+    chunk = adapter.policy.predict_action_chunk(dict(batch), noise=noise)
+    assert torch.equal(actions, chunk[:, :PLAYED])
+    # Its noise comes from LeRobot's own source, and the chunk is played one by one.
+    torch.manual_seed(7)
+    noise = torch.randn(NOISE)
+    torch.manual_seed(7)
+    adapter.policy.reset()
+    played = torch.stack([adapter.policy.select_action(dict(batch)) for _ in range(PLAYED)], 1)
+    assert torch.equal(adapter.sample_actions(batch, temperature=0, noise=noise)["actions"], played)
+    assert not torch.equal(played[0], played[1])
+
+
+def test_likelihoods_do_not_depend_on_the_batch(adapter):
+    batch = make_batch()
+    with torch.inference_mode():
+        sample = adapter.sample_actions(batch, generator=generator())
+    trace, log_prob = sample["trace"].clone(), sample["log_prob"].clone()
+    assert trace.shape == (3, STEPS + 1, CHUNK, PADDED)
+    assert log_prob.shape == (3, STEPS)
+    assert log_prob.unique().numel() == 3 * STEPS
+    torch.testing.assert_close(adapter.evaluate_actions(batch, trace)["log_prob"], log_prob, atol=1e-4, rtol=0)
+    for rows in ([1], [2, 0]):
+        some = take_rows(batch, rows)
+        # A tokenizer pads to the longest of the batch.
+        longest = int(some["observation.language.attention_mask"].sum(1).max())
+        for name in ("observation.language.tokens", "observation.language.attention_mask"):
+            some[name] = some[name][:, :longest]
+        again = adapter.evaluate_actions(some, trace[rows])
+        torch.testing.assert_close(again["log_prob"], log_prob[rows], atol=1e-4, rtol=0)
+
+
+def test_only_what_is_played_is_scored(adapter):
+    batch = make_batch()
+    with torch.no_grad():
+        sample = adapter.sample_actions(batch, generator=generator())
+        trace, log_prob = sample["trace"], sample["log_prob"]
+        assert torch.equal(sample["actions"], trace[:, -1, :PLAYED, :DIMS])
+        other = trace.clone()
+        other[:, -1, PLAYED:] += 1.0
+        other[:, -1, :, DIMS:] += 1.0
+        assert torch.equal(adapter.evaluate_actions(batch, other)["log_prob"], log_prob)
+        other[:, -1, PLAYED - 1, DIMS - 1] += 1.0
+        changed = adapter.evaluate_actions(batch, other)["log_prob"] != log_prob
+    assert changed.tolist() == [[False] * (STEPS - 1) + [True]] * 3
+
+
+def test_gradients_are_finite_differences(adapter):
+    batch = make_batch()
+    with torch.no_grad():
+        trace = adapter.sample_actions(batch, generator=generator())["trace"]
+
+    def log_prob():
+        return adapter.evaluate_actions(batch, trace)["log_prob"].double().sum()
+
+    log_prob().backward()
+    params = {name: p for name, p in adapter.policy.named_parameters() if p.grad is not None and p.grad.any()}
+    # Of the action expert, and through the cache of keys and values of the language model and the image encoder.
+    for part in (
+        "action_in_proj", "action_out_proj", r"expert\.(model\.)?layers\.1\.mlp",
+        r"(text|language)_model\.layers\.0\.self_attn\.k_proj", "vision_.*mlp",
+    ):  # fmt: skip
+        name = next(name for name in params if re.search(part, name) and "weight" in name)
+        param = params[name]
+        direction = param.grad / param.grad.norm()
+        step = min(2e-2, 0.05 / param.grad.norm().item())
+        ends = []
+        with torch.no_grad():
+            for sign in (1, -2):
+                param += sign * step * direction
+                ends.append(log_prob().item())
+            param += step * direction
+        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(param.grad.norm().item(), rel=2e-2), name
+
+
+def test_what_lerobot_freezes_stays_frozen(kind, tmp_path):
+    """Without a gradient, then, where nothing of the prefix is trained."""
+    batch = make_batch()
+    for options in (FROZEN, FROZEN | {"train_state_proj": False} if kind == "smolvla" else FROZEN):
+        adapter = make_trainable(make_vla(kind, tmp_path, **options), OPTIONS)
+        trained = {id(p) for p in adapter.rl_parameter_groups()[0]["params"]}
+        names = {name for name, p in adapter.named_parameters() if id(p) in trained}
+        assert not [name for name in names if "vlm." in name or "paligemma." in name]
+        assert [name for name in names if "expert" in name]
+        assert [name for name in names if "action_out_proj" in name]
+        prefix_is_trained = kind == "smolvla" and "train_state_proj" not in options
+        assert any("state_proj" in name for name in names) == (prefix_is_trained or kind == "pi0")
+        context, features = adapter.observe(batch)
+        assert context.hidden.requires_grad == prefix_is_trained
+        assert not features.requires_grad
+        trace = adapter.sample_actions(batch, generator=generator())["trace"].detach()
+        adapter.evaluate_actions(batch, trace)["log_prob"].sum().backward()
+        without = {name for name, p in adapter.named_parameters() if id(p) in trained and p.grad is None}
+        assert not [name for name in without if "lm_head" not in name], without
+
+
+def test_the_critic_sees_the_picture_the_instruction_and_the_state(adapter):
+    batch = make_batch()
+    torch.nn.init.normal_(adapter.critic.layers[-1].weight)
+    adapter.predict_values(batch).sum().backward()
+    assert all(p.grad is None for p in adapter.policy.parameters())
+    with torch.no_grad():
+        value = adapter.predict_values(batch)
+        torch.testing.assert_close(adapter.predict_values(adapter.value_inputs(batch)), value)
+        torch.testing.assert_close(adapter.sample_actions(batch)["value"], value)
+        for name in ("observation.state", "observation.images.front", "observation.language.tokens"):
+            other = batch | {name: batch[name].flip(0)}
+            assert (adapter.predict_values(other) - value)[0].abs() > 1e-4, name
+
+
+def test_aloha_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"adapt_to_pi_aloha=true turns actions into Aloha's joint angles"):
+        make_trainable(make_vla("smolvla", tmp_path, adapt_to_pi_aloha=True), OPTIONS)
+
+
+STATISTICS = {
+    "observation.state": {name: np.full(STATE, v, np.float32) for name, v in (("mean", 0.5), ("std", 2.0))},
+    "action": {name: np.full(DIMS, v, np.float32) for name, v in (("mean", -0.5), ("std", 0.1))},
+}
+for stats in STATISTICS.values():
+    stats |= {"q01": stats["mean"] - 2 * stats["std"], "q99": stats["mean"] + 2 * stats["std"]}
+TEXTS = ["put the cup on the plate", "put 3 in 4"]
+
+
+def observe(seed):
+    rng = np.random.default_rng(seed)
+    image = rng.integers(256, size=(2, 32, 32, 3), dtype=np.uint8)
+    return {"pixels": {"front": image}, "agent_pos": rng.normal(size=(2, STATE)).astype(np.float32)}
+
+
+def one_update(adapter, processors):
+    """PPO's agent on made-up streams: four decisions of two streams, paid for their first action."""
+    config = PPOConfig(epochs=1, value_warmup_updates=0, minibatch_size=8, ratio="factor", policy_lr=1e-3)
+    ppo = PPO(adapter, processors, config, np.random.default_rng(0))
+    agent = PPOAgent(ppo, RolloutBuffer(4, 2), generator())
+    nobody = np.zeros(2, bool)
+    for step in range(4 * PLAYED):
+        sample = agent.act(observe(step), TEXTS)
+        cut = np.full(2, step == 4 * PLAYED - 1)
+        agent.store(observe(step), TEXTS, sample, sample.action[:, 0], observe(step + 1), cut, nobody)
+    return agent.update()
+
+
+LOAD = """
+import sys, torch
+from pathlib import Path
+from tiny_pi0 import tiny_gemma
+from tiny_smolvla import pretend_num2words
+pretend_num2words()
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs import preprocess_observation
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.factory import get_policy_class
+
+for folder in sys.argv[1:]:
+    config = PreTrainedConfig.from_pretrained(folder)
+    with tiny_gemma():
+        policy = get_policy_class(config.type).from_pretrained(folder)
+    before, after = make_pre_post_processors(config, folder)
+    asked = torch.load(Path(folder) / "asked.pt", weights_only=False)
+    batch = before(preprocess_observation(asked["observation"]) | {"task": asked["task"]})
+    torch.save(after(policy.predict_action_chunk(batch, noise=asked["noise"])), Path(folder) / "answer.pt")
+assert not [name for name in sys.modules if name.startswith(("cronos", "lerobot_env_", "lerobot_policy_"))]
+"""
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Each policy cloned for a step, trained for an update, saved, and asked in a process that has only LeRobot."""
+    results = {}
+    for kind in KINDS:
+        folder = tmp_path_factory.mktemp(kind)
+        policy = make_vla(kind, folder)
+        pair = make_processors(policy, folder, STATISTICS)
+        processors = around(policy, *pair)
+        start = {name: p.clone() for name, p in policy.state_dict().items()}
+        policy.train()
+        batch = processors.batch(observation_columns(observe(0)), TEXTS) | {"action": torch.randn(2, CHUNK, DIMS)}
+        optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+        policy.forward(batch)[0].backward()
+        optimizer.step()
+        cloned = {name: p.clone() for name, p in policy.state_dict().items()}
+        adapter = make_trainable(policy, OPTIONS)
+        metrics = one_update(adapter, processors)
+        checkpoint = save_vla(policy, pair, folder / "checkpoint", folder)
+        noise = torch.randn((2, CHUNK, PADDED), generator=generator())
+        with torch.no_grad():
+            batch = processors.batch(observation_columns(observe(9)), TEXTS)
+            actions = adapter.sample_actions(batch, temperature=0, noise=noise)["actions"]
+        asked = {"observation": observe(9), "task": TEXTS, "noise": noise}
+        torch.save(asked, checkpoint / "asked.pt")
+        played = processors.physical_actions(actions.flatten(0, 1)).reshape(actions.shape)
+        results[kind] = (checkpoint, start, cloned, dict(policy.state_dict()), metrics, played)
+    tests = str(Path(__file__).parents[1])
+    command = [sys.executable, "-c", LOAD, *(str(result[0]) for result in results.values())]
+    environment = os.environ | {"PYTHONPATH": tests, "HF_HUB_OFFLINE": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return results
+
+
+def test_it_is_cloned_trained_saved_and_loaded_by_lerobot_alone(kind, trained):
+    checkpoint, start, cloned, after, metrics, played = trained[kind]
+    for before, now in ((start, cloned), (cloned, after)):
+        moved = {name for name in before if not torch.equal(before[name], now[name])}
+        assert [name for name in moved if "expert" in name]
+        # SmolVLA's vision-language model is frozen, that of pi0 is not.
+        assert bool([name for name in moved if "vision" in name]) == (kind != "smolvla")
+    # One optimizer step, on the very decisions that were drawn.
+    assert metrics["ratio_max"] == pytest.approx(1, abs=1e-4)
+    assert metrics["approx_kl"] == pytest.approx(0, abs=1e-6)
+    assert metrics["policy_grad_norm"] > 0
+    assert metrics["reward_mean"] != 0
+    answer = torch.load(checkpoint / "answer.pt")
+    np.testing.assert_allclose(answer[:, :PLAYED].numpy(), played, atol=1e-6)
