@@ -9,8 +9,8 @@ from tiny_smolvla import pretend_num2words, save_tiny_smolvlm
 
 KINDS = ("smolvla", "pi0", "pi05")
 CHUNK, PLAYED, DIMS, PADDED, STATE, STEPS = 6, 4, 3, 5, 4, 3
-"""Actions of a chunk, those of them that are played; dimensions of an action, also with padding; of the state; steps
-of the denoising."""
+"""Actions of a chunk, those of them that are played; dimensions of an action, the same with padding, those of the
+state; steps of the denoising."""
 INPUTS = {
     "observation.state": PolicyFeature(FeatureType.STATE, (STATE,)),
     "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, 32, 32)),
@@ -30,7 +30,9 @@ def make_vla(kind, folder, **options):
         own = {"image_resolution": (28, 28), "num_inference_steps": STEPS}
     sizes = {"chunk_size": CHUNK, "n_action_steps": PLAYED, "max_action_dim": PADDED}
     features = {"input_features": dict(INPUTS), "output_features": dict(OUTPUTS)}
-    config = make_policy_config(kind, **{**features, **sizes, **own, "device": "cpu", "push_to_hub": False} | options)
+    config = make_policy_config(
+        kind, **{**features, **sizes, **own, "device": "cpu", "push_to_hub": False} | options
+    )
     torch.manual_seed(0)
     with tiny_gemma():
         policy = get_policy_class(kind)(config).eval()

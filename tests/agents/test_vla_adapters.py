@@ -9,7 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_vlas import CHUNK, DIMS, KINDS, PADDED, PLAYED, STATE, STEPS, make_batch, make_processors, make_vla, save_vla
+from tiny_vlas import (
+    CHUNK,
+    DIMS,
+    KINDS,
+    PADDED,
+    PLAYED,
+    STATE,
+    STEPS,
+    make_batch,
+    make_processors,
+    make_vla,
+    save_vla,
+)
 
 from cronos_lerobot.agents.adapters.registry import AdapterOptions, make_trainable
 from cronos_lerobot.agents.chunk_player import take_rows
@@ -215,7 +227,7 @@ assert not [name for name in sys.modules if name.startswith(("cronos", "lerobot_
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """Each policy cloned for a step, trained for an update, saved, and asked in a process that has only LeRobot."""
+    """Each policy cloned for a step, trained for an update, saved; then asked by a process of LeRobot alone."""
     results = {}
     for kind in KINDS:
         folder = tmp_path_factory.mktemp(kind)

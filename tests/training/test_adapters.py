@@ -1,10 +1,20 @@
 """LeRobot's own policies trained by PPO on the real scene."""
 
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
-from test_cronos_train import cronos_train
+from lerobot_env_cronos import CronosVectorEnv
+from test_cronos_train import OBSERVATIONS, cronos_train
 from test_imitation import ACT
 from test_trainer import assert_same_run, metrics, weights
+from tiny_checkpoints import save_policy
+from tiny_smolvla import pretend_num2words, save_tiny_smolvlm
 
 FLAGS = (
     *(flag for flag in ACT if not flag.startswith(("--algorithm.", "--policy.n_action_steps"))),
@@ -38,3 +48,66 @@ def test_chunks_that_reach_beyond_a_switch_are_refused(tmp_path, monkeypatch):
     flags = [flag.replace("n_action_steps=5", "n_action_steps=3") for flag in FLAGS]
     with pytest.raises(SystemExit, match=r"3 actions at once.*Choose --policy\.n_action_steps from \[1, 2, 5\]"):
         cronos_train(monkeypatch, *flags, "--steps=80", f"--output_dir={tmp_path / 'run'}")
+
+
+SMOLVLA = {
+    "chunk_size": 6, "n_action_steps": 5, "num_steps": 3, "num_vlm_layers": 2, "resize_imgs_with_padding": (32, 32)
+}  # fmt: skip
+VLA_FLAGS = (
+    "--policy.device=cpu", "--env.type=cronos", *OBSERVATIONS["pixels"], "--num_envs=2",
+    "--protocol.task_switch_interval=10", "--protocol.update_interval=10", "--protocol.scene_reset_interval=10",
+    "--save_freq=20", "--eval_freq=0", "--tensorboard=false", "--algorithm.value_warmup_updates=0",
+    "--algorithm.ratio=factor", "--algorithm.minibatch_size=4",
+)  # fmt: skip
+EVALUATE = """
+from tiny_smolvla import pretend_num2words
+pretend_num2words()
+from lerobot.scripts.lerobot_eval import main
+main()
+"""
+
+
+@pytest.fixture
+def paid_for_moving(monkeypatch):
+    """An untrained arm hardly ever grasps: it is paid for moving forwards, too."""
+    step_streams = CronosVectorEnv.step_streams
+
+    def step(env, actions, ids):
+        reward, diverged = step_streams(env, actions, ids)
+        return reward + np.clip(actions[:, 0], -1, 1), diverged
+
+    monkeypatch.setattr(CronosVectorEnv, "step_streams", step)
+
+
+@pytest.mark.usefixtures("paid_for_moving")
+def test_smolvla_learns_from_pixels_saves_resumes_and_is_a_lerobot_policy(tmp_path, monkeypatch):
+    pretend_num2words()
+    save_tiny_smolvlm(tmp_path / "vlm")
+    pixels = {"observation_height": 64, "observation_width": 64}
+    clone = save_policy(tmp_path / "clone", "smolvla", pixels, vlm_model_name=str(tmp_path / "vlm"), **SMOLVLA)
+    flags = (f"--policy.path={clone}", *VLA_FLAGS)
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    cronos_train(monkeypatch, *flags, "--steps=40", f"--output_dir={whole}")
+    cronos_train(monkeypatch, *flags, "--steps=20", f"--output_dir={broken}")
+    before = weights(broken)
+    last = broken / "checkpoints/last/pretrained_model"
+    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=40")
+    assert_same_run(whole, broken)
+    moved = {name for name, tensor in weights(whole).items() if not torch.equal(tensor, before[name])}
+    assert [name for name in moved if "lm_expert" in name]
+    assert not [name for name in moved if ".vlm." in name]
+    updates = [line["agent"] for line in metrics(whole) if line["kind"] == "update"]
+    assert len(updates) == 2
+    assert all(update["policy_grad_norm"] > 0 for update in updates)
+
+    command = [
+        sys.executable, "-c", EVALUATE, f"--policy.path={whole / 'checkpoints/last/pretrained_model'}",
+        "--policy.device=cpu", "--env.type=cronos", *OBSERVATIONS["pixels"], "--env.render_size=[32, 32]",
+        "--env.task=put the ketchup bottle on the cloth", "--eval.n_episodes=1", "--eval.batch_size=1",
+        f"--output_dir={tmp_path / 'out'}",
+    ]  # fmt: skip
+    path = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    info = json.loads((tmp_path / "out/eval_info.json").read_text())
+    assert len(info["per_task"][0]["metrics"]["sum_rewards"]) == 1

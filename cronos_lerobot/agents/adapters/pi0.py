@@ -16,12 +16,11 @@ from cronos_lerobot.agents.adapters.vla import Prefix, VLAAdapter, unwrapped
 from cronos_lerobot.agents.base import Batch
 
 
-@register_adapter("pi05")
-class PI05Adapter(VLAAdapter):
-    """pi0.5 reads the robot's state as words of its prompt, which its preprocessor writes.
+class PaliGemmaAdapter(VLAAdapter):
+    """What pi0 and pi0.5 have in common.
 
     Args:
-        policy: a PI05Policy on its device.
+        policy: a PI0Policy or PI05Policy on its device.
         options: of the noise.
     """
 
@@ -60,9 +59,14 @@ class PI05Adapter(VLAAdapter):
 
 
 @register_adapter("pi0")
-class PI0Adapter(PI05Adapter):
+class PI0Adapter(PaliGemmaAdapter):
     """pi0's action expert reads the robot's state at each step of the denoising."""
 
     def read(self, batch: Batch) -> Prefix:
         """See `VLAAdapter`."""
         return replace(super().read(batch), given={"state": self.lerobot_policy.prepare_state(batch)})
+
+
+@register_adapter("pi05")
+class PI05Adapter(PaliGemmaAdapter):
+    """pi0.5 reads the robot's state as words of its prompt, which its preprocessor writes."""
