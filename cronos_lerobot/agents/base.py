@@ -12,6 +12,7 @@ from torch import Tensor
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from pathlib import Path
 
     from torch.optim import Optimizer
 
@@ -183,9 +184,18 @@ class LearningAgent(Agent):
     """
 
     policy: Any
-    """The LeRobot policy that acts: what is saved and evaluated."""
+    """The LeRobot policy that acts: what is saved, and evaluated unless `acting` is another."""
     optimizer: Optimizer | dict[str, Optimizer] | None = None
     """Saved and loaded as LeRobot does it."""
+
+    @property
+    def acting(self) -> Any:
+        """What is evaluated: the policy, or what decides in its place by `sample_actions`."""
+        return self.policy
+
+    def save_pretrained(self, folder: Path) -> None:
+        """Save the policy, and what else `acting` is made of, as LeRobot loads it from a folder."""
+        self.policy.save_pretrained(folder)
 
     def end_step(self, success: np.ndarray) -> None:
         """The step last stored left the tasks complete where `success` (N,) bool says so; before any `update`."""

@@ -2,5 +2,6 @@
 
 from cronos_lerobot.agents.imitation import agent as imitation
 from cronos_lerobot.agents.ppo import factory as ppo
+from cronos_lerobot.agents.steering import agent as steering
 
-__all__ = ["imitation", "ppo"]
+__all__ = ["imitation", "ppo", "steering"]

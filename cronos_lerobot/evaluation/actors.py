@@ -17,6 +17,7 @@ from lerobot_env_cronos.expert.expert import ScriptedExpert
 from cronos_lerobot.agents.base import Columns, TrainablePolicy
 from cronos_lerobot.agents.chunk_player import make_player
 from cronos_lerobot.agents.processing import PolicyProcessors, observation_columns
+from cronos_lerobot.agents.steering.steered import SteeredPolicy
 
 
 class Actor(Protocol):
@@ -48,7 +49,7 @@ class Actor(Protocol):
 
 
 class SamplingPolicy:
-    """A `TrainablePolicy`, sampled at a temperature.
+    """A `TrainablePolicy` or a SteeredPolicy, sampled at a temperature.
 
     A decision on several actions is played to its end, in each environment for itself, unless a new task begins.
 
@@ -167,12 +168,12 @@ def make_actor(
     """Return the actor for a LeRobot policy on its device.
 
     Args:
-        policy: that of the actions.
+        policy: that of the actions, or what steers it.
         processors: the policy's.
         temperature: of the sampling, if the policy has one (`sample_actions`).
         env_processors: LeRobot's processors between environment and policy, (before, after), if any.
     """
-    if isinstance(policy, TrainablePolicy):
+    if isinstance(policy, TrainablePolicy | SteeredPolicy):
         return SamplingPolicy(policy, processors, temperature)
     return SelectingPolicy(policy, processors, env_processors or (_as_it_is, _as_it_is))
 

@@ -19,6 +19,7 @@ from lerobot_env_cronos import CronosEnvConfig, SequentialVectorEnv, check_envir
 from tqdm import tqdm
 
 from cronos_lerobot.agents.processing import make_processors
+from cronos_lerobot.agents.steering.steered import with_steering
 from cronos_lerobot.evaluation.actors import Actor, ExpertActor, make_actor
 from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
 from cronos_lerobot.evaluation.config import CronosEvalConfig
@@ -205,7 +206,9 @@ class Evaluation:
             },
         )
         env_processors = make_env_pre_post_processors(env_cfg=config.env, policy_cfg=config.policy)
-        return make_actor(policy, make_processors(policy, *processors), config.eval.temperature, env_processors)
+        own = make_processors(policy, *processors)
+        policy = with_steering(policy, config.policy.pretrained_path)
+        return make_actor(policy, own, config.eval.temperature, env_processors)
 
     def _close(self) -> None:
         if "_env_and_actor" in self.__dict__:

@@ -158,7 +158,7 @@ def list_checkpoints(folder: Path) -> list[Path]:
 
 
 def _write_model(run: RunState, config: CronosTrainConfig, folder: Path) -> None:
-    run.agent.policy.save_pretrained(folder)
+    run.agent.save_pretrained(folder)
     config.save_pretrained(folder)
     run.preprocessor.save_pretrained(folder)
     run.postprocessor.save_pretrained(folder)

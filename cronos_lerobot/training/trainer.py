@@ -239,7 +239,7 @@ class Trainer:
             self._eval_env = self._make_eval_env(min(options.batch_size, num_episodes))
         result = evaluate_independent(
             self._eval_env,
-            self.policy,
+            self.agent.acting,
             self.processors,
             n_episodes=options.n_episodes,
             repetitions=options.repetitions,

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from cronos_lerobot.agents.adapters import act as _act  # noqa: F401 -- these register their adapters
-from cronos_lerobot.agents.adapters import pi0 as _pi0  # noqa: F401
-from cronos_lerobot.agents.adapters import smolvla as _smolvla  # noqa: F401
+from cronos_lerobot.agents.adapters import builtin as _builtin  # noqa: F401 -- registers them
 from cronos_lerobot.agents.adapters.registry import Adapter, AdapterOptions, make_trainable
 from cronos_lerobot.agents.base import decision_steps
 from cronos_lerobot.agents.ppo.agent import PPOAgent

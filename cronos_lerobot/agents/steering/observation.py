@@ -1,0 +1,74 @@
+"""What actor and critics of steering read."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+import torch
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+from torch import Tensor
+
+from cronos_lerobot.agents.base import Batch, Columns
+from cronos_lerobot.agents.processing import PolicyProcessors
+
+TEXT_WIDTH = 32
+
+
+def resolve_observation(observation: str, policy: Any) -> str:
+    """Return `policy` or `state` for a SteeringConfig's observation.
+
+    Raises:
+        ValueError: `state` of a policy that observes no vector.
+    """
+    vectors = vector_names(policy)
+    if observation == "auto":
+        return "state" if OBS_ENV_STATE in vectors else "policy"
+    if observation == "state" and not vectors:
+        raise ValueError(
+            f"--algorithm.observation=state needs a policy that observes {OBS_STATE} or {OBS_ENV_STATE}, this one "
+            f"observes {sorted(policy.input_features or {})}: give --algorithm.observation=policy."
+        )
+    return observation
+
+
+def vector_names(policy: Any) -> list[str]:
+    """The vectors that a policy observes, by LeRobot's names."""
+    return [name for name in (OBS_STATE, OBS_ENV_STATE) if name in (policy.input_features or {})]
+
+
+def state_features(policy: Any, batch: Batch) -> Tensor:
+    """The vectors that a policy observes and its instructions, (B, F) float32.
+
+    Args:
+        policy: its config.
+        batch: preprocessed.
+    """
+    vectors = [batch[name].flatten(1).float() for name in vector_names(policy)]
+    texts = np.stack([_instruction_vector(text) for text in batch["task"]])
+    return torch.cat([*vectors, torch.from_numpy(texts).to(vectors[0].device)], 1)
+
+
+@torch.inference_mode()
+def feature_width(observation: str, steerable: Any, processors: PolicyProcessors) -> int:
+    """F, the width of what `observation` names, found by showing the policy nothing."""
+    columns: Columns = {}
+    for name, feature in (steerable.config.input_features or {}).items():
+        shape, kind = feature.shape, np.float32
+        if name.startswith(OBS_IMAGES):
+            shape, kind = (*shape[1:], shape[0]), np.uint8
+        columns[name] = np.zeros((1, *shape), kind)
+    batch = processors.batch(columns, ["put it there"])
+    features = state_features(steerable.config, batch) if observation == "state" else steerable.observe(batch)[1]
+    return features.shape[1]
+
+
+@lru_cache(maxsize=4096)
+def _instruction_vector(text: str) -> np.ndarray:
+    """An instruction's words as (TEXT_WIDTH,) float32: the mean of random signs that each word always has."""
+    total = np.zeros(TEXT_WIDTH, np.float32)
+    for word in (words := text.split()):
+        total += np.random.default_rng(crc32(word.encode())).choice([-1.0, 1.0], TEXT_WIDTH)
+    return total / max(1, len(words))

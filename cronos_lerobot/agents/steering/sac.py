@@ -1,0 +1,139 @@
+"""Soft actor-critic (Haarnoja et al., 2018) over decisions, with an ensemble of critics as in REDQ (2021).
+
+LeRobot's SACAlgorithm is not used: its backup has one discount factor, where a decision that is cut short has
+another one; its Gaussian takes a covariance matrix of all dimensions, whose Cholesky factor is found anew for each
+of them, too much for the noise of a chunk; and it takes the optimizer's steps itself, without a place to average
+gradients over processes. Its MLP is the actor's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from copy import deepcopy
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from cronos_lerobot.agents.steering.config import SteeringConfig
+from cronos_lerobot.agents.steering.networks import Critics, NoiseActor, Whitening
+from cronos_lerobot.processes import Processes
+
+Metrics = dict[str, float]
+
+
+class SAC(nn.Module):
+    """Learns which choices are worth most.
+
+    Args:
+        config: the settings.
+        actor: chooses.
+        whitening: of what actor and critics read.
+        features: F, how many numbers those are.
+        dims: d, how many numbers are chosen.
+        device: where it learns.
+        generator: draws the choices that are learned from, and the critics that count; on that device.
+        processes: whose gradients are averaged.
+    """
+
+    def __init__(
+        self,
+        config: SteeringConfig,
+        actor: NoiseActor,
+        whitening: Whitening,
+        features: int,
+        dims: int,
+        device: torch.device | str = "cpu",
+        generator: torch.Generator | None = None,
+        processes: Processes | None = None,
+    ) -> None:
+        super().__init__()
+        self.config, self.generator, self.processes = config, generator, processes or Processes()
+        self.actor, self.whitening = actor, whitening
+        self.critics = Critics(features, dims, config.hidden_width, config.num_critics)
+        self.log_alpha = nn.Parameter(torch.tensor(math.log(config.initial_alpha)))
+        self.target_critics = deepcopy(self.critics).requires_grad_(False)
+        self.target_entropy = config.target_entropy * dims
+        self.to(device)
+        self.optimizers: dict[str, torch.optim.Optimizer] = {
+            "actor": torch.optim.Adam(actor.parameters(), lr=config.lr),
+            "critics": torch.optim.Adam(self.critics.parameters(), lr=config.lr),
+            "alpha": torch.optim.Adam([self.log_alpha], lr=config.lr),
+        }
+
+    def step(self, batch: dict[str, np.ndarray]) -> Metrics:
+        """One optimizer step of critics, actor and alpha on decisions that `ReplayMemory.draw` drew."""
+        device = self.log_alpha.device
+        drawn = {name: torch.from_numpy(column).to(device) for name, column in batch.items()}
+        features = self.whitening(drawn["features"])
+        values = self.critics(features, drawn["choice"])
+        target = self.targets(drawn["reward"], drawn["discount"], drawn["next_features"])
+        critic_loss = ((values - target) ** 2).mean(1).sum()
+        critic_norm = self._descend("critics", critic_loss, self.critics)
+
+        choice, log_prob = self.actor(features, generator=self.generator)
+        alpha = self.log_alpha.exp()
+        self.critics.requires_grad_(False)
+        actor_loss = (alpha.detach() * log_prob - self._judge(features, choice)).mean()
+        actor_norm = self._descend("actor", actor_loss, self.actor)
+        self.critics.requires_grad_(True)
+
+        entropy = -log_prob.detach().mean()
+        self._descend("alpha", alpha * (entropy - self.target_entropy))
+        with torch.no_grad():
+            for goal, param in zip(self.target_critics.parameters(), self.critics.parameters(), strict=True):
+                goal.lerp_(param, self.config.target_update)
+        return {
+            "critic_loss": critic_loss.item(),
+            "critic_grad_norm": critic_norm,
+            "actor_loss": actor_loss.item(),
+            "actor_grad_norm": actor_norm,
+            "value": values.detach().mean().item(),
+            "entropy": entropy.item() / choice.shape[1],
+            "choice_abs": choice.detach().abs().mean().item(),
+        }
+
+    @torch.no_grad()
+    def targets(self, reward: Tensor, discount: Tensor, next_features: Tensor) -> Tensor:
+        """What the critics are to say of decisions (B,): the rewards and what follows, discounted."""
+        features = self.whitening(next_features)
+        choice, log_prob = self.actor(features, generator=self.generator)
+        following = self.target_critics(features, choice)
+        if self.config.num_target_critics < self.config.num_critics:
+            order = torch.randperm(len(following), generator=self.generator, device=following.device)
+            following = following[order[: self.config.num_target_critics]]
+        following = following.min(0).values
+        if self.config.backup_entropy:
+            following = following - self.log_alpha.exp() * log_prob
+        return reward + discount * following
+
+    @torch.no_grad()
+    def value(self, features: Tensor, choice: Tensor) -> Tensor:
+        """What choices (B, d) are worth, (B,)."""
+        return self._judge(self.whitening(features), choice)
+
+    def trained(self) -> Iterator[Tensor]:
+        """All that learning changes."""
+        yield from self.parameters()
+        yield from self.buffers()
+
+    def _judge(self, features: Tensor, choice: Tensor) -> Tensor:
+        """The least of two critics, as in SAC; the mean of more, as in REDQ."""
+        values = self.critics(features, choice)
+        few = self.config.num_target_critics == self.config.num_critics
+        return values.min(0).values if few else values.mean(0)
+
+    def _descend(self, name: str, loss: Tensor, network: nn.Module | None = None) -> float:
+        """An optimizer step; returns the gradient's norm."""
+        if not torch.isfinite(loss):
+            raise FloatingPointError(f"The loss of {name} is {loss.item()}.")
+        optimizer = self.optimizers[name]
+        optimizer.zero_grad()
+        loss.backward()
+        params = [self.log_alpha] if network is None else list(network.parameters())
+        self.processes.average_gradients(params)
+        limit = math.inf if network is None else self.config.max_grad_norm
+        norm = nn.utils.clip_grad_norm_(params, limit)
+        optimizer.step()
+        return float(norm)

@@ -1,0 +1,178 @@
+"""Whole runs of the steering agent, on the dummies."""
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from dummies import DummyEnv, DummyPolicyConfig, identity_processors
+from forked_processes import together
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.random_utils import set_seed
+from safetensors.torch import load_file
+from test_trainer import STEPS_PER_UPDATE, KilledError, MortalEnv, config, metrics, weights
+
+from cronos_lerobot.agents.steering.config import SteeringConfig
+from cronos_lerobot.agents.steering.steered import STEERING, SteeredPolicy, with_steering
+from cronos_lerobot.processes import Processes
+from cronos_lerobot.training.trainer import Trainer
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
+
+
+@PreTrainedConfig.register_subclass("dummy_noise")
+@dataclass
+class NoiseConfig(DummyPolicyConfig):
+    """Plays two of three actions."""
+
+    n_action_steps: int = 2
+
+    def __post_init__(self):
+        super().__post_init__()
+        self.input_features = {"observation.state": PolicyFeature(FeatureType.STATE, (13,))}
+
+
+class NoisePolicy(PreTrainedPolicy):
+    """Its actions are the noise, times its weight: it goes nowhere in particular."""
+
+    config_class, name = NoiseConfig, "dummy_noise"
+    decision_steps, shape = 2, (3, 7)
+
+    def __init__(self, config=None, seed=0, **kwargs):
+        super().__init__(config or NoiseConfig())
+        self.weight = torch.nn.Parameter(torch.tensor(1.0 + seed))
+
+    def observe(self, batch):
+        return None, batch["observation.state"]
+
+    def denoise(self, context, noise):
+        return (self.weight * noise[:, :2]).clamp(-1, 1)
+
+    def predict_action_chunk(self, batch, **kwargs):
+        return self.denoise(None, torch.randn(len(batch["observation.state"]), 3, 7))
+
+    def select_action(self, batch, **kwargs):
+        return self.predict_action_chunk(batch)[:, 0]
+
+    def reset(self):
+        pass
+
+    forward = get_optim_params = None
+
+
+def settings(folder, **options):
+    own = {"hidden_width": 32, "batch_size": 32, "warmup_decisions": 30, "observation": "state", "lr": 3e-3}
+    algorithm = SteeringConfig(**own | options.pop("algorithm", {}))
+    return config(
+        folder, **{"policy": NoiseConfig(), "algorithm": algorithm, "steps": 6 * STEPS_PER_UPDATE} | options
+    )
+
+
+def train(cfg, env_class=DummyEnv, processes=None, policy_seed=0):
+    processes = processes or Processes()
+    mine = processes.share_of(cfg.num_envs)
+    set_seed(cfg.seed + processes.rank)
+    env = env_class(mine.stop - mine.start, diverge_at={(5, 1)})
+    trainer = Trainer(cfg, env, DummyEnv, NoisePolicy(seed=policy_seed), *identity_processors(), processes)
+    try:
+        trainer.train()
+    except KilledError:
+        return None
+    return trainer
+
+
+def assert_same_run(a: Path, b: Path):
+    assert metrics(a) == metrics(b)
+    last = "checkpoints/last"
+    for file in ("pretrained_model/model.safetensors", f"pretrained_model/{STEERING}"):
+        tensors = load_file(b / last / file)
+        for name, tensor in load_file(a / last / file).items():
+            assert torch.equal(tensor, tensors[name]), name
+    kept = [torch.load(folder / last / "training_state/agent.pt") for folder in (a, b)]
+    for part in ("sac", "memory"):
+        for name, tensor in kept[0][part].items():
+            assert torch.equal(tensor, kept[1][part][name]), name
+    for name in ("actor", "critics", "alpha"):
+        file = f"{last}/training_state/{name}/optimizer_state.safetensors"
+        for key, tensor in load_file(a / file).items():
+            assert torch.equal(tensor, load_file(b / file)[key]), key
+
+
+@pytest.mark.parametrize("memory_size", [1000, 40])
+def test_a_resumed_run_equals_the_unbroken_one(tmp_path, memory_size):
+    """Also where the memory has begun to forget before the kill: two updates are 32 decisions."""
+    unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
+    options = {"algorithm": {"memory_size": memory_size}}
+    trainer = train(settings(unbroken, **options))
+    updates = [line["agent"] for line in metrics(unbroken) if line["kind"] == "update"]
+    # Four streams decide four times in eight steps; the first 16 decisions are too few to learn from.
+    assert [line["decisions"] for line in updates] == [min(memory_size, 16.0 * (i + 1)) for i in range(6)]
+    assert [line["optimizer_steps"] for line in updates] == [0.0, *[16.0] * 5]
+    assert trainer.agent.num_steps == 80
+    assert train(settings(broken, **options), MortalEnv) is None
+    resumed = settings(broken, **options)
+    resumed.checkpoint_path = (broken / "checkpoints/last").resolve()
+    torch.manual_seed(999)
+    train(resumed, policy_seed=8)
+    assert_same_run(unbroken, broken)
+    # Frozen.
+    assert weights(unbroken)["weight"].item() == 1.0
+
+
+def in_processes(processes, cfg, env_class=DummyEnv):
+    trainer = train(cfg, env_class, processes)
+    if trainer is None:
+        return None
+    return [param.sum().item() for param in trainer.agent.sac.parameters()], len(trainer.agent.memory)
+
+
+def test_two_processes_learn_together_and_resume(tmp_path):
+    first, second = together(in_processes, settings(tmp_path / "unbroken"))
+    assert first == second
+    assert first[1] == 6 * 16 / 2
+    last = [line["agent"] for line in metrics(tmp_path / "unbroken") if line["kind"] == "update"][-1]
+    assert (last["decisions"], last["optimizer_steps"]) == (96.0, 16.0)
+    assert together(in_processes, settings(tmp_path / "broken"), MortalEnv) == [None, None]
+    resumed = settings(tmp_path / "broken")
+    resumed.checkpoint_path = (tmp_path / "broken/checkpoints/last").resolve()
+    assert together(in_processes, resumed) == [first, second]
+    assert_same_run(tmp_path / "unbroken", tmp_path / "broken")
+
+
+def test_what_is_evaluated_and_saved_is_steered_once_it_has_learned(tmp_path, monkeypatch, caplog):
+    asked, sample = [], SteeredPolicy.sample_actions
+    monkeypatch.setattr(
+        SteeredPolicy, "sample_actions", lambda *args, **kw: asked.append(1) or sample(*args, **kw)
+    )
+    cfg = settings(tmp_path / "run", steps=3 * STEPS_PER_UPDATE, eval_freq=STEPS_PER_UPDATE, keep_checkpoints=None)
+    trainer = train(cfg)
+    evaluations = [line for line in metrics(tmp_path / "run") if line["kind"] == "evaluation"]
+    assert len(evaluations) == 4
+    # Those at the start and after the first update, which was too early to learn, ask the policy alone: twelve
+    # episodes of 80 steps, five at a time. The others ask for two steps at a time.
+    assert len(asked) >= 2 * 40
+    frozen, early, *late = ({k: line[k] for k in ("success", "steps")} for line in evaluations)
+    assert frozen == early
+    assert frozen not in late
+    folders = sorted((tmp_path / "run/checkpoints").glob("0*/pretrained_model"))
+    # After the first update there is nothing to steer with.
+    assert [folder.name for folder in folders if not (folder / STEERING).is_file()] == ["pretrained_model"]
+    assert with_steering(trainer.policy, None) is with_steering(trainer.policy, folders[0]) is trainer.policy
+    with caplog.at_level(logging.INFO):
+        loaded = with_steering(NoisePolicy.from_pretrained(folders[-1]), folders[-1])
+    assert "steering.safetensors chooses the policy's noise" in caplog.text
+    assert isinstance(loaded, SteeredPolicy)
+    batch = {"observation.state": torch.from_numpy(np.float32(np.random.default_rng(0).normal(size=(5, 13))))}
+    batch["task"] = ["go to 1.0"] * 5
+    for temperature in (0.0, 0.6):
+        samples = [
+            policy.sample_actions(batch, temperature=temperature, generator=torch.Generator().manual_seed(1))
+            for policy in (loaded, trainer.agent.acting)
+        ]
+        assert torch.equal(*(sample["actions"] for sample in samples))
+    (folders[-1] / STEERING).write_bytes(b"short")
+    with pytest.raises(ValueError, match=r"steering\.safetensors is damaged"):
+        with_steering(trainer.policy, folders[-1])
