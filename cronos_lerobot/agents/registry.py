@@ -37,6 +37,8 @@ class AgentContext:
     checkpoint holds them and continues them."""
     torch_rng: Callable[[str], torch.Generator]
     """Returns the torch generator of a name, on the policy's device, in the same way."""
+    observation_shapes: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    """Of what the environment shows, without the batch, by LeRobot's names; none if they are not known."""
     processes: Processes = field(default_factory=Processes)
     """Those that train together. Gradients are averaged over them by the agent."""
     stopwatch: Stopwatch = field(default_factory=Stopwatch)

@@ -227,7 +227,7 @@ class CronosTrainConfig:
             self.policy = load_policy_config(path, overrides)
         if self.policy is None:
             raise ValueError("Choose a policy: --policy.path=<checkpoint or Hub id>, or --policy.type=<name>.")
-        self._show_what_the_policy_reads(self.env, self.policy)
+        self._show_what_is_read(self.env, self.policy)
         self.job_name = self.job_name or f"{self.env.type}_{self.policy.type}"
         if self.output_dir is None:
             self.output_dir = Path("outputs/train") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_{self.job_name}"
@@ -243,10 +243,11 @@ class CronosTrainConfig:
         if env.benchmark is not None and not Path(env.benchmark).is_dir():
             env.benchmark = load_benchmark(env.benchmark, env.scene).source
 
-    @staticmethod
-    def _show_what_the_policy_reads(env: CronosEnvConfig, policy: PreTrainedConfig) -> None:
-        """A policy that reads the privileged state (a critic may) is shown it."""
-        if OBS_ENV_STATE in (policy.input_features or {}) and OBS_ENV_STATE not in env.features_map.values():
+    def _show_what_is_read(self, env: CronosEnvConfig, policy: PreTrainedConfig) -> None:
+        """A policy or a critic that reads the privileged state is shown it."""
+        reads = OBS_ENV_STATE in (policy.input_features or {})
+        reads |= getattr(self.algorithm, "critic_observation", "policy") == "environment_state"
+        if reads and OBS_ENV_STATE not in env.features_map.values():
             env.privileged_state = True
             env.__post_init__()
 

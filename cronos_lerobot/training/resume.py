@@ -40,7 +40,7 @@ _TABLE = {
         "steps_per_update batch_size warmup_segments tail_steps memory_gib "
         "value_max_grad_norm beta1 "
         "beta2 weight_decay",
-        REFUSED: "type kl_base_coef temperature noise_std noise_level *",
+        REFUSED: "type kl_base_coef temperature noise_std noise_level critic_observation *",
     },
     "record.": {FOLLOWED: "flush_interval_s", REFUSED: "repo_id root streams filmed_streams"},
     "eval.": {FOLLOWED: "n_episodes repetitions split temperature batch_size seed"},

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from lerobot.envs import EnvConfig
 
 from cronos_lerobot.agents.base import LearningAgent
 from cronos_lerobot.agents.processing import make_processors
@@ -97,6 +98,7 @@ class Trainer:
                 task_switch_interval=self.config.protocol.task_switch_interval,
                 rng=lambda name: self.generators.for_numpy(own(name)),
                 torch_rng=lambda name: self.generators.for_torch(own(name)),
+                observation_shapes=_shapes(self.config.env),
                 processes=self.processes,
                 stopwatch=self.stopwatch,
             )
@@ -264,6 +266,11 @@ class Trainer:
 
     def _has_checkpoint(self) -> bool:
         return self.config.checkpoint_path is not None
+
+
+def _shapes(env: EnvConfig | None) -> dict[str, tuple[int, ...]]:
+    """Of what the environment shows, by LeRobot's names."""
+    return {} if env is None else {env.features_map[name]: tuple(f.shape) for name, f in env.features.items()}
 
 
 def _due(n: int, last: int, frequency: int) -> bool:

@@ -23,9 +23,9 @@ from tiny_vlas import (
     save_vla,
 )
 
+from cronos_lerobot.agents.adapters import builtin  # noqa: F401 -- registers the adapters
 from cronos_lerobot.agents.adapters.registry import AdapterOptions, make_trainable
 from cronos_lerobot.agents.chunk_player import take_rows
-from cronos_lerobot.agents.ppo import factory  # noqa: F401 -- registers the adapters
 from cronos_lerobot.agents.ppo.agent import PPOAgent
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.ppo.ppo import PPO

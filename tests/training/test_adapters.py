@@ -85,7 +85,7 @@ def test_smolvla_learns_from_pixels_saves_resumes_and_is_a_lerobot_policy(tmp_pa
     save_tiny_smolvlm(tmp_path / "vlm")
     pixels = {"observation_height": 64, "observation_width": 64}
     clone = save_policy(tmp_path / "clone", "smolvla", pixels, vlm_model_name=str(tmp_path / "vlm"), **SMOLVLA)
-    flags = (f"--policy.path={clone}", *VLA_FLAGS)
+    flags = (f"--policy.path={clone}", *VLA_FLAGS, "--algorithm.critic_observation=environment_state")
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     cronos_train(monkeypatch, *flags, "--steps=40", f"--output_dir={whole}")
     cronos_train(monkeypatch, *flags, "--steps=20", f"--output_dir={broken}")

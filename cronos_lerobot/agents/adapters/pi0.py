@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -70,3 +71,8 @@ class PI0Adapter(PaliGemmaAdapter):
 @register_adapter("pi05")
 class PI05Adapter(PaliGemmaAdapter):
     """pi0.5 reads the robot's state as words of its prompt, which its preprocessor writes."""
+
+    def instruction(self, text: str) -> str:
+        """See `Adapter`."""
+        found = re.fullmatch(r"Task: (.*), State: [-\d ]*;\nAction: ", text)
+        return found[1] if found else text

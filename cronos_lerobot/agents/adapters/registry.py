@@ -40,6 +40,10 @@ class Adapter(nn.Module):
         self.policy = policy
         self.config = policy.config
 
+    def instruction(self, text: str) -> str:
+        """Return the instruction in what the policy's preprocessor made of it."""
+        return text
+
     def own_parameters(self) -> dict[str, Tensor]:
         """What is not the policy's, without gradient: noise scales, the critic. A run's checkpoint holds it."""
         return {name: p.detach() for name, p in self.named_parameters() if not name.startswith("policy.")}

@@ -11,6 +11,7 @@ from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 LR_SCHEDULES = ("fixed", "kl_step", "kl_update")
 VALUE_LOSSES = ("huber", "mse")
 RATIOS = ("decision", "factor")
+CRITIC_OBSERVATIONS = ("policy", "environment_state")
 
 
 @dataclass(frozen=True)
@@ -143,13 +144,20 @@ class PPOConfig(RLAlgorithmConfig):
     none of its own (ACT); it is learned."""
     noise_level: float = 0.5
     """Noise of the denoising of a flow policy (PocketVLA's flow head, SmolVLA, pi0), which has none of its own."""
+    critic_observation: str = "policy"
+    """What the critic beside a policy that has none of its own (ACT, SmolVLA, pi0) reads: what the `policy` makes
+    of its observation, or the privileged `environment_state`, the robot's state and the instruction; the
+    environment then shows it beside pixels."""
 
     def __post_init__(self) -> None:
         for name, interval in RANGES.items():
             value = getattr(self, name)
             if value is not None and value not in interval:
                 raise ValueError(f"algorithm.{name} must be {interval}, got {value}.")
-        for name, choices in (("lr_schedule", LR_SCHEDULES), ("value_loss", VALUE_LOSSES), ("ratio", RATIOS)):
+        for name, choices in (
+            ("lr_schedule", LR_SCHEDULES), ("value_loss", VALUE_LOSSES), ("ratio", RATIOS),
+            ("critic_observation", CRITIC_OBSERVATIONS),
+        ):  # fmt: skip
             if getattr(self, name) not in choices:
                 raise ValueError(f"algorithm.{name} must be one of {choices}, got {getattr(self, name)!r}.")
         if self.target_kl is None and self.lr_schedule != "fixed":

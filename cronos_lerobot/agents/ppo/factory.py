@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from cronos_lerobot.agents.adapters import builtin as _builtin  # noqa: F401 -- registers them
+from cronos_lerobot.agents.adapters.privileged import PrivilegedCritic
 from cronos_lerobot.agents.adapters.registry import Adapter, AdapterOptions, make_trainable
 from cronos_lerobot.agents.base import decision_steps
 from cronos_lerobot.agents.ppo.agent import PPOAgent
@@ -21,6 +24,8 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
     """
     options = AdapterOptions(noise_std=context.config.noise_std, noise_level=context.config.noise_level)
     policy = make_trainable(context.policy, options)
+    if context.config.critic_observation == "environment_state":
+        policy = _with_privileged_critic(policy, context)
     if isinstance(policy, Adapter):
         context.processes.copy_from_main([*policy.own_parameters().values()])
     mine = context.streams
@@ -29,3 +34,12 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
     steps = decision_steps(policy, context.task_switch_interval)
     buffer = RolloutBuffer(context.update_interval // steps, mine.stop - mine.start)
     return PPOAgent(ppo, buffer, context.torch_rng("actions"), context.stopwatch, mine)
+
+
+def _with_privileged_critic(policy: Any, context: AgentContext) -> PrivilegedCritic:
+    if not isinstance(policy, Adapter):
+        raise ValueError(
+            f"--algorithm.critic_observation=environment_state is for policies without a critic; "
+            f"--policy.type={policy.config.type} has one of its own, and perhaps a --policy.critic_observation."
+        )
+    return PrivilegedCritic(policy, context.observation_shapes)
