@@ -9,7 +9,7 @@ from pocketvla_samples import make_batch, make_config, make_policy
 
 
 def test_the_loss_of_a_fresh_categorical_head_is_that_of_a_uniform_guess():
-    policy = PocketVLAPolicy(make_config(image=False, action_head="categorical"))
+    policy = PocketVLAPolicy(make_config(image=False, head="categorical"))
     with torch.no_grad():
         policy.head.project.weight.zero_()
     batch = make_batch(5) | {"action": torch.zeros(5, 7)}
@@ -56,7 +56,7 @@ def test_augmentation_is_for_training_only():
 @pytest.mark.parametrize(("image", "head"), [(True, "gaussian"), (False, "gaussian"), (False, "categorical")])
 def test_two_instructions_are_learnt_as_two_actions(image, head):
     torch.manual_seed(0)
-    policy = PocketVLAPolicy(make_config(image=image, action_head=head, random_shift_px=2))
+    policy = PocketVLAPolicy(make_config(image=image, head=head, random_shift_px=2))
     targets = torch.tensor([[0.5, -0.5, 0.2, 0.0, 0.9, -0.9, 1.0], [-0.5, 0.5, -0.2, 0.4, -0.9, 0.9, -1.0]])
     batch = make_batch(16)
     # Every observation comes under both instructions, so that only the words tell the actions apart.

@@ -14,7 +14,7 @@ HEADS = ["gaussian", "categorical"]
 )
 @pytest.mark.parametrize("temperature", [1.0, 0.6])
 def test_the_ratio_is_one_before_the_first_update(head, image, dtype, temperature):
-    policy = make_policy(image=image, dtype=dtype, action_head=head, critic_observation="environment_state")
+    policy = make_policy(image=image, dtype=dtype, head=head, critic_observation="environment_state")
     batch = make_batch(24)
     generator = torch.Generator().manual_seed(3)
     with torch.inference_mode():
@@ -177,7 +177,7 @@ def test_an_environment_state_that_is_not_there_is_refused():
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("observation", "video"), ("action_head", "diffusion"), ("temperature", -1.0), ("sigma_init", 0.9)],
+    [("observation", "video"), ("head", "diffusion"), ("temperature", -1.0), ("sigma_init", 0.9)],
 )
 def test_bad_configurations_name_the_value(field, value):
     with pytest.raises(ValueError, match=str(value)):

@@ -5,7 +5,15 @@ Importing the package registers `--policy.type=pocketvla` and its processor step
 """
 
 from lerobot_policy_pocketvla.configuration_pocketvla import PocketVLAConfig
+from lerobot_policy_pocketvla.flow_policy import PocketVLAFlowPolicy
 from lerobot_policy_pocketvla.modeling_pocketvla import PocketVLAPolicy
 from lerobot_policy_pocketvla.processor_pocketvla import make_pocketvla_pre_post_processors
+from lerobot_policy_pocketvla.token_policy import PocketVLATokenPolicy
 
-__all__ = ["PocketVLAConfig", "PocketVLAPolicy", "make_pocketvla_pre_post_processors"]
+__all__ = [
+    "PocketVLAConfig",
+    "PocketVLAFlowPolicy",
+    "PocketVLAPolicy",
+    "PocketVLATokenPolicy",
+    "make_pocketvla_pre_post_processors",
+]

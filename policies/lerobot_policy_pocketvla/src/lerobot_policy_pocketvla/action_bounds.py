@@ -76,13 +76,16 @@ class ActionBoundsProcessorStep(ProcessorStep):
         return converted
 
     def convert(self, action: Tensor) -> Tensor:
-        """Convert actions of shape (..., len(low)) in the direction that `inverse` tells."""
+        """Convert actions of shape (..., len(low)) in the direction that `inverse` tells.
+
+        What is beyond [-1, 1], as a chain of noise may end, becomes an end of the box.
+        """
         if action.shape[-1] != len(self.low):
             raise ValueError(f"action has {action.shape[-1]} dimensions, the bounds have {len(self.low)}")
         low = torch.as_tensor(self.low, dtype=torch.float32, device=action.device)
         high = torch.as_tensor(self.high, dtype=torch.float32, device=action.device)
         if self.inverse:
-            return low + (action.float() + 1.0) * 0.5 * (high - low)
+            return low + (action.float().clamp(-1.0, 1.0) + 1.0) * 0.5 * (high - low)
         return 2.0 * (action.float() - low) / (high - low) - 1.0
 
     def get_config(self) -> dict[str, Any]:

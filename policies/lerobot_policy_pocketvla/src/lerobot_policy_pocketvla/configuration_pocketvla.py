@@ -11,17 +11,22 @@ from lerobot_policy_pocketvla.precision import Precision
 
 Observation = Literal["auto", "image", "environment_state"]
 CriticObservation = Literal["actor", "environment_state"]
-ActionHead = Literal["gaussian", "categorical"]
+Head = Literal["gaussian", "categorical", "flow"]
 BoundsSource = Literal["bridge_orig", "dataset"]
+
+DEFAULT_CHUNK_SIZE = 4
+"""Of the `flow` head: 0.8 s at 5 control steps a second."""
+DEFAULT_ACTION_STEPS = 2
 
 
 @PreTrainedConfig.register_subclass("pocketvla")
 @dataclass
 class PocketVLAConfig(PreTrainedConfig):
-    """A language-conditioned policy with discretised actions, small enough for a laptop CPU.
+    """A language-conditioned policy, small enough for a laptop CPU.
 
     The actor sees one camera image, or the environment's state in its place, the proprioception
-    (`observation.state`) and the instruction (`task`), and returns one bin per action dimension.
+    (`observation.state`) and the instruction (`task`), and returns one bin per action dimension, or with
+    `head=flow` a chunk of continuous actions.
     """
 
     observation: Observation = "auto"
@@ -41,9 +46,10 @@ class PocketVLAConfig(PreTrainedConfig):
     they were cloned. What they say of an observation is then computed once, while acting, and kept for the
     update, which trains the trunk and the head many times faster. Cloning always trains everything."""
 
-    action_head: ActionHead = "gaussian"
+    head: Head = "gaussian"
     """`gaussian`: a mean and one sigma per dimension generate the bins' logits, the gripper has a sign.
-    `categorical`: a free logit for every bin."""
+    `categorical`: a free logit for every bin.
+    `flow`: a chunk of continuous actions, integrated from noise (flow matching)."""
     num_bins: int = 256
     """Bins per action dimension, equal parts of [-1, 1]."""
     gripper_dim: int | None = -1
@@ -62,6 +68,19 @@ class PocketVLAConfig(PreTrainedConfig):
     action_bounds: BoundsSource = "bridge_orig"
     """Physical actions that -1 and 1 stand for: the 1st and 99th percentile of BridgeData V2, as in OpenVLA
     (7 dimensions), or the data set's own minimum and maximum. Fixed at the first training."""
+
+    chunk_size: int | None = None
+    """Actions that the `flow` head predicts at once, H; null is 4. The other heads predict one."""
+    n_action_steps: int | None = None
+    """How many of them are played before the policy looks again, the first ones; null is 2, of one action 1."""
+    num_inference_steps: int = 5
+    """Euler steps from noise to actions (`flow` head)."""
+    flow_width: int = 256
+    """Width of the `flow` head's layers."""
+    flow_depth: int = 3
+    """Number of the `flow` head's residual blocks."""
+    flow_draws: int = 4
+    """Noises and times that behaviour cloning draws for each chunk of a batch; the trunk is asked only once."""
 
     task_width: int = 64
     """Width of the instruction's embedding."""
@@ -114,10 +133,14 @@ class PocketVLAConfig(PreTrainedConfig):
             ValueError: naming the bad value and the valid ones.
         """
         super().__post_init__()
+        self._check_choices_and_ranges()
+        self._check_chunk()
+
+    def _check_choices_and_ranges(self) -> None:
         for name, choices in (
             ("observation", Observation),
             ("critic_observation", CriticObservation),
-            ("action_head", ActionHead),
+            ("head", Head),
             ("action_bounds", BoundsSource),
             ("dtype", Precision),
         ):
@@ -139,9 +162,28 @@ class PocketVLAConfig(PreTrainedConfig):
             ("hidden_depth", 1),
             ("vocabulary_size", 2),
             ("random_shift_px", 0),
+            ("num_inference_steps", 1),
+            ("flow_width", 1),
+            ("flow_depth", 1),
+            ("flow_draws", 1),
         ):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least {least}")
+
+    def _check_chunk(self) -> None:
+        if self.chunk_size is None:
+            self.chunk_size = DEFAULT_CHUNK_SIZE if self.head == "flow" else 1
+        if self.n_action_steps is None:
+            self.n_action_steps = min(DEFAULT_ACTION_STEPS, self.chunk_size)
+        if self.head != "flow" and self.chunk_size != 1:
+            raise ValueError(
+                f"chunk_size={self.chunk_size}: head={self.head} predicts one action, chunk_size must be 1; "
+                "head=flow predicts chunks"
+            )
+        if not 1 <= self.n_action_steps <= self.chunk_size:
+            raise ValueError(
+                f"n_action_steps={self.n_action_steps} must be at least 1 and at most chunk_size={self.chunk_size}"
+            )
 
     @property
     def actor_observation(self) -> Literal["image", "environment_state"]:
@@ -189,6 +231,12 @@ class PocketVLAConfig(PreTrainedConfig):
         if self.action_feature is None:
             raise ValueError(f"output_features must hold 'action', got {sorted(self.output_features or {})}")
         return self.action_feature.shape[0]
+
+    @property
+    def chunk_shape(self) -> tuple[int, int]:
+        """(H, action dimensions) of what the head predicts."""
+        assert self.chunk_size is not None
+        return self.chunk_size, self.action_dim
 
     def physical_bounds(self, stats: dict[str, dict[str, Any]] | None) -> tuple[list[float], list[float]]:
         """Lowest and highest physical action, from `action_bounds` and, for `dataset`, its statistics.
@@ -252,14 +300,9 @@ class PocketVLAConfig(PreTrainedConfig):
         return None
 
     @property
-    def action_delta_indices(self) -> None:
-        """No action chunks: the action of the same step."""
-        return None
-
-    @property
-    def chunk_size(self) -> int:
-        """Actions in a chunk; LeRobot's sample weighting looks so many frames ahead."""
-        return 1
+    def action_delta_indices(self) -> list[int] | None:
+        """The steps of the chunk (`flow` head); else None, the action of the same step alone."""
+        return list(range(self.chunk_size or 1)) if self.head == "flow" else None
 
     @property
     def reward_delta_indices(self) -> None:

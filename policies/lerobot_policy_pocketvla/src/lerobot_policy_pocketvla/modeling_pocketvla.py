@@ -1,21 +1,17 @@
-"""The PocketVLA policy: behaviour cloning, acting, and what an actor-critic trainer needs."""
+"""The PocketVLA policy: its networks, and what an actor-critic trainer needs whatever the head."""
 
+from __future__ import annotations
+
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any, ClassVar
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE, OBS_STR
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE, OBS_STR
 from torch import Tensor, nn
 
 from lerobot_policy_pocketvla.configuration_pocketvla import PocketVLAConfig
-from lerobot_policy_pocketvla.heads import (
-    BinDistribution,
-    CategoricalHead,
-    GaussianHead,
-    actions_to_tokens,
-    tokens_to_actions,
-)
 from lerobot_policy_pocketvla.images import check_image_size, random_shift
 from lerobot_policy_pocketvla.networks import ImageNetwork, StateNetwork, ValueHead
 from lerobot_policy_pocketvla.precision import use_bfloat16
@@ -34,6 +30,11 @@ FEATURES = f"{OBS_STR}.features"
 class PocketVLAPolicy(PreTrainedPolicy):
     """Actor and critic; see `PocketVLAConfig` for what each of them sees.
 
+    `PocketVLAPolicy(config)` is the subclass for the config's head: what a policy can do depends on it.
+
+    Args:
+        config: the policy's.
+
     Raises:
         ValueError: when the configuration's features lack an input that it asks for.
     """
@@ -42,6 +43,18 @@ class PocketVLAPolicy(PreTrainedPolicy):
     name = "pocketvla"  # ty: ignore[invalid-assignment]
     takes_uint8_images = True
     """Camera frames may come as they are, in 0..255: converting them to floats costs as much as a convolution."""
+    by_head: ClassVar[dict[str, type[PocketVLAPolicy]]] = {}
+    """The subclasses by the config's `head`."""
+
+    def __init_subclass__(cls, heads: tuple[str, ...] = (), **kwargs: Any) -> None:
+        """Register a subclass as the policy of some heads."""
+        super().__init_subclass__(**kwargs)
+        cls.by_head.update(dict.fromkeys(heads, cls))
+
+    def __new__(cls, config: PocketVLAConfig | None = None, **kwargs: Any) -> PocketVLAPolicy:
+        """Choose the class; a copy is made of its class, without a config."""
+        chosen = cls.by_head[config.head] if cls is PocketVLAPolicy and config is not None else cls
+        return super().__new__(chosen)
 
     def __init__(self, config: PocketVLAConfig, **kwargs: Any) -> None:
         """Build the networks; LeRobot's further arguments (data set statistics, metadata) are not needed."""
@@ -63,20 +76,9 @@ class PocketVLAPolicy(PreTrainedPolicy):
         self.value_head = ValueHead(config.hidden_width, config.value_width)
         self.to(config.device)
 
-    def _build_head(self) -> GaussianHead | CategoricalHead:
-        config = self.config
-        if config.action_head == "categorical":
-            return CategoricalHead(config.hidden_width, config.action_dim, config.num_bins)
-        return GaussianHead(
-            config.hidden_width,
-            config.action_dim,
-            config.num_bins,
-            config.gripper_dim,
-            config.sigma_init,
-            config.sigma_min,
-            config.sigma_max,
-            config.gripper_logit_limit,
-        )
+    @abstractmethod
+    def _build_head(self) -> nn.Module:
+        """The layers from the actor's features (B, hidden_width) on."""
 
     # What the networks are fed.
 
@@ -126,76 +128,6 @@ class PocketVLAPolicy(PreTrainedPolicy):
 
     # LeRobot's policy interface.
 
-    def forward(
-        self, batch: Batch, reduction: Literal["mean", "none"] = "mean"
-    ) -> tuple[Tensor, dict[str, float]]:
-        """Behaviour cloning: negative log-likelihood of the bins of the demonstrated actions.
-
-        Args:
-            batch: with `action` (B, D) or (B, 1, D), normalised, and `action_is_pad` (B,) or (B, 1) if some
-                actions are padding.
-            reduction: `mean` over the samples that are not padding, or `none`.
-
-        Returns:
-            The loss, a scalar or (B,), in nats summed over the action's dimensions, and numbers for the log.
-        """
-        with self._full_precision():
-            shift_px = self.config.random_shift_px if self.training else 0
-            distribution = BinDistribution(self.head(self._features(batch, shift_px)))
-        target = batch[ACTION].reshape(-1, self.config.action_dim)
-        tokens = self._target_tokens(target)
-        losses = -distribution.log_prob(tokens)
-        valid = torch.ones_like(losses)
-        if "action_is_pad" in batch:
-            valid = 1.0 - batch["action_is_pad"].reshape(-1).to(losses.dtype)
-        losses = losses * valid
-        loss = losses if reduction == "none" else losses.sum() / valid.sum().clamp(min=1.0)
-        return loss, self._metrics(distribution, target, valid)
-
-    def _target_tokens(self, actions: Tensor) -> Tensor:
-        tokens = actions_to_tokens(actions, self.config.num_bins)
-        if isinstance(self.head, GaussianHead) and self.head.gripper_dim is not None:
-            gripper = self.head.gripper_dim
-            tokens[:, gripper] = torch.where(actions[:, gripper] >= 0, self.config.num_bins - 1, 0)
-        return tokens
-
-    @torch.no_grad()
-    def _metrics(self, distribution: BinDistribution, target: Tensor, valid: Tensor) -> dict[str, float]:
-        greedy = tokens_to_actions(distribution.mode(), self.config.num_bins)
-        error = (greedy - target.clamp(-1.0, 1.0)).abs().mean(-1)
-        metrics = {"greedy_abs_error": float((error * valid).sum() / valid.sum().clamp(min=1.0))}
-        if isinstance(self.head, GaussianHead):
-            metrics["sigma_mean"] = float(self.head.sigma().mean())
-        return metrics
-
-    @torch.no_grad()
-    def select_action(  # ty: ignore[incompatible-method-override]
-        self,
-        batch: Batch,
-        *,
-        temperature: float | None = None,
-        generator: torch.Generator | None = None,
-        **_: Any,
-    ) -> Tensor:
-        """Choose one normalised action per sample, (B, D) float32; the critic's inputs are not needed.
-
-        Args:
-            batch: observations and `task`.
-            temperature: of the sampling, 0 is greedy; None takes the configuration's.
-            generator: random source; None is torch's global one.
-        """
-        temperature = self.config.temperature if temperature is None else temperature
-        with self._full_precision():
-            tokens = BinDistribution(self.head(self._features(batch))).sample(temperature, generator)
-        return tokens_to_actions(tokens, self.config.num_bins)
-
-    def predict_action_chunk(self, batch: Batch, **kwargs: Any) -> Tensor:
-        """`select_action` as a chunk of one action, (B, 1, D)."""
-        return self.select_action(batch, **kwargs).unsqueeze(1)
-
-    def reset(self) -> None:
-        """Nothing to forget: the policy has no memory between steps."""
-
     def get_optim_params(self) -> list[dict[str, Any]]:  # ty: ignore[incompatible-method-override]
         """Parameter groups for behaviour cloning: the actor's, weight decay on its matrices only."""
         matrices, others, sigmas = [], [], []
@@ -239,51 +171,6 @@ class PocketVLAPolicy(PreTrainedPolicy):
     def _actor_features(self, batch: Batch) -> Batch:
         with self._full_precision():
             return {FEATURES: self._features(batch)}
-
-    @torch.no_grad()
-    def sample_actions(
-        self,
-        batch: Batch,
-        *,
-        temperature: float = 1.0,
-        generator: torch.Generator | None = None,
-        uniform: Tensor | None = None,
-    ) -> dict[str, Tensor]:
-        """Draw actions with what is needed to learn from them.
-
-        Args:
-            batch: observations and `task`.
-            temperature: of the sampling, 0 is greedy.
-            generator: random source; None is torch's global one.
-            uniform: the randomness itself, (B, D) in [0, 1), in place of a generator: a sample then does not
-                depend on the others of its batch.
-
-        Returns:
-            `actions` (B, 1, D) float32, normalised; `trace` (B, D) int64, the bins; `log_prob` (B,), summed over
-            the dimensions, at this temperature; `value` (B,). Temperature 0 is greedy, its `log_prob` is 0.
-        """
-        with self._full_precision():
-            features = self._features(batch)
-            distribution = BinDistribution(self.head(features))
-            tokens = distribution.sample(temperature, generator, uniform)
-            return {
-                "actions": tokens_to_actions(tokens, self.config.num_bins).unsqueeze(1),
-                "trace": tokens,
-                "log_prob": distribution.log_prob(tokens, temperature),
-                "value": self._values(batch, features),
-            }
-
-    def evaluate_actions(self, batch: Batch, tokens: Tensor, *, temperature: float = 1.0) -> dict[str, Tensor]:
-        """Evaluate drawn bins (B, D) under the policy as it is now, differentiable.
-
-        Returns:
-            `log_prob` (B,), summed over the dimensions; `entropy` (B,), mean over the dimensions, in nats;
-            `value` (B,).
-        """
-        with self._full_precision():
-            features = self._features(batch)
-            log_prob, entropy = self.head.evaluate(features, tokens, temperature)
-            return {"log_prob": log_prob, "entropy": entropy, "value": self._values(batch, features)}
 
     def predict_values(self, batch: Batch) -> Tensor:
         """Values of the observations, (B,), differentiable."""

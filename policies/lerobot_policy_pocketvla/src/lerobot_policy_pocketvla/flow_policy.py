@@ -1,0 +1,119 @@
+"""PocketVLA with a flow head: a chunk of continuous actions, integrated from noise."""
+
+from collections import deque
+from typing import Any, Literal
+
+import torch
+from lerobot.policies.common.flow_matching import euler_integrate, sample_noise, sample_time_beta
+from lerobot.utils.constants import ACTION
+from torch import Tensor
+
+from lerobot_policy_pocketvla.flow import FlowHead
+from lerobot_policy_pocketvla.modeling_pocketvla import Batch, PocketVLAPolicy
+
+
+class PocketVLAFlowPolicy(PocketVLAPolicy, heads=("flow",)):
+    """Predicts a velocity v = noise - actions on the way x = t noise + (1 - t) actions, as LeRobot's SmolVLA does.
+
+    A chunk of H actions is decided on at once, and n of them are played. It says of no chunk how likely it was;
+    a trainer that makes a stochastic chain of the integration finds what it needs in `flow_context`,
+    `flow_velocity` and `flow_values`.
+    """
+
+    head: FlowHead
+
+    def __init__(self, config: Any, **kwargs: Any) -> None:
+        """Build the networks."""
+        super().__init__(config, **kwargs)
+        self.reset()
+
+    def _build_head(self) -> FlowHead:
+        config = self.config
+        return FlowHead(config.hidden_width, config.chunk_shape, config.flow_width, config.flow_depth)
+
+    def forward(
+        self,
+        batch: Batch,
+        reduction: Literal["mean", "none"] = "mean",
+        noise: Tensor | None = None,
+        time: Tensor | None = None,
+    ) -> tuple[Tensor, dict[str, float]]:
+        """Behaviour cloning: squared error of the velocity at a random time, mean over the chunk's numbers.
+
+        Args:
+            batch: with `action` (B, H, D), normalised, and `action_is_pad` (B, H) if some actions are padding.
+            reduction: `mean` over the actions that are not padding, or `none`.
+            noise: (B, H, D) with a `time` (B,); None draws `flow_draws` for each sample, noisy times more often
+                (LeRobot's beta distribution).
+            time: see there.
+
+        Returns:
+            The loss, a scalar or (B,), the mean of each sample's actions that are not padding; nothing to log.
+        """
+        actions = batch[ACTION].float().clamp(-1.0, 1.0)
+        if actions.shape[1:] != self.head.shape:
+            raise ValueError(f"action has shape {tuple(actions.shape)}, the policy's chunks are {self.head.shape}")
+        draws = self.config.flow_draws if noise is None else 1
+        repeated = actions.repeat(draws, 1, 1)
+        if noise is None or time is None:
+            noise = sample_noise(repeated.shape, actions.device)
+            time = sample_time_beta(len(repeated), actions.device, alpha=1.5, beta=1.0, scale=0.999, offset=0.001)
+        t = time[:, None, None]
+        with self._full_precision():
+            features = self._features(batch, self.config.random_shift_px if self.training else 0)
+            velocity = self.head(features.repeat(draws, 1), t * noise + (1 - t) * repeated, time)
+        errors = (velocity - (noise - repeated)).square().mean(-1).unflatten(0, (draws, -1)).mean(0)
+        valid = torch.ones_like(errors)
+        if "action_is_pad" in batch:
+            valid = 1.0 - batch["action_is_pad"].to(errors.dtype)
+        errors = errors * valid
+        if reduction == "none":
+            return errors.sum(1) / valid.sum(1).clamp(min=1.0), {}
+        return errors.sum() / valid.sum().clamp(min=1.0), {}
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: Batch, noise: Tensor | None = None, **_: Any) -> Tensor:
+        """Integrate chunks (B, H, D), normalised, not clipped; the critic's inputs are not needed.
+
+        Args:
+            batch: observations and `task`.
+            noise: to begin with, (B, H, D); None draws it from torch's global generator.
+        """
+        features = self.flow_context(batch)
+        if noise is None:
+            noise = sample_noise((len(features), *self.head.shape), features.device)
+        return euler_integrate(
+            lambda x, time: self.flow_velocity(features, x, time), noise, self.config.num_inference_steps
+        )
+
+    @torch.no_grad()
+    def select_action(self, batch: Batch, noise: Tensor | None = None, **_: Any) -> Tensor:
+        """Return the next action of the chunk (B, D), normalised; a new chunk where none is left.
+
+        The queue is of the whole batch: `reset` clears it.
+        """
+        if not self._queue:
+            chunk = self.predict_action_chunk(batch, noise)[:, : self.config.n_action_steps]
+            self._queue.extend(chunk.transpose(0, 1))
+        return self._queue.popleft()
+
+    def reset(self) -> None:
+        """Forget what is left of the chunk."""
+        self._queue: deque[Tensor] = deque()
+
+    # What a trainer that makes a stochastic chain of the integration needs.
+
+    def flow_context(self, batch: Batch) -> Tensor:
+        """What the velocity needs of observations, (B, hidden_width), differentiable."""
+        with self._full_precision():
+            return self._features(batch)
+
+    def flow_velocity(self, context: Tensor, x: Tensor, time: Tensor) -> Tensor:
+        """Velocities (B, H, D) of chunks x (B, H, D) at times (B,), 1 noise to 0 actions, differentiable."""
+        with self._full_precision():
+            return self.head(context, x, time)
+
+    def flow_values(self, batch: Batch, context: Tensor) -> Tensor:
+        """`predict_values` of a batch whose `flow_context` is at hand."""
+        with self._full_precision():
+            return self._values(batch, context)
