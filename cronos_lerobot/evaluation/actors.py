@@ -26,6 +26,11 @@ class Actor(Protocol):
     is_per_environment: bool
     """Whether it remembers nothing, or of each environment by itself; if not, `act` is always asked for all."""
 
+    @property
+    def temperature(self) -> float | None:
+        """Of its sampling; None if it does not sample at a temperature that the evaluation chooses."""
+        ...
+
     def seed(self, seed: int) -> None:
         """Start all randomness that is not handed to `act` anew."""
         ...
@@ -60,7 +65,7 @@ class SamplingPolicy:
     is_per_environment = True
 
     def __init__(self, policy: Any, processors: PolicyProcessors, temperature: float) -> None:
-        self._policy, self._processors, self._temperature = policy.eval(), processors, temperature
+        self._policy, self._processors, self.temperature = policy.eval(), processors, temperature
         self._takes_uniform = "uniform" in inspect.signature(policy.sample_actions).parameters
         self._generator = torch.Generator(device=processors.device)
         self._left: dict[int, list[np.ndarray]] = {}
@@ -94,7 +99,7 @@ class SamplingPolicy:
         if self._takes_uniform:
             randomness = {"uniform": torch.from_numpy(uniform).to(self._processors.device)}
         with self._autocast():
-            sample = self._policy.sample_actions(batch, temperature=self._temperature, **randomness)
+            sample = self._policy.sample_actions(batch, temperature=self.temperature, **randomness)
         actions = sample["actions"]
         return self._processors.physical_actions(actions.flatten(0, 1)).reshape(actions.shape)
 
@@ -112,6 +117,8 @@ class SelectingPolicy:
         processors: its pre- and postprocessor.
         env_processors: LeRobot's processors between environment and policy, (before, after).
     """
+
+    temperature = None
 
     def __init__(self, policy: Any, processors: PolicyProcessors, env_processors: tuple[Any, Any]) -> None:
         before, self._after_policy = env_processors
@@ -143,7 +150,7 @@ class SelectingPolicy:
 class ExpertActor:
     """The scripted expert, which looks at the simulation's state: the ceiling of every policy."""
 
-    is_per_environment = True
+    is_per_environment, temperature = True, None
 
     def __init__(self, env: CronosVectorEnv) -> None:
         self._expert = ScriptedExpert(env)

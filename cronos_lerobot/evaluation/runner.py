@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from lerobot.envs.factory import make_env_pre_post_processors
 from lerobot.policies import make_policy, make_pre_post_processors
-from lerobot.policies.factory import get_policy_class
 from lerobot_env_cronos import CronosEnvConfig, SequentialVectorEnv, check_environment_id, get_scene, gymnasium_id
 from tqdm import tqdm
 
@@ -130,6 +129,7 @@ class Evaluation:
             "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             "seconds": time.perf_counter() - start,
             "made_by": self._maker,
+            "temperature": actor.temperature,
             "chains": records,
         }
         kept = {
@@ -236,7 +236,8 @@ class Evaluation:
                 "source": self.benchmark.source,
             },
             "obs_type": self.env_config.obs_type,
-            "temperature": config.eval.temperature if self._has_temperature() else None,
+            # Parts of earlier commits do not say it.
+            "temperature": finished[0].get("temperature", config.eval.temperature),
             "seed": config.seed,
             "advance": config.advance,
             "end_effector_reset": config.end_effector_reset,
@@ -262,12 +263,6 @@ class Evaluation:
             )
             maker["parts"].append(part.name)
         return list(makers.values())
-
-    def _has_temperature(self) -> bool:
-        """Whether actions are sampled at the config's temperature, or at whatever the policy does by itself."""
-        return self.config.policy is not None and hasattr(
-            get_policy_class(self.config.policy.type), "sample_actions"
-        )
 
     def _suite_results(self, suite: str, finished: Sequence[dict[str, Any]]) -> dict[str, Any]:
         found = {}
