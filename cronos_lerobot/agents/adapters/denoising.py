@@ -28,7 +28,7 @@ class DenoisingAdapter(Adapter):
         shape: (H, D) of the chunk as the network sees it, with padded dimensions.
         num_steps: S, as the policy's own denoising has.
         first: step of the chunk that is played first; n_action_steps are.
-        feature_width: F, of what the critic reads; None if the subclass has a `critic` of its own.
+        feature_width: F, of what the critic reads; None if the subclass has values of its own.
     """
 
     def __init__(
@@ -49,6 +49,10 @@ class DenoisingAdapter(Adapter):
     @abstractmethod
     def step(self, context: Any, temperature: float) -> Step:
         """Return the steps of the denoising; temperature 0 is the policy's own, without noise."""
+
+    def values(self, batch: Batch, context: Any, features: Tensor) -> Tensor:
+        """Return the values (B,) of a batch, of which `observe` returned `context` and `features`."""
+        return self.critic(features)
 
     def features(self, batch: Batch) -> Tensor:
         """The critic's features alone (B, F), where they can be had for less."""
@@ -81,8 +85,8 @@ class DenoisingAdapter(Adapter):
             )
         step = self.step(context, temperature)
         chain, log_prob = sample_chain(step, noise, self.num_steps, self.scored, generator)
-        actions = self.scored(chain[:, -1])
-        return {"actions": actions, "trace": chain, "log_prob": log_prob, "value": self.critic(features)}
+        actions, value = self.scored(chain[:, -1]), self.values(batch, context, features)
+        return {"actions": actions, "trace": chain, "log_prob": log_prob, "value": value}
 
     def denoise(self, context: Any, noise: Tensor) -> Tensor:
         """See `Steerable`."""
@@ -97,7 +101,7 @@ class DenoisingAdapter(Adapter):
         """See `TrainablePolicy`; the chain's entropy does not depend on the policy."""
         context, features = self.observe(batch)
         log_prob = chain_log_prob(self.step(context, temperature), trace, self.scored)
-        return {"log_prob": log_prob, "entropy": None, "value": self.critic(features)}
+        return {"log_prob": log_prob, "entropy": None, "value": self.values(batch, context, features)}
 
     def predict_values(self, batch: Batch) -> Tensor:
         """See `TrainablePolicy`."""

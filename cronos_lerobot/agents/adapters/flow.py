@@ -30,7 +30,7 @@ class FlowAdapter(DenoisingAdapter):
         options: of the noise.
         shape: (H, D) of the chunk as the network sees it, with padded dimensions.
         num_steps: S, as the policy's own integration has.
-        feature_width: F, of what the critic reads; None if the subclass has a `critic` of its own.
+        feature_width: F, of what the critic reads; None if the subclass has values of its own.
     """
 
     def __init__(

@@ -39,6 +39,12 @@ class Adapter(nn.Module):
         super().__init__()
         self.policy = policy
         self.config = policy.config
+        self.takes_uint8_images = getattr(policy, "takes_uint8_images", False)
+
+    @property
+    def encode_observation(self) -> Callable[[Batch], Batch] | None:
+        """The policy's own, if it has one: `observe` and the like take what it returns."""
+        return getattr(self.policy, "encode_observation", None)
 
     def instruction(self, text: str) -> str:
         """Return the instruction in what the policy's preprocessor made of it."""

@@ -1,0 +1,146 @@
+"""The flow head under PPO (Flow-SDE), with values that are the policy's own."""
+
+import numpy as np
+import pytest
+import torch
+from lerobot.policies import make_pre_post_processors
+from pocketvla_samples import make_batch, make_policy, take
+from test_pocketvla_flow import FLOW, make_flow, make_noise
+
+from cronos_lerobot.agents.adapters.pocketvla import PocketVLAFlowAdapter
+from cronos_lerobot.agents.adapters.registry import AdapterOptions, make_steerable, make_trainable
+from cronos_lerobot.agents.ppo.config import PPOConfig
+from cronos_lerobot.agents.ppo.ppo import PPO
+from cronos_lerobot.agents.processing import make_processors
+
+OBSERVED = {
+    "state": {},
+    "pixels": {"image": True},
+    "privileged": {"image": True, "critic_observation": "environment_state"},
+    "frozen": {"image": True, "freeze_encoder": True},
+    "shared": {"image": True, "value_detach": False},
+}
+
+
+def make_adapter(level=0.5, **options):
+    return make_trainable(make_flow(dtype="float32", **options), AdapterOptions(noise_level=level))
+
+
+def generator(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+def test_tokens_need_no_adapter():
+    tokens = make_policy(image=False)
+    assert make_trainable(tokens, AdapterOptions()) is tokens
+    assert isinstance(make_adapter(), PocketVLAFlowAdapter)
+    assert isinstance(make_steerable(make_flow()), PocketVLAFlowAdapter)
+    with pytest.raises(ValueError, match=r"--policy\.head=gaussian makes no actions of noise"):
+        make_steerable(tokens)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("options", [{"temperature": 0.0}, {"level": 0.0}])
+@pytest.mark.parametrize("observed", ["state", "pixels"])
+def test_without_noise_it_acts_as_select_action_does(observed, options):
+    adapter, batch, noise = (
+        make_adapter(options.get("level", 0.5), **OBSERVED[observed]),
+        make_batch(3),
+        make_noise(3),
+    )
+    sample = adapter.sample_actions(batch, temperature=options.get("temperature", 1.0), noise=noise)
+    assert adapter.decision_steps == 2
+    played = torch.stack([adapter.policy.select_action(batch, noise=noise) for _ in range(2)], 1)
+    assert torch.equal(sample["actions"], played)
+    context, _ = adapter.observe(batch)
+    assert torch.equal(adapter.denoise(context, noise), played)
+
+
+@pytest.mark.parametrize("temperature", [0.6, 1.0])
+@pytest.mark.parametrize("options", OBSERVED.values(), ids=OBSERVED)
+def test_the_ratio_is_one_before_the_first_step(options, temperature):
+    adapter, batch = make_adapter(**options), make_batch(12)
+    if adapter.encode_observation is not None:
+        batch = adapter.encode_observation(batch)
+        assert not [key for key in batch if "images" in key]
+    with torch.inference_mode():
+        sample = adapter.sample_actions(batch, temperature=temperature, generator=generator(2))
+        again = adapter.sample_actions(batch, temperature=temperature, generator=generator(2))
+    assert torch.equal(sample["trace"], again["trace"])
+    assert sample["trace"].shape == (12, 6, 4, 7)
+    assert sample["log_prob"].shape == (12, 5)
+    # Minibatches are other mixtures of the samples than the rollout's batches were.
+    rows = [5, 0, 11, 7]
+    got = adapter.evaluate_actions(take(batch, rows), sample["trace"][rows], temperature=temperature)
+    log_ratio = got["log_prob"] - sample["log_prob"][rows]
+    torch.testing.assert_close(log_ratio, torch.zeros_like(log_ratio), atol=1e-4, rtol=0)
+    torch.testing.assert_close(got["value"], sample["value"][rows], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(adapter.predict_values(batch), sample["value"], rtol=1e-4, atol=1e-5)
+    assert sample["value"].std() > 0
+
+
+@pytest.mark.parametrize("options", OBSERVED.values(), ids=OBSERVED)
+def test_the_values_inputs_stand_in_for_the_batch(options):
+    adapter, batch = make_adapter(**options), make_batch(4)
+    if adapter.value_inputs is None:
+        assert not adapter.config.value_detach
+        return
+    inputs = adapter.value_inputs(batch)
+    assert not [key for key in inputs if "images" in key]
+    values = adapter.predict_values(inputs | {"task": batch["task"]})
+    torch.testing.assert_close(values, adapter.predict_values(batch))
+
+
+@pytest.mark.parametrize("options", OBSERVED.values(), ids=OBSERVED)
+def test_each_loss_trains_its_own(options):
+    adapter, batch = make_adapter(**options), make_batch(4)
+    PPO(
+        adapter,
+        make_processors(adapter.policy, *make_pre_post_processors(adapter.config)),
+        PPOConfig(),
+        np.random.default_rng(0),
+    )
+    trace = adapter.sample_actions(batch, generator=generator(3))["trace"]
+    groups = {group["name"]: {id(p) for p in group["params"]} for group in adapter.rl_parameter_groups()}
+    assert not groups["policy"] & groups["value"]
+    frozen = {
+        id(p) for name, p in adapter.policy.named_parameters() if name.startswith(("actor.enc", "actor.text"))
+    }
+    everything = {id(p) for p in adapter.parameters()}
+    assert groups["policy"] | groups["value"] == everything - (frozen if "freeze_encoder" in options else set())
+    for name, loss in (("log_prob", "policy"), ("value", "value")):
+        adapter.zero_grad()
+        adapter.evaluate_actions(batch, trace)[name].sum().backward()
+        moved = {id(p) for p in adapter.parameters() if p.grad is not None and p.grad.abs().sum() > 0}
+        if name == "value" and "value_detach" in options:
+            assert groups["value"] < moved
+        else:
+            assert moved
+            assert moved <= groups[loss]
+
+
+def test_gradients_are_finite_differences():
+    adapter, batch = make_adapter(num_inference_steps=3), make_batch(3)
+    with torch.no_grad():
+        trace = adapter.sample_actions(batch, generator=generator(4))["trace"]
+    adapter.evaluate_actions(batch, trace)["log_prob"].sum().backward()
+    policy = adapter.policy
+    for param in (policy.head.out.bias, policy.head.from_time.weight, policy.actor.trunk.linears[0].weight):
+        flat, grad = param.data.view(-1), param.grad.view(-1)
+        i = int(grad.abs().argmax())
+        ends = []
+        for shift in (1e-3, -1e-3):
+            flat[i] += shift
+            with torch.no_grad():
+                ends.append(adapter.evaluate_actions(batch, trace)["log_prob"].double().sum().item())
+            flat[i] -= shift
+        assert abs(grad[i].item()) > 0.1
+        assert grad[i].item() == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=2e-2)
+
+
+def test_nothing_is_beside_the_policy():
+    adapter = make_adapter()
+    assert adapter.own_parameters() == {}
+    adapter.load_own_parameters({})
+    assert adapter.takes_uint8_images
+    assert FLOW["head"] == adapter.config.head
