@@ -1,0 +1,79 @@
+"""`cronos-train --algorithm.type=steering` on the real scene, and `cronos-eval` of what it saves."""
+
+import json
+import sys
+
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from safetensors.torch import load_file
+from test_adapters import FLAGS, SMOLVLA, VLA_FLAGS
+from test_cronos_train import cronos_train
+from test_steering_runs import assert_same_run
+from test_trainer import metrics
+from tiny_checkpoints import save_policy
+from tiny_smolvla import pretend_num2words, save_tiny_smolvlm
+
+from cronos_lerobot.agents.steering.steered import SteeredPolicy
+from cronos_lerobot.evaluation.policy_source import fingerprint
+from cronos_lerobot.scripts import eval as eval_script
+
+STEERED = (
+    *(flag for flag in VLA_FLAGS if not flag.startswith("--algorithm.")), "--algorithm.type=steering",
+    "--algorithm.hidden_width=16", "--algorithm.batch_size=8", "--algorithm.warmup_decisions=4",
+    "--algorithm.noise_repeat=true",
+)  # fmt: skip
+
+
+def test_smolvla_is_steered_saved_resumed_and_evaluated(tmp_path, monkeypatch, caplog):
+    pretend_num2words()
+    save_tiny_smolvlm(tmp_path / "vlm")
+    pixels = {"observation_height": 64, "observation_width": 64}
+    clone = save_policy(tmp_path / "clone", "smolvla", pixels, vlm_model_name=str(tmp_path / "vlm"), **SMOLVLA)
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    flags = (f"--policy.path={clone}", *STEERED)
+    cronos_train(monkeypatch, *flags, "--steps=40", f"--output_dir={whole}")
+    cronos_train(monkeypatch, *flags, "--steps=20", f"--output_dir={broken}")
+    last = broken / "checkpoints/last/pretrained_model"
+    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=40")
+    assert_same_run(whole, broken)
+    # Two streams decide twice in an update of ten steps.
+    updates = [line["agent"] for line in metrics(whole) if line["kind"] == "update"]
+    assert [(line["decisions"], line["optimizer_steps"]) for line in updates] == [(4, 4), (8, 4)]
+    folder = whole / "checkpoints/last/pretrained_model"
+    frozen = load_file(clone / "model.safetensors")
+    for name, tensor in load_file(folder / "model.safetensors").items():
+        assert torch.equal(tensor, frozen[name]), name
+    assert fingerprint(policy_config(folder)) != fingerprint(policy_config(clone))
+
+    asked, sample = [], SteeredPolicy.sample_actions
+    monkeypatch.setattr(
+        SteeredPolicy, "sample_actions", lambda *args, **kw: asked.append(1) or sample(*args, **kw)
+    )
+    for policy, steers in ((folder, True), (clone, False)):
+        out = tmp_path / f"steered_{steers}"
+        command = [
+            "cronos-eval", f"--policy.path={policy}", "--policy.device=cpu", "--eval.n_episodes=1",
+            "--eval.videos=0", "--eval.suites=independent", "--eval.splits=train", f"--output_dir={out}",
+        ]  # fmt: skip
+        monkeypatch.setattr(sys, "argv", command)
+        asked.clear()
+        eval_script.main()
+        assert json.loads((out / "results.json").read_text())["independent"]["train"]["n"] == 4
+        # 80 steps, five at a time, for all four tasks at once.
+        assert len(asked) == (16 if steers else 0)
+
+
+def policy_config(folder):
+    config = PreTrainedConfig.from_pretrained(folder)
+    config.pretrained_path = folder
+    return config
+
+
+def test_policies_without_noise_are_refused(tmp_path, monkeypatch):
+    flags = [flag for flag in FLAGS if not flag.startswith("--algorithm.")]
+    with pytest.raises(SystemExit, match=r"--policy\.type=act has no noise .*smolvla") as ended:
+        cronos_train(
+            monkeypatch, *flags, "--algorithm.type=steering", "--steps=80", f"--output_dir={tmp_path / 'run'}"
+        )
+    assert "\n" not in str(ended.value)
