@@ -38,6 +38,7 @@ _TABLE = {
         "gae_lambda normalize_advantage entropy_coef value_coef value_loss huber_delta value_clip policy_lr "
         "value_lr lr_schedule target_kl kl_stop_factor lr_factor policy_lr_min policy_lr_max max_grad_norm "
         "steps_per_update batch_size warmup_segments tail_steps memory_gib "
+        "utd warmup_decisions target_update target_entropy backup_entropy "
         "value_max_grad_norm beta1 "
         "beta2 weight_decay",
         REFUSED: "type kl_base_coef temperature noise_std noise_level critic_observation *",
