@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
-from zlib import crc32
 
 import numpy as np
 import torch
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
+from cronos_lerobot.agents.adapters.privileged import text_vector
 from cronos_lerobot.agents.base import Batch, Columns
 from cronos_lerobot.agents.processing import PolicyProcessors
-
-TEXT_WIDTH = 32
 
 
 def resolve_observation(observation: str, policy: Any) -> str:
@@ -39,15 +36,16 @@ def vector_names(policy: Any) -> list[str]:
     return [name for name in (OBS_STATE, OBS_ENV_STATE) if name in (policy.input_features or {})]
 
 
-def state_features(policy: Any, batch: Batch) -> Tensor:
+def state_features(steerable: Any, batch: Batch) -> Tensor:
     """The vectors that a policy observes and its instructions, (B, F) float32.
 
     Args:
-        policy: its config.
+        steerable: the policy or its adapter.
         batch: preprocessed.
     """
-    vectors = [batch[name].flatten(1).float() for name in vector_names(policy)]
-    texts = np.stack([_instruction_vector(text) for text in batch["task"]])
+    vectors = [batch[name].flatten(1).float() for name in vector_names(steerable.config)]
+    instruction = getattr(steerable, "instruction", str)
+    texts = np.stack([text_vector(instruction(text)) for text in batch["task"]])
     return torch.cat([*vectors, torch.from_numpy(texts).to(vectors[0].device)], 1)
 
 
@@ -61,14 +59,5 @@ def feature_width(observation: str, steerable: Any, processors: PolicyProcessors
             shape, kind = (*shape[1:], shape[0]), np.uint8
         columns[name] = np.zeros((1, *shape), kind)
     batch = processors.batch(columns, ["put it there"])
-    features = state_features(steerable.config, batch) if observation == "state" else steerable.observe(batch)[1]
+    features = state_features(steerable, batch) if observation == "state" else steerable.observe(batch)[1]
     return features.shape[1]
-
-
-@lru_cache(maxsize=4096)
-def _instruction_vector(text: str) -> np.ndarray:
-    """An instruction's words as (TEXT_WIDTH,) float32: the mean of random signs that each word always has."""
-    total = np.zeros(TEXT_WIDTH, np.float32)
-    for word in (words := text.split()):
-        total += np.random.default_rng(crc32(word.encode())).choice([-1.0, 1.0], TEXT_WIDTH)
-    return total / max(1, len(words))

@@ -66,7 +66,7 @@ class SteeredPolicy(nn.Module):
         """Return what the policy makes of an observation, and what the actor reads of it (B, F)."""
         context, features = self.steerable.observe(batch)
         if self.shape.observation == "state":
-            features = state_features(self.config, batch)
+            features = state_features(self.steerable, batch)
         return context, features.detach().float()
 
     def denoise(self, context: Any, choice: Tensor) -> Tensor:
