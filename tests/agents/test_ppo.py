@@ -66,6 +66,22 @@ def test_accumulated_minibatches_make_the_step_of_a_large_one():
     torch.testing.assert_close(*params, atol=2e-6, rtol=1e-4)
 
 
+def test_pieces_of_a_minibatch_make_its_step(monkeypatch):
+    params, seen = [], []
+    for piece_bytes in (2**23, 300):
+        monkeypatch.setattr("cronos_lerobot.agents.ppo.ppo.PIECE_BYTES", piece_bytes)
+        ppo = make_ppo(epochs=1, value_epochs=1, lr_schedule="fixed", max_grad_norm=1e9, minibatch_size=128)
+        loss_of, sizes = ppo._loss, []
+        ppo._loss = lambda minibatch, of=loss_of, to=sizes: (to.append(len(minibatch.indices)), of(minibatch))[1]
+        ppo.update(rollout(ppo, reward_for_up))
+        params.append(flat(ppo.policy.parameters()))
+        seen.append(sizes)
+    assert seen[0] == [128]
+    assert len(seen[1]) > 2
+    assert sum(seen[1]) == 128
+    torch.testing.assert_close(*params, atol=2e-6, rtol=1e-4)
+
+
 def test_kl_to_the_base_policy_holds_back():
     moved = []
     for coefficient in (0.0, 100.0):

@@ -85,6 +85,22 @@ def test_actions_keep_their_type_and_shape():
     np.testing.assert_array_equal(minibatch.trace, drawn.reshape(2 * N, 4, 2)[minibatch.indices])
 
 
+@pytest.mark.parametrize(("max_bytes", "pieces"), [(10**6, 1), (1, 2 * N), (16 * 2 * N, 1), (16 * 2 * N - 1, 2)])
+def test_a_minibatch_is_split_by_the_size_of_its_observations(max_bytes, pieces):
+    """2 N observations of a number, four bytes, and a picture of 2 x 2 x 3."""
+    buffer = filled(rows=2)
+    (whole,) = buffer.minibatches(100, np.random.default_rng(0))
+    parts = whole.split(max_bytes)
+    assert len(parts) == pieces
+    assert max(len(part.indices) for part in parts) - min(len(part.indices) for part in parts) <= 1
+    assert [text for part in parts for text in part.instructions] == whole.instructions
+    for name in ("indices", "trace", "log_prob", "value", "advantage", "return_"):
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_array_equal(joined, getattr(whole, name))
+    states = [part.observation["observation.state"] for part in parts]
+    np.testing.assert_array_equal(np.concatenate(states), whole.observation["observation.state"])
+
+
 @pytest.mark.parametrize("batch_size", [1, 2 * N, 100])
 def test_observations_are_mapped_once_and_may_stand_in_for_the_stored_ones(batch_size):
     buffer = filled(rows=4)

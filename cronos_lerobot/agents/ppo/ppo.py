@@ -46,6 +46,11 @@ class Loss:
     """KL(old || new) of the policies [nats], if the policy is trained."""
 
 
+PIECE_BYTES = 2**23
+"""Observations that are backpropagated at once on a CPU. The mean over the pieces of a minibatch is that over the
+minibatch; what convolutions make of 2048 pictures does not fit into a cache, and costs half as much again."""
+
+
 class PPO:
     """Updates a policy from rollouts.
 
@@ -168,10 +173,11 @@ class PPO:
                     self._optimizer_step(metrics)
 
     def _groups(self, buffer: RolloutBuffer, observations: Columns | None = None) -> Iterator[list[Minibatch]]:
-        """The minibatches of each optimizer step of one epoch."""
+        """What is backpropagated for each optimizer step of one epoch: its minibatches, or pieces of them."""
         minibatches = buffer.minibatches(self.config.minibatch_size, self.rng, observations)
+        on_cpu = self.processors.device.type == "cpu"
         while group := list(itertools.islice(minibatches, self.config.grad_accumulation)):
-            yield group
+            yield [piece for minibatch in group for piece in minibatch.split(PIECE_BYTES)] if on_cpu else group
 
     def _accumulate(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -30,6 +31,22 @@ class Minibatch:
     value: np.ndarray
     advantage: np.ndarray
     return_: np.ndarray
+
+    def split(self, max_bytes: int) -> list[Minibatch]:
+        """The same decisions in as few even pieces as have at most `max_bytes` of observations, one at least each.
+
+        They are views.
+        """
+        size, total = len(self.indices), sum(col.nbytes for col in self.observation.values())
+        count = min(size, max(1, -(-total // max_bytes)))
+        bounds = np.linspace(0, size, count + 1).astype(int).tolist()
+        return [self._rows(slice(first, end)) for first, end in itertools.pairwise(bounds)]
+
+    def _rows(self, rows: slice) -> Minibatch:
+        observation = {name: col[rows] for name, col in self.observation.items()}
+        arrays = (self.trace, self.log_prob, self.value, self.advantage, self.return_)
+        parts = (array[rows] for array in arrays)
+        return Minibatch(self.indices[rows], observation, self.instructions[rows], *parts)
 
 
 class RolloutBuffer:
