@@ -16,11 +16,43 @@ from test_trainer import assert_same_run, metrics, weights
 from tiny_checkpoints import save_policy
 from tiny_smolvla import pretend_num2words, save_tiny_smolvlm
 
+from cronos_lerobot.agents.adapters.registry import AdapterOptions, make_trainable
+
 FLAGS = (
     *(flag for flag in ACT if not flag.startswith(("--algorithm.", "--policy.n_action_steps"))),
     "--policy.n_action_steps=5", "--algorithm.type=ppo", "--algorithm.value_warmup_updates=0",
     "--algorithm.ratio=factor", "--algorithm.minibatch_size=8",
 )  # fmt: skip
+DIFFUSION = (
+    "--policy.type=diffusion", "--policy.device=cpu", "--policy.n_obs_steps=1", "--policy.horizon=8",
+    "--policy.n_action_steps=5", "--policy.drop_n_last_frames=1", "--policy.down_dims=[8,16]",
+    "--policy.n_groups=4", "--policy.diffusion_step_embed_dim=8", "--policy.num_inference_steps=2",
+    *(flag for flag in FLAGS if not flag.startswith("--policy.")),
+)  # fmt: skip
+ACT_ALONE = """
+import json, sys
+sys.modules["cronos_lerobot"] = None
+import torch
+from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
+policy = DiffusionPolicy.from_pretrained(sys.argv[1])
+torch.manual_seed(0)
+shapes = {name: feature.shape for name, feature in policy.config.input_features.items()}
+batch, noise = {name: torch.rand(2, *shape) for name, shape in shapes.items()}, torch.randn(2, 8, 7)
+policy.reset()
+print(json.dumps(policy.select_action(batch, noise=noise).tolist()))
+"""
+
+
+@pytest.fixture
+def paid_for_moving(monkeypatch):
+    """An untrained arm hardly ever grasps: it is paid for moving forwards, too."""
+    step_streams = CronosVectorEnv.step_streams
+
+    def step(env, actions, ids):
+        reward, diverged = step_streams(env, actions, ids)
+        return reward + np.clip(actions[:, 0], -1, 1), diverged
+
+    monkeypatch.setattr(CronosVectorEnv, "step_streams", step)
 
 
 def test_act_learns_in_chunks_saves_resumes_and_is_a_lerobot_policy(tmp_path, monkeypatch):
@@ -44,6 +76,36 @@ def test_act_learns_in_chunks_saves_resumes_and_is_a_lerobot_policy(tmp_path, mo
     assert policy.select_action({name: torch.zeros(2, *shape) for name, shape in shapes.items()}).shape == (2, 7)
 
 
+@pytest.mark.usefixtures("paid_for_moving")
+def test_diffusion_learns_by_its_chain_saves_resumes_and_is_a_lerobot_policy(tmp_path, monkeypatch):
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    with pytest.raises(SystemExit, match=r"--policy\.noise_scheduler_type=DDIM"):
+        cronos_train(monkeypatch, *DIFFUSION, "--steps=80", f"--output_dir={tmp_path / 'ddpm'}")
+    flags = (*DIFFUSION, "--policy.noise_scheduler_type=DDIM")
+    cronos_train(monkeypatch, *flags, "--steps=160", f"--output_dir={whole}")
+    cronos_train(monkeypatch, *flags, "--steps=80", f"--output_dir={broken}")
+    before = weights(broken)
+    last = broken / "checkpoints/last/pretrained_model"
+    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=160")
+    assert_same_run(whole, broken)
+    assert all(not torch.equal(tensor, before[name]) for name, tensor in weights(whole).items())
+    updates = [line["agent"] for line in metrics(whole) if line["kind"] == "update"]
+    assert len(updates) == 2
+    assert all(update["policy_grad_norm"] > 0 for update in updates)
+
+    from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
+
+    last = whole / "checkpoints/last/pretrained_model"
+    acted = subprocess.run([sys.executable, "-c", ACT_ALONE, last], check=True, capture_output=True, text=True)
+    adapter = make_trainable(DiffusionPolicy.from_pretrained(last), AdapterOptions())
+    torch.manual_seed(0)
+    shapes = {name: feature.shape for name, feature in adapter.config.input_features.items()}
+    batch, noise = {name: torch.rand(2, *shape) for name, shape in shapes.items()}, torch.randn(2, 8, 7)
+    with torch.no_grad():
+        actions = adapter.sample_actions(batch, temperature=0, noise=noise)["actions"]
+    assert json.loads(acted.stdout.splitlines()[-1]) == actions[:, 0].tolist()
+
+
 def test_chunks_that_reach_beyond_a_switch_are_refused(tmp_path, monkeypatch):
     flags = [flag.replace("n_action_steps=5", "n_action_steps=3") for flag in FLAGS]
     with pytest.raises(SystemExit, match=r"3 actions at once.*Choose --policy\.n_action_steps from \[1, 2, 5\]"):
@@ -65,18 +127,6 @@ pretend_num2words()
 from lerobot.scripts.lerobot_eval import main
 main()
 """
-
-
-@pytest.fixture
-def paid_for_moving(monkeypatch):
-    """An untrained arm hardly ever grasps: it is paid for moving forwards, too."""
-    step_streams = CronosVectorEnv.step_streams
-
-    def step(env, actions, ids):
-        reward, diverged = step_streams(env, actions, ids)
-        return reward + np.clip(actions[:, 0], -1, 1), diverged
-
-    monkeypatch.setattr(CronosVectorEnv, "step_streams", step)
 
 
 @pytest.mark.usefixtures("paid_for_moving")
