@@ -6,15 +6,16 @@ import sys
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
+from safetensors import safe_open
 from safetensors.torch import load_file
 from test_adapters import FLAGS, SMOLVLA, VLA_FLAGS
-from test_cronos_train import cronos_train
+from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
 from test_steering_runs import assert_same_run
 from test_trainer import metrics
 from tiny_checkpoints import save_policy
 from tiny_smolvla import pretend_num2words, save_tiny_smolvlm
 
-from cronos_lerobot.agents.steering.steered import SteeredPolicy
+from cronos_lerobot.agents.steering.steered import STEERING, SteeredPolicy
 from cronos_lerobot.evaluation.policy_source import fingerprint
 from cronos_lerobot.scripts import eval as eval_script
 
@@ -62,6 +63,24 @@ def test_smolvla_is_steered_saved_resumed_and_evaluated(tmp_path, monkeypatch, c
         assert json.loads((out / "results.json").read_text())["independent"]["train"]["n"] == 4
         # 80 steps, five at a time, for all four tasks at once.
         assert len(asked) == (16 if steers else 0)
+
+
+def test_pocketvlas_flow_head_is_steered_from_the_state(tmp_path, monkeypatch):
+    flags = [flag for flag in (*SMALL, *OBSERVATIONS["state"]) if not flag.startswith("--algorithm.")]
+    flags += ["--algorithm.type=steering", "--algorithm.batch_size=8", "--algorithm.warmup_decisions=8"]
+    run = tmp_path / "run"
+    with pytest.raises(SystemExit, match=r"--policy\.head=gaussian makes no actions of noise.*head=flow"):
+        cronos_train(monkeypatch, *flags, f"--output_dir={run}")
+    flow = ["--policy.head=flow", "--policy.chunk_size=6", "--policy.n_action_steps=2", "--algorithm.utd=0.5"]
+    cronos_train(monkeypatch, *flags, *flow, f"--output_dir={run}")
+    # Two streams of four decisions in an update of eight steps.
+    first = metrics(run)[0]["agent"]
+    assert (first["decisions"], first["optimizer_steps"]) == (8, 4)
+    with safe_open(run / "checkpoints/last/pretrained_model" / STEERING, "pt") as actor:
+        shape = json.loads(actor.metadata()["shape"])
+        # State, environment's state and words; the noise of six steps of seven dimensions, mean and deviation.
+        assert (shape["observation"], shape["features"]) == ("state", 13 + 48 + 32)
+        assert actor.get_slice("actor.head.bias").get_shape() == [2 * 6 * 7]
 
 
 def policy_config(folder):
