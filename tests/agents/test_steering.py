@@ -228,38 +228,46 @@ class StateFlow(GaussianFlowAdapter):
         super().__init__(policy, AdapterOptions(), shape=(3, 4), num_steps=10, feature_width=8)
 
 
-@pytest.mark.parametrize("repeat", [False, True])
-def test_it_finds_the_noise_that_is_paid_for(repeat):
-    """Best is 0.4 = 0.7 - 0.3, a noise of about -1, under one instruction, and 1.0, about 1, under the other."""
+@pytest.mark.parametrize(("repeat", "is_late"), [(False, False), (True, True)])
+def test_it_finds_the_noise_that_is_paid_for(repeat, is_late):
+    """Best is 0.4 = 0.7 - 0.3, a noise of about -1, under one instruction, and 1.0, about 1, under the other.
+
+    Of two decisions each is paid at once, or the first one only at the end of the second, which sees where it led.
+    """
     adapter = StateFlow()
     weights = adapter.policy.scale.clone()
     agent = make_agent(
         adapter, streams=32, observation="state", noise_repeat=repeat, warmup_decisions=64, batch_size=64,
-        hidden_width=32, lr=3e-3, utd=0.5, target_update=0.05, target_entropy=-2.0,
+        gamma=0.8, hidden_width=32, lr=3e-3, utd=0.5, target_update=0.05, target_entropy=-2.0,
     )  # fmt: skip
     assert agent.steered.dims == (2 if repeat else 6)
     rng = np.random.default_rng(0)
     tau = ["go down", "go up"] * 16
     targets = np.array([0.4, 1.0] * 16)
 
-    def round_of_decisions():
-        errors = []
-        for k in range(2):
-            observation = {"agent_pos": rng.normal(size=(32, 8)).astype(np.float32)}
-            sample = agent.act(observation, tau)
-            error = ((sample.action - targets[:, None]) ** 2).mean(1)
-            errors.append(error)
-            ends = np.full(32, k == 1)
-            agent.store(observation, tau, sample, -10 * error, observation, ends, np.zeros(32, bool))
-        return np.mean(errors)
+    def two_decisions():
+        errors, never, seen = [], np.zeros(32, bool), rng.normal(size=(32, 8)).astype(np.float32)
+        seen[:, 0] = 0
+        for k in range(4):
+            sample = agent.act({"agent_pos": seen}, tau)
+            errors.append(((sample.action - targets[:, None]) ** 2).mean(1))
+            after = seen.copy()
+            if k == 1:
+                after[:, 0] = sample.action.mean(1) - 0.7
+            paid = (errors[1] if k == 3 else 0 * errors[0]) if is_late else errors[-1]
+            agent.store(
+                {"agent_pos": seen}, tau, sample, -10 * paid, {"agent_pos": after}, never | (k == 3), never
+            )
+            seen = after
+        return np.mean(errors[1] if is_late else errors)
 
-    first = round_of_decisions()
+    first = two_decisions()
     # The flow's own: 0.3^2 off target and 0.3^2 about it, less what the box cuts off.
     assert first == pytest.approx(2 * STD**2, rel=0.4)
     for _ in range(40):
         agent.update()
-        last = round_of_decisions()
-    assert last < 0.15 * first
+        last = two_decisions()
+    assert last < 0.2 * first
     batch = {"observation.state": torch.zeros(2, 8), "task": ["go down", "go up"]}
     actions = agent.acting.sample_actions(batch, temperature=0.0)["actions"].mean((1, 2))
     assert actions.tolist() == pytest.approx([0.4, 1.0], abs=0.1)
