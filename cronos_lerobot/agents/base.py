@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cronos_lerobot.agents.weights import save_policy
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
@@ -195,7 +197,7 @@ class LearningAgent(Agent):
 
     def save_pretrained(self, folder: Path) -> None:
         """Save the policy, and what else `acting` is made of, as LeRobot loads it from a folder."""
-        self.policy.save_pretrained(folder)
+        save_policy(self.policy, folder)
 
     def end_step(self, success: np.ndarray) -> None:
         """The step last stored left the tasks complete where `success` (N,) bool says so; before any `update`."""

@@ -15,6 +15,7 @@ from lerobot.utils.utils import init_logging
 from lerobot_env_cronos import SequentialVectorEnv
 
 from cronos_lerobot.agents.registry import check_agent
+from cronos_lerobot.agents.weights import is_wrapped
 from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.processes import join_processes
 from cronos_lerobot.scripts.errors import error_line, parse_command_line
@@ -63,7 +64,9 @@ def push_to_hub(config: CronosTrainConfig, policy: Any, preprocessor: Any, postp
     """Push the trained policy to `--policy.repo_id`, if it is given and pushing is on."""
     assert config.policy is not None
     if config.policy.push_to_hub and config.policy.repo_id:
-        for part in (policy, preprocessor, postprocessor):
+        # PEFT pushes its adapters only.
+        configs = [policy.config] if is_wrapped(policy) else []
+        for part in (policy, *configs, preprocessor, postprocessor):
             part.push_to_hub(config.policy.repo_id, private=config.policy.private)
 
 

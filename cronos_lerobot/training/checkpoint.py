@@ -39,10 +39,11 @@ from lerobot.utils.constants import (
 from lerobot.utils.random_utils import deserialize_rng_state, load_rng_state, save_rng_state, serialize_rng_state
 from lerobot.utils.utils import flatten_dict, unflatten_dict
 from safetensors import SafetensorError
-from safetensors.torch import load_file, load_model, save_file
+from safetensors.torch import load_file, save_file
 
 from cronos_lerobot.agents.base import LearningAgent
 from cronos_lerobot.agents.state import to_arrays, to_tensors
+from cronos_lerobot.agents.weights import load_weights, weights_file
 from cronos_lerobot.processes import Processes
 from cronos_lerobot.protocol.loop_state import LoopState
 from cronos_lerobot.training.config import CronosTrainConfig
@@ -137,8 +138,8 @@ def load_checkpoint(run: RunState, config: CronosTrainConfig, folder: Path) -> d
     with _reading(state_dir / LOOP) as path:
         state = json.loads(path.read_text())
     _warn_of_other_count(folder, run.processes)
-    with _reading(folder / PRETRAINED_MODEL_DIR / "model.safetensors") as path:
-        load_model(run.agent.policy, str(path))
+    with _reading(weights_file(run.agent.policy, folder / PRETRAINED_MODEL_DIR)) as path:
+        load_weights(run.agent.policy, path.parent)
     if run.agent.optimizer is not None:
         with _reading(state_dir / OPTIMIZER_STATE):
             load_optimizer_state(run.agent.optimizer, state_dir)

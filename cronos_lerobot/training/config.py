@@ -12,7 +12,7 @@ from typing import Any
 import draccus
 from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import PreTrainedConfig, parser
-from lerobot.configs.default import WandBConfig
+from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.datasets.utils import INFO_PATH
 from lerobot.envs import EnvConfig
@@ -154,6 +154,8 @@ class CronosTrainConfig:
     """When a stream switches task, when the policy learns, and what help a stream gets."""
     algorithm: RLAlgorithmConfig = field(default_factory=PPOConfig)
     """How the policy learns: --algorithm.type=ppo (PocketVLA's settings, default), ppo_paper or another agent."""
+    peft: PeftConfig | None = None
+    """Train adapters in the policy's layers (LoRA) in place of its weights, as in lerobot-train: --peft.r=16"""
     record: RecordConfig = field(default_factory=RecordConfig)
     """Recording of the streams."""
     eval: PeriodicEvaluationConfig = field(default_factory=PeriodicEvaluationConfig)

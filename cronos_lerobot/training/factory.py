@@ -14,6 +14,7 @@ from lerobot.utils.constants import ACTION
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, SequentialVectorEnv, get_scene
 from safetensors import SafetensorError
 
+from cronos_lerobot.agents.weights import wrap
 from cronos_lerobot.evaluation.policy_env import check_task_observation
 from cronos_lerobot.training.config import CronosTrainConfig
 
@@ -80,7 +81,7 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
     if not (path or getattr(policy_config, "checkpoint", None)):
         logging.warning("Training a policy from scratch: its states are not normalised, its success starts at 0.")
     try:
-        policy = make_policy(policy_config, env_cfg=env_config)
+        policy = wrap(make_policy(policy_config, env_cfg=env_config), config.peft)
         if path is None:
             return policy, *make_pre_post_processors(policy_config)
         # Like lerobot-train: the checkpoint's processors, on the device of this run.

@@ -19,7 +19,7 @@ _TABLE = {
     "": {
         FOLLOWED: "resume steps job_name eval_freq eval_at_interventions save_checkpoint save_freq "
         "keep_checkpoints log_freq tensorboard torch_threads wandb.*",
-        REFUSED: "output_dir seed num_envs",
+        REFUSED: "output_dir seed num_envs peft.*",
     },
     "env.": {
         FOLLOWED: "num_threads",

@@ -9,7 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from lerobot_env_cronos import CronosVectorEnv
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_policy
+from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
+from peft import get_peft_model_state_dict
+from safetensors.torch import load_file
 from test_cronos_train import OBSERVATIONS, cronos_train
 from test_imitation import ACT
 from test_trainer import assert_same_run, metrics, weights
@@ -129,12 +133,16 @@ main()
 """
 
 
-@pytest.mark.usefixtures("paid_for_moving")
-def test_smolvla_learns_from_pixels_saves_resumes_and_is_a_lerobot_policy(tmp_path, monkeypatch):
+@pytest.fixture
+def clone(tmp_path):
     pretend_num2words()
     save_tiny_smolvlm(tmp_path / "vlm")
     pixels = {"observation_height": 64, "observation_width": 64}
-    clone = save_policy(tmp_path / "clone", "smolvla", pixels, vlm_model_name=str(tmp_path / "vlm"), **SMOLVLA)
+    return save_policy(tmp_path / "clone", "smolvla", pixels, vlm_model_name=str(tmp_path / "vlm"), **SMOLVLA)
+
+
+@pytest.mark.usefixtures("paid_for_moving")
+def test_smolvla_learns_from_pixels_saves_resumes_and_is_a_lerobot_policy(clone, tmp_path, monkeypatch):
     flags = (f"--policy.path={clone}", *VLA_FLAGS, "--algorithm.critic_observation=environment_state")
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     cronos_train(monkeypatch, *flags, "--steps=40", f"--output_dir={whole}")
@@ -161,3 +169,28 @@ def test_smolvla_learns_from_pixels_saves_resumes_and_is_a_lerobot_policy(tmp_pa
     assert done.returncode == 0, done.stderr[-3000:]
     info = json.loads((tmp_path / "out/eval_info.json").read_text())
     assert len(info["per_task"][0]["metrics"]["sum_rewards"]) == 1
+
+
+@pytest.mark.usefixtures("paid_for_moving")
+def test_lora_learns_saves_resumes_and_is_a_lerobot_policy(clone, tmp_path, monkeypatch):
+    flags = (f"--policy.path={clone}", *VLA_FLAGS, "--peft.r=2")
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    model = "checkpoints/last/pretrained_model"
+    cronos_train(monkeypatch, *flags, "--steps=40", f"--output_dir={whole}")
+    cronos_train(monkeypatch, *flags, "--steps=20", f"--output_dir={broken}")
+    before = load_file(broken / model / "adapter_model.safetensors")
+    resume = ("--resume=true", f"--config_path={broken / model}/train_config.json", "--steps=40")
+    with pytest.raises(SystemExit, match=r"--peft\.r=4, but the run that is resumed has 2"):
+        cronos_train(monkeypatch, *resume, "--peft.r=4")
+    cronos_train(monkeypatch, *resume)
+    after = [load_file(run / model / "adapter_model.safetensors") for run in (whole, broken)]
+    assert metrics(whole) == metrics(broken)
+    assert all(torch.equal(after[0][name], after[1][name]) for name in before)
+    assert any(not torch.equal(before[name], after[0][name]) for name in before)
+    assert not (whole / model / "model.safetensors").exists()
+
+    config = PreTrainedConfig.from_pretrained(whole / model)
+    config.pretrained_path = whole / model
+    policy = make_policy(config, env_cfg=CronosEnvConfig(observation_height=64, observation_width=64))
+    trained = get_peft_model_state_dict(policy)
+    assert all(torch.equal(trained[name], tensor) for name, tensor in after[0].items())

@@ -12,8 +12,9 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 from torch import nn
 
 from cronos_lerobot.agents.adapters.registry import AdapterOptions, register_adapter
-from cronos_lerobot.agents.adapters.vla import Prefix, VLAAdapter, unwrapped
+from cronos_lerobot.agents.adapters.vla import Prefix, VLAAdapter
 from cronos_lerobot.agents.base import Batch
+from cronos_lerobot.agents.weights import unwrapped
 
 
 @register_adapter("smolvla")

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from cronos_lerobot.agents.adapters.flow import FlowAdapter
 from cronos_lerobot.agents.adapters.registry import AdapterOptions
 from cronos_lerobot.agents.base import Batch
+from cronos_lerobot.agents.weights import unwrapped
 
 
 @dataclass(frozen=True)
@@ -83,8 +84,3 @@ class VLAAdapter(FlowAdapter):
     def features(self, batch: Batch) -> Tensor:
         """See `FlowAdapter`."""
         return self.observe(batch)[1]
-
-
-def unwrapped(policy: Any) -> Any:
-    """The LeRobot policy inside PEFT's wrapper, or the policy itself."""
-    return policy.get_base_model() if hasattr(policy, "get_base_model") else policy

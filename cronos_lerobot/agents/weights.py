@@ -1,0 +1,58 @@
+"""A policy's weights in its folder; of one that PEFT wraps only the adapters, beside LeRobot's config."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
+from lerobot.configs.default import PeftConfig
+from safetensors.torch import load_model
+
+ADAPTER_FILE = "adapter_model.safetensors"
+"""PEFT's name of what it saves."""
+
+
+def is_wrapped(policy: Any) -> bool:
+    """Whether PEFT wraps the policy: it has adapters in its layers, and only they are trained."""
+    return hasattr(policy, "peft_config")
+
+
+def unwrapped(policy: Any) -> Any:
+    """The LeRobot policy inside PEFT's wrapper, or the policy itself."""
+    return policy.get_base_model() if is_wrapped(policy) else policy
+
+
+def wrap(policy: Any, config: PeftConfig | None) -> Any:
+    """Return a policy with PEFT's adapters, as `lerobot-train --peft.*` makes them; one that has them keeps them.
+
+    Raises:
+        ValueError: the policy is from scratch, or does not say which layers get adapters.
+    """
+    if config is None or is_wrapped(policy):
+        return policy
+    return policy.wrap_with_peft(peft_cli_overrides=vars(config).copy())
+
+
+def save_policy(policy: Any, folder: Path) -> None:
+    """Write what LeRobot's `make_policy` loads."""
+    policy.save_pretrained(folder)
+    if is_wrapped(policy):
+        # PEFT writes its own config only.
+        policy.config.save_pretrained(folder)
+
+
+def weights_file(policy: Any, folder: Path) -> Path:
+    """Where `save_policy` writes the weights."""
+    return folder / (ADAPTER_FILE if is_wrapped(policy) else SAFETENSORS_SINGLE_FILE)
+
+
+def load_weights(policy: Any, folder: Path) -> None:
+    """Give a policy the weights that `save_policy` wrote."""
+    if not is_wrapped(policy):
+        load_model(policy, str(weights_file(policy, folder)))
+        return
+    from peft import load_peft_weights, set_peft_model_state_dict
+
+    device = str(next(policy.parameters()).device)
+    set_peft_model_state_dict(policy, load_peft_weights(str(folder), device=device))
