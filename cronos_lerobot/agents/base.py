@@ -35,7 +35,9 @@ class TrainablePolicy(Protocol):
     (n = 1: it looks at every control step), and a trace, which is all that `evaluate_actions` needs to know which
     decision it was: tokens, a sample before it was squashed, a denoising chain.
 
-    A policy that decides on more than one action says on how many: its attribute `decision_steps`.
+    A policy that decides on more than one action says on how many: its attribute `decision_steps`. One that looks
+    at more than one observation says at how many: `observation_steps`. Its batches have `observation.*`
+    (B, observation_steps, ...), oldest first, of what has happened since the task began.
 
     A policy whose first layers are frozen may also have `encode_observation(batch) -> Batch` (or None there),
     which replaces inputs by what those layers make of them. It is called once for each observation; what it

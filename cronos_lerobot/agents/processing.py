@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from lerobot.configs import FeatureType, NormalizationMode
 from lerobot.processor import TokenizerProcessorStep
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_LANGUAGE, OBS_STATE, OBS_STR
 
 from cronos_lerobot.agents.base import Batch, Columns
 
@@ -60,7 +60,14 @@ class PolicyProcessors:
         self._encoder = encoder
 
     def batch(self, columns: Columns, instructions: list[str]) -> Batch:
-        """Return the policy's batch: images (B, 3, H, W), states normalised, `task` strings."""
+        """Return the policy's batch: images (B, 3, H, W), states normalised, `task` strings.
+
+        Columns with a history, (B, n_obs, ...), become observations (B, n_obs, ...), each preprocessed by itself.
+        """
+        if length := _history_length(columns):
+            flat = {name: column.reshape(-1, *column.shape[2:]) for name, column in columns.items()}
+            batch = self.batch(flat, [text for text in instructions for _ in range(length)])
+            return {name: _unfold(name, value, length) for name, value in batch.items()}
         batch: Batch = {"task": list(instructions)}
         for name, column in columns.items():
             tensor = torch.from_numpy(np.ascontiguousarray(column)).to(self.device)
@@ -137,3 +144,18 @@ def make_processors(policy: Any, preprocessor: Any, postprocessor: Any) -> Polic
 
 def _to_columns(batch: Batch) -> Columns:
     return {name: value.cpu().numpy() for name, value in batch.items() if isinstance(value, torch.Tensor)}
+
+
+def _history_length(columns: Columns) -> int:
+    """Observations in each row, or 0 if a row is one observation."""
+    for name, column in columns.items():
+        if column.ndim == (5 if name.startswith(OBS_IMAGES) else 3):
+            return column.shape[1]
+    return 0
+
+
+def _unfold(name: str, value: Any, length: int) -> Any:
+    """Rows (B * length, ...) as (B, length, ...); of those of the instruction, all the same, one each: (B, ...)."""
+    if name.startswith(f"{OBS_STR}.") and not name.startswith(OBS_LANGUAGE):
+        return value.unflatten(0, (-1, length))
+    return value[::length] if isinstance(value, torch.Tensor | list) else value

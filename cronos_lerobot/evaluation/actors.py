@@ -16,6 +16,7 @@ from lerobot_env_cronos.expert.expert import ScriptedExpert
 
 from cronos_lerobot.agents.base import Columns, TrainablePolicy
 from cronos_lerobot.agents.chunk_player import make_player
+from cronos_lerobot.agents.history import ObservationHistory, observation_steps
 from cronos_lerobot.agents.processing import PolicyProcessors, observation_columns
 from cronos_lerobot.agents.steering.steered import SteeredPolicy
 
@@ -69,6 +70,7 @@ class SamplingPolicy:
         self._takes_uniform = "uniform" in inspect.signature(policy.sample_actions).parameters
         self._generator = torch.Generator(device=processors.device)
         self._left: dict[int, list[np.ndarray]] = {}
+        self._history = ObservationHistory(observation_steps(policy))
         self._autocast = _autocast(policy, processors)
 
     def seed(self, seed: int) -> None:
@@ -76,7 +78,8 @@ class SamplingPolicy:
         self._generator.manual_seed(seed)
 
     def begin(self, ids: np.ndarray, running: np.ndarray) -> None:
-        """What was decided for another task is not played."""
+        """What was decided for another task is not played, what was seen in it forgotten."""
+        self._history.begin(ids)
         for i in ids:
             self._left.pop(int(i), None)
 
@@ -85,9 +88,10 @@ class SamplingPolicy:
         self, observation: dict[str, Any], instructions: list[str], uniform: np.ndarray, ids: np.ndarray
     ) -> np.ndarray:
         """See `Actor`."""
+        seen = self._history.see(observation_columns(observation), ids.tolist())
         undecided = [row for row, i in enumerate(ids) if not self._left.get(int(i))]
         if undecided:
-            columns = {name: col[undecided] for name, col in observation_columns(observation).items()}
+            columns = {name: col[undecided] for name, col in seen.items()}
             decided = self._decide(columns, [instructions[row] for row in undecided], uniform[undecided])
             self._left |= {int(ids[row]): list(actions) for row, actions in zip(undecided, decided, strict=True)}
         return np.stack([self._left[int(i)].pop(0) for i in ids])

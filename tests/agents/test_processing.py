@@ -74,3 +74,26 @@ def test_each_instruction_of_a_batch_is_tokenized_once():
     expected = [[97, 0], [98, 0], [97, 0], [99, 99], [98, 0]]
     assert batch["observation.language.tokens"].tolist() == expected
     assert batch["observation.language.attention_mask"].tolist() == [[bool(i) for i in row] for row in expected]
+
+
+def test_a_history_is_preprocessed_observation_by_observation():
+    def preprocess(batch):
+        letters = torch.tensor([[len(text)] for text in batch["task"]])
+        renamed = {"observation.renamed": 2 * batch.pop("observation.state")}
+        return batch | renamed | {"observation.language.tokens": letters, "action": None}
+
+    processors = PolicyProcessors(preprocess, lambda action: action)
+    rng = np.random.default_rng(1)
+    pixels = rng.integers(0, 256, (2, 3, 8, 6, 3), dtype=np.uint8)
+    columns = {
+        "observation.images.front": pixels,
+        "observation.state": rng.normal(size=(2, 3, 4)).astype(np.float32),
+    }
+    batch = processors.batch(columns, ["put it", "there"])
+    assert batch["task"] == ["put it", "there"]
+    assert batch["observation.language.tokens"].tolist() == [[6], [5]]
+    assert batch["action"] is None
+    for step in range(3):
+        alone = processors.batch({name: col[:, step] for name, col in columns.items()}, ["put it", "there"])
+        for name in ("observation.images.front", "observation.renamed"):
+            assert torch.equal(batch[name][:, step], alone[name])

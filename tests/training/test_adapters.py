@@ -28,7 +28,7 @@ FLAGS = (
     "--algorithm.ratio=factor", "--algorithm.minibatch_size=8",
 )  # fmt: skip
 DIFFUSION = (
-    "--policy.type=diffusion", "--policy.device=cpu", "--policy.n_obs_steps=1", "--policy.horizon=8",
+    "--policy.type=diffusion", "--policy.device=cpu", "--policy.n_obs_steps=2", "--policy.horizon=8",
     "--policy.n_action_steps=5", "--policy.drop_n_last_frames=1", "--policy.down_dims=[8,16]",
     "--policy.n_groups=4", "--policy.diffusion_step_embed_dim=8", "--policy.num_inference_steps=2",
     *(flag for flag in FLAGS if not flag.startswith("--policy.")),
@@ -105,6 +105,8 @@ def test_diffusion_learns_by_its_chain_saves_resumes_and_is_a_lerobot_policy(tmp
     torch.manual_seed(0)
     shapes = {name: feature.shape for name, feature in adapter.config.input_features.items()}
     batch, noise = {name: torch.rand(2, *shape) for name, shape in shapes.items()}, torch.randn(2, 8, 7)
+    # Of its first observation LeRobot makes both.
+    batch = {name: torch.stack([value, value], 1) for name, value in batch.items()}
     with torch.no_grad():
         actions = adapter.sample_actions(batch, temperature=0, noise=noise)["actions"]
     assert json.loads(acted.stdout.splitlines()[-1]) == actions[:, 0].tolist()

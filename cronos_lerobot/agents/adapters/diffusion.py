@@ -53,6 +53,7 @@ class DiffusionAdapter(DenoisingAdapter):
             feature_width=_condition_width(config),
             first=config.n_obs_steps - 1,
         )
+        self.observation_steps = config.n_obs_steps
         self.eta, self.min_std = options.noise_level, options.noise_std
         self._scheduler = model.noise_scheduler
         self._scheduler.set_timesteps(self.num_steps)

@@ -41,7 +41,7 @@ class PrivilegedCritic(Adapter):
         for name in (OBS_ENV_STATE, OBS_STATE):
             _check_shown(name, shapes)
         self.adapter: Any = adapter
-        self.decision_steps = adapter.decision_steps
+        self.decision_steps, self.observation_steps = adapter.decision_steps, adapter.observation_steps
         width = shapes[OBS_ENV_STATE][0] + shapes[OBS_STATE][0] + TEXT_WIDTH
         self.critic = Critic(width).to(next(adapter.policy.parameters()).device)
 

@@ -31,9 +31,11 @@ class Adapter(nn.Module):
     Attributes:
         policy: the same.
         decision_steps: how many actions it decides on at once.
+        observation_steps: how many observations it looks at.
     """
 
     decision_steps: int = 1
+    observation_steps: int = 1
 
     def __init__(self, policy: Any) -> None:
         super().__init__()

@@ -11,6 +11,7 @@ import torch
 from cronos_lerobot.agents.adapters.registry import Adapter, trained_tensors
 from cronos_lerobot.agents.base import ActionSample, Columns, Decision, LearningAgent, decision_steps
 from cronos_lerobot.agents.decisions import DecisionClock
+from cronos_lerobot.agents.history import ObservationHistory, observation_steps
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
 from cronos_lerobot.agents.ppo.state import join_rollouts, set_optimizer
@@ -22,7 +23,8 @@ from cronos_lerobot.stopwatch import Stopwatch
 class PPOAgent(LearningAgent):
     """Acts, stores and updates.
 
-    When streams decide, and what is learned from: see `DecisionClock`.
+    When streams decide, and what is learned from: see `DecisionClock`. What a policy that looks back has seen of a
+    stream is forgotten where its trace is cut, so at an update nothing is left of it.
 
     Args:
         ppo: holds the policy, its processors and the optimizer.
@@ -49,6 +51,8 @@ class PPOAgent(LearningAgent):
         self.streams = streams
         self.num_steps = decision_steps(ppo.policy)
         self.clock = DecisionClock(self.num_steps)
+        self.history = ObservationHistory(observation_steps(ppo.policy))
+        self._seen: Columns = {}
         self._encoded: Columns = {}
         self._decision: Decision | None = None
         # Dropout and the like stay off in the update too, or the ratio would not be 1 before its first step.
@@ -59,10 +63,11 @@ class PPOAgent(LearningAgent):
         """The next action of each of its streams; a decision where none is left."""
         tau = tau[self.streams]
         with self.stopwatch("infer"):
+            self._seen = self.history.see(observation_columns(o_t), range(len(tau)))
             if self.clock.step == 0:
-                self._begin(*self._decide(observation_columns(o_t), tau))
+                self._begin(*self._decide(self._seen, tau))
             elif self.clock.fresh.any():
-                self._decide_anew(observation_columns(o_t), tau)
+                self._decide_anew(self._seen, tau)
             assert self._decision is not None
             action = self.clock.action()
             log_prob = self._decision.log_prob
@@ -87,9 +92,10 @@ class PPOAgent(LearningAgent):
         is_first, clock = self.clock.step == 0, self.clock
         is_over = clock.store(
             r_t, cut_t, diverged_t, self.ppo.config.gamma,
-            before=lambda: a_t.value if is_first else self._values(o_t, tau),
-            after=lambda: self._values(o_tp1, tau),
+            before=lambda: a_t.value if is_first else self._values(self._seen, tau),
+            after=lambda: self._values(self.history.followed_by(observation_columns(o_tp1), range(len(tau))), tau),
         )  # fmt: skip
+        self.history.begin(np.flatnonzero(cut_t))
         if is_over:
             assert self._decision is not None
             self.buffer.add(
@@ -162,7 +168,7 @@ class PPOAgent(LearningAgent):
         self.clock.begin_anew(decision.actions)
 
     @torch.inference_mode()
-    def _values(self, observation: dict[str, Any], tau: list[str]) -> np.ndarray:
-        encoded = self.ppo.processors.encode(observation_columns(observation), tau)
+    def _values(self, columns: Columns, tau: list[str]) -> np.ndarray:
+        encoded = self.ppo.processors.encode(columns, tau)
         batch = self.ppo.processors.encoded_batch(encoded, tau)
         return self.ppo.policy.predict_values(batch).float().cpu().numpy()
