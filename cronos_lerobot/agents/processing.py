@@ -155,7 +155,7 @@ def _history_length(columns: Columns) -> int:
 
 
 def _unfold(name: str, value: Any, length: int) -> Any:
-    """Rows (B * length, ...) as (B, length, ...); of those of the instruction, all the same, one each: (B, ...)."""
+    """Rows (B * length, ...) as (B, length, ...); of an instruction's, which are all the same, one each."""
     if name.startswith(f"{OBS_STR}.") and not name.startswith(OBS_LANGUAGE):
         return value.unflatten(0, (-1, length))
     return value[::length] if isinstance(value, torch.Tensor | list) else value
