@@ -194,7 +194,10 @@ class LearningAgent(Agent):
 
     @property
     def acting(self) -> Any:
-        """What is evaluated: the policy, or what decides in its place by `sample_actions`."""
+        """What is evaluated: the policy, or what decides in its place by `sample_actions`.
+
+        Another than the policy has a `push_to_hub`, as LeRobot's HubMixin, for what lies beside the policy.
+        """
         return self.policy
 
     def save_pretrained(self, folder: Path) -> None:

@@ -14,6 +14,7 @@ from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import init_logging
 from lerobot_env_cronos import SequentialVectorEnv
 
+from cronos_lerobot.agents.base import LearningAgent
 from cronos_lerobot.agents.registry import check_agent
 from cronos_lerobot.agents.weights import is_wrapped
 from cronos_lerobot.locks import FolderLock
@@ -56,17 +57,19 @@ def train(config: CronosTrainConfig) -> None:
             trainer.load()
         trainer.train()
     if processes.is_main:
-        push_to_hub(config, policy, preprocessor, postprocessor)
+        push_to_hub(config, trainer.agent, preprocessor, postprocessor)
     processes.leave()
 
 
-def push_to_hub(config: CronosTrainConfig, policy: Any, preprocessor: Any, postprocessor: Any) -> None:
-    """Push the trained policy to `--policy.repo_id`, if it is given and pushing is on."""
+def push_to_hub(config: CronosTrainConfig, agent: LearningAgent, preprocessor: Any, postprocessor: Any) -> None:
+    """Push what the agent trained to `--policy.repo_id`, if it is given and pushing is on."""
     assert config.policy is not None
     if config.policy.push_to_hub and config.policy.repo_id:
         # PEFT pushes its adapters only.
-        configs = [policy.config] if is_wrapped(policy) else []
-        for part in (policy, *configs, preprocessor, postprocessor):
+        more = [agent.policy.config] if is_wrapped(agent.policy) else []
+        if agent.acting is not agent.policy:
+            more.append(agent.acting)
+        for part in (agent.policy, *more, preprocessor, postprocessor):
             part.push_to_hub(config.policy.repo_id, private=config.policy.private)
 
 

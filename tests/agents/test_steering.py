@@ -35,7 +35,7 @@ class Noises(torch.nn.Module):
         self.asked = []
 
     def observe(self, batch):
-        x = batch["observation.state"]
+        x = batch["observation.state"].flatten(1)
         self.asked.append(x[:, 0].tolist())
         return x, x
 
@@ -126,6 +126,19 @@ def test_a_divergence_leaves_the_others_decisions_open():
     # Stream 0 went on to x = 5; stream 1, whose last step has no outcome, was at 104.
     assert kept["next_features"].tolist()[:2] == [[5], [104]]
     assert kept["features"].tolist()[2:] == [[5], [105]]
+
+
+def test_what_a_policy_that_looks_back_has_seen_ends_with_the_trace():
+    policy = Noises()
+    policy.observation_steps = 2
+    agent = make_agent(policy)
+    assert agent.steered.shape.features == 2
+    policy.asked.clear()
+    play(agent, [[0, 0]] * 8, diverged={(5, 1)}, cut={(3, 0), (3, 1), (7, 0), (7, 1)})
+    kept = agent.memory.state_dict()
+    # A new task begins at 5 and 105. Stream 1 diverges in its second step, having seen 105 and 106.
+    assert kept["features"].tolist() == [[1, 1], [101, 101], [5, 5], [105, 105]]
+    assert kept["next_features"].tolist() == [[4, 5], [104, 105], [8, 9], [105, 106]]
 
 
 def make_sac(**options):

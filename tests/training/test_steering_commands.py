@@ -8,7 +8,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from safetensors import safe_open
 from safetensors.torch import load_file
-from test_adapters import FLAGS, SMOLVLA, VLA_FLAGS
+from test_adapters import DIFFUSION, FLAGS, SMOLVLA, VLA_FLAGS
 from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
 from test_steering_runs import assert_same_run
 from test_trainer import metrics
@@ -81,6 +81,20 @@ def test_pocketvlas_flow_head_is_steered_from_the_state(tmp_path, monkeypatch):
         # State, environment's state and words; the noise of six steps of seven dimensions, mean and deviation.
         assert (shape["observation"], shape["features"]) == ("state", 13 + 48 + 32)
         assert actor.get_slice("actor.head.bias").get_shape() == [2 * 6 * 7]
+
+
+def test_a_diffusion_that_looks_back_is_steered(tmp_path, monkeypatch):
+    flags = [flag for flag in DIFFUSION if not flag.startswith("--algorithm.")]
+    flags += ["--policy.noise_scheduler_type=DDIM", "--algorithm.type=steering", "--algorithm.batch_size=8"]
+    flags += ["--algorithm.warmup_decisions=8", "--algorithm.observation=policy", "--algorithm.hidden_width=16"]
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    cronos_train(monkeypatch, *flags, "--steps=160", f"--output_dir={whole}")
+    cronos_train(monkeypatch, *flags, "--steps=80", f"--output_dir={broken}")
+    last = broken / "checkpoints/last/pretrained_model"
+    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=160")
+    assert_same_run(whole, broken)
+    # Four streams decide every five steps: 16 times in an update.
+    assert [line["agent"]["decisions"] for line in metrics(whole) if line["kind"] == "update"] == [16, 32]
 
 
 def policy_config(folder):

@@ -13,6 +13,7 @@ from torch import Tensor
 from cronos_lerobot.agents.adapters.registry import make_steerable
 from cronos_lerobot.agents.base import ActionSample, Columns, LearningAgent, decision_steps
 from cronos_lerobot.agents.decisions import DecisionClock
+from cronos_lerobot.agents.history import ObservationHistory, observation_steps
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.agents.registry import AgentContext, register_agent
 from cronos_lerobot.agents.state import map_leaves, to_arrays, to_tensors
@@ -46,6 +47,7 @@ class SteeringAgent(LearningAgent):
         self._rng, self._generator = context.rng("minibatches"), context.torch_rng("actions")
         steerable = make_steerable(self.policy).eval().requires_grad_(False)
         self.clock = DecisionClock(decision_steps(steerable, context.task_switch_interval))
+        self.history = ObservationHistory(observation_steps(steerable))
         observation = resolve_observation(self.config.observation, self.policy.config)
         shape = SteeringShape(
             features=feature_width(observation, steerable, self._processors),
@@ -65,6 +67,7 @@ class SteeringAgent(LearningAgent):
         self.memory = ReplayMemory(-(-self.config.memory_size // self._processes.count))
         self.num_steps = 0
         self._new = 0
+        self._seen: Columns = {}
         self._waiting: Columns = {}
 
     @property
@@ -76,18 +79,19 @@ class SteeringAgent(LearningAgent):
         """Save the policy as LeRobot does, and the actor beside it."""
         super().save_pretrained(folder)
         if self.num_steps:
-            self.steered.save_actor(folder)
+            self.steered.save_pretrained(folder)
 
     @torch.inference_mode()
     def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
         """The next action of each of its streams; a decision where none is left."""
         tau = tau[self._streams]
         with self._stopwatch("infer"):
+            self._seen = self.history.see(observation_columns(o_t), range(len(tau)))
             if self.clock.step == 0:
-                self._begin(observation_columns(o_t), tau)
+                self._begin(self._seen, tau)
             elif self.clock.fresh.any():
                 who = np.flatnonzero(self.clock.fresh)
-                columns = {name: col[who] for name, col in observation_columns(o_t).items()}
+                columns = {name: col[who] for name, col in self._seen.items()}
                 self.clock.begin_anew(self._decide(columns, [tau[i] for i in who])[0])
             return ActionSample(self.clock.action(), self._log_prob, self._value)
 
@@ -106,12 +110,15 @@ class SteeringAgent(LearningAgent):
         Where the trace is cut, `o_tp1` follows it, or `o_t` if there is no outcome.
         """
         mine, is_first = self._streams, self.clock.step == 0
-        tau = tau[mine]
+        tau, cut_t = tau[mine], cut_t[mine]
         is_over = self.clock.store(
-            r_t[mine], cut_t[mine], diverged_t[mine], self.config.gamma,
-            before=lambda: self._features if is_first else self._observe(o_t, tau),
-            after=lambda: self._observe(o_tp1, tau),
+            r_t[mine], cut_t, diverged_t[mine], self.config.gamma,
+            before=lambda: self._features if is_first else self._observe(self._seen, tau),
+            after=lambda: self._observe(
+                self.history.followed_by(observation_columns(o_tp1), range(len(tau))), tau
+            ),
         )  # fmt: skip
+        self.history.begin(np.flatnonzero(cut_t))
         if is_over:
             self._waiting = {
                 "features": self._features,
@@ -184,9 +191,8 @@ class SteeringAgent(LearningAgent):
         return physical, features, choice, log_prob
 
     @torch.inference_mode()
-    def _observe(self, observation: dict[str, Any], tau: list[str]) -> np.ndarray:
-        batch = self._processors.batch(observation_columns(observation), tau)
-        return self.steered.observe(batch)[1].cpu().numpy()
+    def _observe(self, columns: Columns, tau: list[str]) -> np.ndarray:
+        return self.steered.observe(self._processors.batch(columns, tau))[1].cpu().numpy()
 
     def _remember(self, next_features: np.ndarray) -> None:
         """Remember the decisions that are over; where they were not cut, `next_features` (N, F) follow."""

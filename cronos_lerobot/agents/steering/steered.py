@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lerobot.utils.hub import HubMixin
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 from cronos_lerobot.agents.adapters import builtin as _builtin  # noqa: F401 -- registers them
 from cronos_lerobot.agents.adapters.registry import make_steerable
 from cronos_lerobot.agents.base import Batch
+from cronos_lerobot.agents.history import observation_steps
 from cronos_lerobot.agents.steering.networks import NoiseActor, Whitening
 from cronos_lerobot.agents.steering.observation import state_features
 
@@ -39,7 +41,7 @@ class SteeringShape:
     hidden_width: int
 
 
-class SteeredPolicy(nn.Module):
+class SteeredPolicy(nn.Module, HubMixin):
     """Plays what the frozen policy makes of the noise that the actor chooses.
 
     The actor chooses the noise of the action's dimensions, for every step of the chunk or one for all; that of
@@ -54,7 +56,7 @@ class SteeredPolicy(nn.Module):
         super().__init__()
         self.steerable, self.shape = steerable, shape
         self.policy = getattr(steerable, "policy", steerable)
-        self.config = self.policy.config
+        self.config, self.observation_steps = self.policy.config, observation_steps(steerable)
         self._action_dims = self.config.action_feature.shape[0]
         steps = 1 if shape.noise_repeat else steerable.shape[0]
         self.dims = steps * self._action_dims
@@ -97,11 +99,11 @@ class SteeredPolicy(nn.Module):
         actions = self.denoise(context, choice)
         return {"actions": actions, "trace": choice, "log_prob": log_prob, "value": torch.zeros_like(log_prob)}
 
-    def save_actor(self, folder: Path) -> None:
-        """Write the actor into a policy's folder."""
+    def _save_pretrained(self, save_directory: Path) -> None:
+        """Write the actor into a policy's folder; `save_pretrained` and `push_to_hub` are LeRobot's."""
         own = {name: tensor for name, tensor in self.state_dict().items() if name.startswith(OWN)}
         tensors = {name: tensor.cpu().contiguous() for name, tensor in own.items()}
-        save_file(tensors, folder / STEERING, {"shape": json.dumps(asdict(self.shape))})
+        save_file(tensors, save_directory / STEERING, {"shape": json.dumps(asdict(self.shape))})
 
 
 def with_steering(policy: Any, folder: Path | None) -> Any:
