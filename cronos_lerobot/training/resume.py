@@ -41,7 +41,7 @@ _TABLE = {
         "utd warmup_decisions target_update target_entropy backup_entropy "
         "value_max_grad_norm beta1 "
         "beta2 weight_decay",
-        REFUSED: "type kl_base_coef temperature noise_std noise_level critic_observation *",
+        REFUSED: "type kl_base_coef temperature noise_std noise_level noise_steps critic_observation *",
     },
     "record.": {FOLLOWED: "flush_interval_s", REFUSED: "repo_id root streams filmed_streams"},
     "eval.": {FOLLOWED: "n_episodes repetitions split temperature batch_size seed"},

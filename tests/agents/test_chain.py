@@ -39,8 +39,8 @@ class GaussianFlowAdapter(FlowAdapter):
         return self.policy.velocity(x, time)
 
 
-def make_adapter(steps, level, shape=(3, 4)):
-    options = AdapterOptions(noise_level=level)
+def make_adapter(steps, level, shape=(3, 4), noise_steps=None):
+    options = AdapterOptions(noise_level=level, noise_steps=noise_steps)
     return GaussianFlowAdapter(GaussianFlow(), options, shape=shape, num_steps=steps, feature_width=1)
 
 
@@ -113,3 +113,52 @@ def test_gradients_of_a_chain_are_finite_differences():
             results.append(float(adapter.evaluate_actions(batch, sample["trace"])["log_prob"].sum()))
             scale -= change
     assert float(scale.grad) == pytest.approx((results[0] - results[1]) / 2e-5, rel=1e-5)
+
+
+@torch.no_grad()
+def test_noise_at_some_steps_alone():
+    """Two of five: the others are LeRobot's, and of five steps an update looks at two."""
+    adapter, rows = make_adapter(5, 0.5, noise_steps=2), torch.arange(1000)
+    looked = []
+    velocity = adapter.velocity
+    adapter.velocity = lambda context, x, time: looked.append(time) or velocity(context, x, time)
+    noise = torch.randn(1000, 3, 4, generator=torch.Generator().manual_seed(1))
+    sample = adapter.sample_actions(make_batch(1000), generator=torch.Generator().manual_seed(2), noise=noise)
+    assert len(looked) == 5
+    trace = sample["trace"]
+    assert trace.shape == (1000, 2, 7, 4)
+    before, after, numbers = trace[:, :, :3], trace[:, :, 3:6], trace[:, :, 6, 0].long()
+    assert (numbers[:, 0] < numbers[:, 1]).all()
+    # Each pair of five steps is as likely as another: a tenth, within four standard errors.
+    pairs = torch.bincount(5 * numbers[:, 0] + numbers[:, 1], minlength=25)
+    assert (pairs > 0).sum() == 10
+    assert all(abs(int(count) - 100) < 4 * 90**0.5 for count in pairs if count)
+    # From the noise to the first of them, between them, and to the actions: Euler steps of the velocity.
+    x = noise.clone()
+    for k in range(5):
+        for j in range(2):
+            here = numbers[:, j] == k
+            torch.testing.assert_close(x[here], before[here, j], atol=1e-6, rtol=0)
+            x[here] = after[here, j]
+        quiet = (numbers != k).all(1)
+        t = torch.full((int(quiet.sum()),), 1 - k / 5)
+        x[quiet] -= 0.2 * adapter.policy.velocity(x[quiet], t)
+    torch.testing.assert_close(sample["actions"], x[:, :2, :2], atol=1e-6, rtol=0)
+    # The likelihood of the steps with noise is that of the same steps of a chain in which all have noise.
+    looked.clear()
+    log_prob = adapter.evaluate_actions(make_batch(1000), trace)["log_prob"]
+    assert len(looked) == 2
+    assert log_prob.shape == (1000, 2)
+    torch.testing.assert_close(log_prob, sample["log_prob"], atol=1e-5, rtol=0)
+    whole = make_adapter(5, 0.5)
+    for k in range(5):
+        chain = torch.zeros(1000, 6, 3, 4)
+        chosen, j = (numbers == k).any(1), (numbers == k).int().argmax(1)
+        chain[:, k], chain[:, k + 1] = before[rows, j], after[rows, j]
+        of_step = whole.evaluate_actions(make_batch(1000), chain)["log_prob"][:, k]
+        torch.testing.assert_close(of_step[chosen], log_prob[rows, j][chosen], atol=1e-5, rtol=0)
+
+
+def test_noise_at_more_steps_than_there_are_is_refused():
+    with pytest.raises(ValueError, match=r"noise_steps=6, but the policy denoises in 5 steps: give 5 or fewer"):
+        make_adapter(5, 0.5, noise_steps=6)

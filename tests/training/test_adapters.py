@@ -112,6 +112,13 @@ def test_diffusion_learns_by_its_chain_saves_resumes_and_is_a_lerobot_policy(tmp
     assert json.loads(acted.stdout.splitlines()[-1]) == actions[:, 0].tolist()
 
 
+def test_noise_at_some_steps_is_for_flows(tmp_path, monkeypatch):
+    with pytest.raises(
+        SystemExit, match=r"noise_steps=1 is for flow policies; --policy\.type=act has no such steps"
+    ):
+        cronos_train(monkeypatch, *FLAGS, "--algorithm.noise_steps=1", f"--output_dir={tmp_path / 'run'}")
+
+
 def test_chunks_that_reach_beyond_a_switch_are_refused(tmp_path, monkeypatch):
     flags = [flag.replace("n_action_steps=5", "n_action_steps=3") for flag in FLAGS]
     with pytest.raises(SystemExit, match=r"3 actions at once.*Choose --policy\.n_action_steps from \[1, 2, 5\]"):
@@ -145,7 +152,12 @@ def clone(tmp_path):
 
 @pytest.mark.usefixtures("paid_for_moving")
 def test_smolvla_learns_from_pixels_saves_resumes_and_is_a_lerobot_policy(clone, tmp_path, monkeypatch):
-    flags = (f"--policy.path={clone}", *VLA_FLAGS, "--algorithm.critic_observation=environment_state")
+    flags = (
+        f"--policy.path={clone}",
+        *VLA_FLAGS,
+        "--algorithm.critic_observation=environment_state",
+        "--algorithm.noise_steps=2",
+    )
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     cronos_train(monkeypatch, *flags, "--steps=40", f"--output_dir={whole}")
     cronos_train(monkeypatch, *flags, "--steps=20", f"--output_dir={broken}")

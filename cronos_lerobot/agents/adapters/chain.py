@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.distributions import Normal
 
-Step = Callable[[int, Tensor], tuple[Tensor, Tensor]]
+Step = Callable[[Any, Tensor], tuple[Tensor, Tensor]]
 """k in 0 .. S-1 and x_k (B, H, D) -> mean (B, H, D) and standard deviation, that shape or one that broadcasts to
-it, of x_{k+1}. A deviation of 0 is a step without noise."""
+it, of x_{k+1}. A deviation of 0 is a step without noise. A flow's takes also (B,) of k, a number for each row."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def sample_chain(
         noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
         # Not mean + 0 * noise where there is none: exactly what the policy itself would do.
         x = torch.where(std > 0, mean + std * noise, mean)
-        log_probs.append(_log_prob(mean, std, x, scored))
+        log_probs.append(step_log_prob(mean, std, x, scored))
         chain.append(x)
     return torch.stack(chain, 1), torch.stack(log_probs, 1)
 
@@ -64,11 +65,12 @@ def chain_log_prob(step: Step, chain: Tensor, scored: Scored) -> Tensor:
     log_probs = []
     for k in range(chain.shape[1] - 1):
         mean, std = step(k, chain[:, k])
-        log_probs.append(_log_prob(mean, std, chain[:, k + 1], scored))
+        log_probs.append(step_log_prob(mean, std, chain[:, k + 1], scored))
     return torch.stack(log_probs, 1)
 
 
-def _log_prob(mean: Tensor, std: Tensor, x: Tensor, scored: Scored) -> Tensor:
+def step_log_prob(mean: Tensor, std: Tensor, x: Tensor, scored: Scored) -> Tensor:
+    """Return the log-likelihood (B,) [nats] of x (B, H, D) after a step; 0 where it has no noise."""
     mean, x, std = scored(mean), scored(x), scored(std.expand_as(mean))
     noisy = std > 0
     log_prob = Normal(mean, torch.where(noisy, std, 1.0)).log_prob(x)

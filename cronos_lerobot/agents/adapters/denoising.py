@@ -83,10 +83,21 @@ class DenoisingAdapter(Adapter):
             noise = torch.randn(
                 (len(features), *self.shape), generator=generator, device=features.device, dtype=torch.float32
             )
+        end, trace, log_prob = self.draw(context, noise, temperature, generator)
+        value = self.values(batch, context, features)
+        return {"actions": self.scored(end), "trace": trace, "log_prob": log_prob, "value": value}
+
+    def draw(
+        self, context: Any, noise: Tensor, temperature: float, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return x_S (B, H, D), the trace and `log_prob` (B, L) of a denoising that begins with `noise`."""
         step = self.step(context, temperature)
         chain, log_prob = sample_chain(step, noise, self.num_steps, self.scored, generator)
-        actions, value = self.scored(chain[:, -1]), self.values(batch, context, features)
-        return {"actions": actions, "trace": chain, "log_prob": log_prob, "value": value}
+        return chain[:, -1], chain, log_prob
+
+    def judge(self, context: Any, trace: Tensor, temperature: float) -> Tensor:
+        """Return, differentiably, `log_prob` (B, L) of a trace."""
+        return chain_log_prob(self.step(context, temperature), trace, self.scored)
 
     def denoise(self, context: Any, noise: Tensor) -> Tensor:
         """See `Steerable`."""
@@ -100,7 +111,7 @@ class DenoisingAdapter(Adapter):
     ) -> dict[str, Tensor | None]:
         """See `TrainablePolicy`; the chain's entropy does not depend on the policy."""
         context, features = self.observe(batch)
-        log_prob = chain_log_prob(self.step(context, temperature), trace, self.scored)
+        log_prob = self.judge(context, trace, temperature)
         return {"log_prob": log_prob, "entropy": None, "value": self.values(batch, context, features)}
 
     def predict_values(self, batch: Batch) -> Tensor:

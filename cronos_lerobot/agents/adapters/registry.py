@@ -20,6 +20,8 @@ class AdapterOptions:
     """Standard deviation at the start, in normalised units, of the noise that an adapter adds to actions."""
     noise_level: float = 0.5
     """Noise of a flow policy's denoising; 0 has none, 1 about that of the policy's own first noise."""
+    noise_steps: int | None = None
+    """At how many steps of a flow policy's denoising there is noise; None is all."""
 
 
 class Adapter(nn.Module):

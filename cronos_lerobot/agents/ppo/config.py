@@ -67,6 +67,7 @@ RANGES = {
     "temperature": ABOVE_0,
     "noise_std": ABOVE_0,
     "noise_level": ABOVE_0,
+    "noise_steps": COUNT,
 }
 """Valid values of the numbers; those that may be null are free to be."""
 
@@ -144,6 +145,9 @@ class PPOConfig(RLAlgorithmConfig):
     none of its own (ACT); it is learned."""
     noise_level: float = 0.5
     """Noise of the denoising of a flow policy (PocketVLA's flow head, SmolVLA, pi0), which has none of its own."""
+    noise_steps: int | None = None
+    """At how many steps of a flow policy's denoising there is noise, drawn for each decision; an update evaluates
+    the network at these alone. null is all of them."""
     critic_observation: str = "policy"
     """What the critic beside a policy that has none of its own (ACT, SmolVLA, pi0) reads: what the `policy` makes
     of its observation, or the privileged `environment_state`, the robot's state and the instruction; the

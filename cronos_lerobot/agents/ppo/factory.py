@@ -22,15 +22,21 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
     Raises:
         ValueError: the policy does not say how likely its decisions were, or decides beyond a task switch.
     """
-    options = AdapterOptions(noise_std=context.config.noise_std, noise_level=context.config.noise_level)
+    config = context.config
+    options = AdapterOptions(config.noise_std, config.noise_level, config.noise_steps)
     policy = make_trainable(context.policy, options)
-    if context.config.critic_observation == "environment_state":
+    if config.noise_steps is not None and not hasattr(policy, "noise_steps"):
+        raise ValueError(
+            f"--algorithm.noise_steps={config.noise_steps} is for flow policies; "
+            f"--policy.type={policy.config.type} has no such steps."
+        )
+    if config.critic_observation == "environment_state":
         policy = _with_privileged_critic(policy, context)
     if isinstance(policy, Adapter):
         context.processes.copy_from_main([*policy.own_parameters().values()])
     mine = context.streams
     # Every process draws its own minibatches and actions.
-    ppo = PPO(policy, context.processors, context.config, context.rng("minibatches"), context.processes)
+    ppo = PPO(policy, context.processors, config, context.rng("minibatches"), context.processes)
     steps = decision_steps(policy, context.task_switch_interval)
     buffer = RolloutBuffer(context.update_interval // steps, mine.stop - mine.start)
     return PPOAgent(ppo, buffer, context.torch_rng("actions"), context.stopwatch, mine)
