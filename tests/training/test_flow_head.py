@@ -1,0 +1,124 @@
+"""PocketVLA's flow head from demonstrations to an evaluation, by the commands."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from lerobot.policies import make_pre_post_processors
+from lerobot_env_cronos import CronosEnvConfig, SequentialVectorEnv, get_scene
+from lerobot_policy_pocketvla import PocketVLAFlowPolicy, PocketVLAPolicy
+from test_adapters import paid_for_moving  # noqa: F401
+from test_cronos_train import OBSERVATIONS, cronos_train
+from test_trainer import assert_same_run, metrics, weights
+from tiny_checkpoints import STATE, save_policy
+
+from cronos_lerobot.agents.processing import make_processors
+from cronos_lerobot.evaluation.independent import run_independent
+from cronos_lerobot.scripts import eval as cronos_eval
+from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig, record_demos
+
+TINY = (
+    "--policy.device=cpu", "--policy.hidden_width=16", "--policy.hidden_depth=1", "--policy.flow_width=16",
+    "--policy.flow_depth=1", "--policy.num_inference_steps=3",
+)  # fmt: skip
+TRAIN = (
+    "--env.type=cronos", "--num_envs=2", "--protocol.task_switch_interval=10", "--protocol.update_interval=10",
+    "--protocol.scene_reset_interval=10", "--save_freq=20", "--eval_freq=0", "--tensorboard=false",
+    "--algorithm.value_warmup_updates=0", "--algorithm.ratio=factor", "--algorithm.minibatch_size=4",
+)  # fmt: skip
+WITHOUT_US = """
+import sys
+sys.modules["cronos_lerobot"] = None
+from lerobot.scripts.{command} import main
+main()
+"""
+
+
+def lerobot(command, *flags):
+    """One of LeRobot's commands, in a process that has the policy's and the scenes' packages, and not ours."""
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_US.format(command=command), *map(str, flags)],
+        env=os.environ | {"HF_HUB_OFFLINE": "1"}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def trains_saves_and_resumes(folder, monkeypatch, *flags):
+    """Returns the weights after one update and after the second, and the checkpoint."""
+    whole, broken = folder / "whole", folder / "broken"
+    cronos_train(monkeypatch, *flags, *TRAIN, "--steps=40", f"--output_dir={whole}")
+    cronos_train(monkeypatch, *flags, *TRAIN, "--steps=20", f"--output_dir={broken}")
+    before = weights(broken)
+    last = broken / "checkpoints/last/pretrained_model"
+    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=40")
+    assert_same_run(whole, broken)
+    updates = [line["agent"] for line in metrics(whole) if line["kind"] == "update"]
+    assert len(updates) == 2
+    assert all(update["policy_grad_norm"] > 0 and update["value_grad_norm"] > 0 for update in updates)
+    return before, weights(whole), whole / "checkpoints/last/pretrained_model"
+
+
+@pytest.mark.usefixtures("paid_for_moving")
+def test_cloned_trained_and_evaluated_by_the_commands(tmp_path, monkeypatch):
+    demos = DemoDatasetConfig("me/demos", tmp_path / "demos", 2)
+    record_demos(RecordDemosConfig(env=CronosEnvConfig(**STATE), dataset=demos, num_envs=2))
+    lerobot(
+        "lerobot_train", "--policy.type=pocketvla", "--policy.head=flow", *TINY, "--policy.push_to_hub=false",
+        "--dataset.repo_id=me/demos", f"--dataset.root={tmp_path / 'demos'}", "--batch_size=8", "--steps=2",
+        "--num_workers=0", f"--output_dir={tmp_path / 'clone'}",
+    )  # fmt: skip
+    clone = tmp_path / "clone/checkpoints/last/pretrained_model"
+    flags = (f"--policy.path={clone}", *OBSERVATIONS["state"])
+    before, after, checkpoint = trains_saves_and_resumes(tmp_path, monkeypatch, *flags)
+    for part in ("actor.", "head.", "value_head.", "critic."):
+        assert any(not torch.equal(before[name], after[name]) for name in after if name.startswith(part)), part
+
+    policy = PocketVLAPolicy.from_pretrained(checkpoint)
+    assert isinstance(policy, PocketVLAFlowPolicy)
+    assert policy.state_dict().keys() == after.keys()
+    lerobot(
+        "lerobot_eval", f"--policy.path={checkpoint}", "--policy.device=cpu", "--env.type=cronos",
+        *OBSERVATIONS["state"], "--env.render_size=[32, 32]", "--env.task=put the ketchup bottle on the cloth",
+        "--eval.n_episodes=1", "--eval.batch_size=1", f"--output_dir={tmp_path / 'out'}",
+    )  # fmt: skip
+    info = json.loads((tmp_path / "out/eval_info.json").read_text())
+    assert len(info["per_task"][0]["metrics"]["sum_rewards"]) == 1
+
+    monkeypatch.setattr(sys, "argv", [
+        "cronos-eval", f"--policy.path={checkpoint}", "--policy.device=cpu", "--eval.n_episodes=1",
+        "--eval.splits=train", "--eval.suites=independent", "--eval.videos=0", f"--output_dir={tmp_path / 'eval'}",
+    ])  # fmt: skip
+    cronos_eval.main()
+    results = json.loads((tmp_path / "eval/results.json").read_text())
+    assert results["independent"]["train"]["n"] == 4
+    # Nothing is sampled at a temperature; the noise that a chunk begins with is the policy's own.
+    assert results["temperature"] is None
+
+
+def test_an_evaluation_repeats_with_its_seed(tmp_path):
+    checkpoint = save_policy(tmp_path, "pocketvla", STATE, head="flow", hidden_width=16, flow_width=16)
+    policy = PocketVLAPolicy.from_pretrained(checkpoint)
+    processors = make_processors(policy, *make_pre_post_processors(policy.config, str(checkpoint)))
+    env = SequentialVectorEnv(2, ordering=get_scene("kitchen_2x2").tasks, window=20, **STATE)
+    options = {"n_episodes": 1, "split": "train", "temperature": 0.6, "keeps_states": True}
+    paths = []
+    for seed in (3, 3, 4):
+        torch.rand(1)  # Whatever else was drawn.
+        results = run_independent(env, policy, processors, seed=seed, **options)
+        paths.append(np.stack([result.trajectory.qpos for result in results]))
+    assert np.array_equal(paths[0], paths[1])
+    assert not np.array_equal(paths[0], paths[2])
+
+
+@pytest.mark.usefixtures("paid_for_moving")
+def test_a_frozen_encoder_is_asked_once_for_an_observation(tmp_path, monkeypatch):
+    flags = ("--policy.type=pocketvla", "--policy.head=flow", "--policy.freeze_encoder=true", *TINY)
+    before, after, _ = trains_saves_and_resumes(tmp_path, monkeypatch, *flags, *OBSERVATIONS["pixels"])
+    moved = {name for name, tensor in after.items() if not torch.equal(tensor, before[name])}
+    assert [name for name in moved if name.startswith("head.")]
+    assert [name for name in moved if name.startswith("actor.trunk.")]
+    assert not [name for name in moved if name.startswith(("actor.encoder.", "actor.text."))]
