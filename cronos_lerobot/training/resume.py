@@ -34,7 +34,8 @@ _TABLE = {
         REFUSED: "task_switch_interval learned_reset reward",
     },
     "algorithm.": {
-        FOLLOWED: "epochs value_epochs value_warmup_updates minibatch_size grad_accumulation clip ratio gamma "
+        FOLLOWED: "epochs value_epochs value_warmup_updates minibatch_size grad_accumulation clip ratio "
+        "denoising_discount gamma "
         "gae_lambda normalize_advantage entropy_coef value_coef value_loss huber_delta value_clip policy_lr "
         "value_lr lr_schedule target_kl kl_stop_factor lr_factor policy_lr_min policy_lr_max max_grad_norm "
         "steps_per_update batch_size warmup_segments tail_steps memory_gib "

@@ -7,7 +7,7 @@ import torch
 from cronos_lerobot.agents.base import decision_steps
 from cronos_lerobot.agents.ppo.agent import PPOAgent
 from cronos_lerobot.agents.ppo.config import PPOConfig
-from cronos_lerobot.agents.ppo.losses import by_factor
+from cronos_lerobot.agents.ppo.losses import by_factor, factor_weights
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
 from cronos_lerobot.agents.processing import PolicyProcessors
@@ -150,6 +150,25 @@ def test_ratios_of_decisions_and_of_factors(ratio):
     factors = 1 if ratio == "decision" else 2
     assert metrics["approx_kl"] == pytest.approx(factors * (np.exp(shift) - 1 - shift), rel=1e-3)
     assert "entropy" not in metrics
+
+
+def test_the_first_steps_of_a_denoising_may_count_less():
+    assert factor_weights(torch.zeros(5, 3), 0.5).tolist() == [0.25, 0.5, 1]
+    assert factor_weights(torch.zeros(5, 1), 1.0).tolist() == [1]
+    options = {"target_kl": None, "lr_schedule": "fixed", "epochs": 1, "normalize_advantage": False}
+    losses = []
+    for discount in (1.0, 0.5):
+        agent, policy = make_agent(ratio="factor", denoising_discount=discount, **options)
+        with torch.no_grad():
+            policy.actor.weight.fill_(0.0)
+            policy.actor.bias.fill_(0.5)
+        play(agent, 8, [[1, 1]] * 8, cut={(7, 0), (7, 1)})
+        losses.append(agent.update()["policy_loss"])
+    # Both factors of a decision have the same ratio: (1/2 + 1) / 2 of the loss is left.
+    assert losses[0] != 0
+    assert losses[1] == pytest.approx(0.75 * losses[0])
+    with pytest.raises(ValueError, match=r"denoising_discount=0\.5 is between factors"):
+        PPOConfig(denoising_discount=0.5)
 
 
 def test_an_entropy_bonus_needs_an_entropy():

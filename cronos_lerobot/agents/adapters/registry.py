@@ -17,9 +17,11 @@ class AdapterOptions:
     """What an agent asks of an adapter."""
 
     noise_std: float = 0.1
-    """Standard deviation at the start, in normalised units, of the noise that an adapter adds to actions."""
+    """Standard deviation at the start, in normalised units, of the noise that an adapter adds to actions; the
+    least deviation of a diffusion's step."""
     noise_level: float = 0.5
-    """Noise of a flow policy's denoising; 0 has none, 1 about that of the policy's own first noise."""
+    """Noise of a flow policy's denoising; 0 has none, 1 about that of the policy's own first noise. Of a
+    diffusion policy DDIM's eta."""
     noise_steps: int | None = None
     """At how many steps of a flow policy's denoising there is noise; None is all."""
 

@@ -45,6 +45,7 @@ RANGES = {
     "minibatch_size": COUNT,
     "grad_accumulation": COUNT,
     "clip": Interval(0, 1, with_low=False),
+    "denoising_discount": Interval(0, 1, with_low=False),
     "gamma": SHARE,
     "gae_lambda": SHARE,
     "entropy_coef": FROM_0,
@@ -92,6 +93,9 @@ class PPOConfig(RLAlgorithmConfig):
     ratio: str = "decision"
     """What has a ratio: the whole `decision`, or each `factor` of it, if the policy tells them apart (the steps of
     a denoising chain)."""
+    denoising_discount: float = 1.0
+    """Of L factors the last one counts in the policy's loss, each before it this much of the one after it (DPPO's
+    denoising discount): the first steps of a denoising are forgotten by those that follow."""
     gamma: float = 0.99
     """Discount factor per control step (0.2 s)."""
     gae_lambda: float = 0.9
@@ -142,16 +146,17 @@ class PPOConfig(RLAlgorithmConfig):
     """Sampling temperature while training."""
     noise_std: float = 0.1
     """Standard deviation at the start, in normalised units, of the noise around the actions of a policy that has
-    none of its own (ACT); it is learned."""
+    none of its own (ACT), where it is learned; the least deviation of a step of Diffusion's denoising."""
     noise_level: float = 0.5
-    """Noise of the denoising of a flow policy (PocketVLA's flow head, SmolVLA, pi0), which has none of its own."""
+    """Noise of the denoising of a flow policy (PocketVLA's flow head, SmolVLA, pi0), which has none of its own;
+    Diffusion's is DDIM's eta, from 0 to 1."""
     noise_steps: int | None = None
     """At how many steps of a flow policy's denoising there is noise, drawn for each decision; an update evaluates
     the network at these alone. null is all of them."""
     critic_observation: str = "policy"
-    """What the critic beside a policy that has none of its own (ACT, SmolVLA, pi0) reads: what the `policy` makes
-    of its observation, or the privileged `environment_state`, the robot's state and the instruction; the
-    environment then shows it beside pixels."""
+    """What the critic beside a policy that has none of its own (ACT, Diffusion, SmolVLA, pi0) reads: what the
+    `policy` makes of its observation, or the privileged `environment_state`, the robot's state and the
+    instruction; the environment then shows it beside pixels."""
 
     def __post_init__(self) -> None:
         for name, interval in RANGES.items():
@@ -164,6 +169,11 @@ class PPOConfig(RLAlgorithmConfig):
         ):  # fmt: skip
             if getattr(self, name) not in choices:
                 raise ValueError(f"algorithm.{name} must be one of {choices}, got {getattr(self, name)!r}.")
+        if self.denoising_discount < 1 and self.ratio != "factor":
+            raise ValueError(
+                f"algorithm.denoising_discount={self.denoising_discount} is between factors: it needs "
+                "algorithm.ratio=factor."
+            )
         if self.target_kl is None and self.lr_schedule != "fixed":
             raise ValueError(f"algorithm.lr_schedule={self.lr_schedule} needs algorithm.target_kl.")
         if self.policy_lr_min > self.policy_lr_max:

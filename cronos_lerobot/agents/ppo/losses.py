@@ -35,6 +35,12 @@ def clipped_objective(log_ratio: Tensor, advantage: Tensor, clip: float) -> Tens
     return torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)
 
 
+def factor_weights(log_ratio: Tensor, discount: float) -> Tensor:
+    """How much each of L factors (B, L) counts, (L,): the last one 1, each before it `discount` of the next."""
+    before_last = torch.arange(log_ratio.shape[1] - 1, -1, -1, device=log_ratio.device)
+    return discount**before_last
+
+
 def approximate_kl(log_ratio: Tensor) -> Tensor:
     """KL(old || new) from samples of old, (B,): (r - 1) - log r, unbiased and never negative [nats]."""
     return log_ratio.exp() - 1 - log_ratio

@@ -23,6 +23,7 @@ from cronos_lerobot.agents.ppo.losses import (
     by_factor,
     clipped_objective,
     explained_variance,
+    factor_weights,
     kl_to_base,
     value_error,
 )
@@ -219,7 +220,8 @@ class PPO:
         new_log_prob, old_log_prob = (by_factor(x, config.ratio) for x in (new["log_prob"], old_log_prob))
         log_ratio = bounded_log_ratio(new_log_prob, old_log_prob)
         advantage = self._tensor(minibatch.advantage)[:, None]
-        policy_loss = -clipped_objective(log_ratio, advantage, config.clip).mean()
+        weights = factor_weights(log_ratio, config.denoising_discount)
+        policy_loss = -(weights * clipped_objective(log_ratio, advantage, config.clip)).mean()
         value_loss = self._value_error(new["value"], minibatch)
         total = policy_loss + config.value_coef * value_loss
         ratio = log_ratio.detach().exp()
