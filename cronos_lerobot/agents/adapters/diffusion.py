@@ -59,7 +59,8 @@ class DiffusionAdapter(DenoisingAdapter):
         self._scheduler.set_timesteps(self.num_steps)
         self._times: list[int] = self._scheduler.timesteps.tolist()
         # Of x = 0 and a network that answers 0 a step leaves nothing but its noise.
-        zero, one = torch.zeros(1), torch.ones(1)
+        one = torch.ones(1, device=self._scheduler.alphas_cumprod.device)
+        zero = torch.zeros_like(one)
         self._sigmas = [float(self._previous(zero, t, zero, 1.0, one)) for t in self._times]
 
     def observe(self, batch: Batch) -> tuple[Tensor, Tensor]:
