@@ -169,6 +169,8 @@ def test_the_first_steps_of_a_denoising_may_count_less():
     assert losses[1] == pytest.approx(0.75 * losses[0])
     with pytest.raises(ValueError, match=r"denoising_discount=0\.5 is between factors"):
         PPOConfig(denoising_discount=0.5)
+    with pytest.raises(ValueError, match=r"noise_steps=2 leaves some out"):
+        PPOConfig(denoising_discount=0.5, ratio="factor", noise_steps=2)
 
 
 def test_an_entropy_bonus_needs_an_entropy():

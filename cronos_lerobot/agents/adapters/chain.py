@@ -73,5 +73,6 @@ def step_log_prob(mean: Tensor, std: Tensor, x: Tensor, scored: Scored) -> Tenso
     """Return the log-likelihood (B,) [nats] of x (B, H, D) after a step; 0 where it has no noise."""
     mean, x, std = scored(mean), scored(x), scored(std.expand_as(mean))
     noisy = std > 0
-    log_prob = Normal(mean, torch.where(noisy, std, 1.0)).log_prob(x)
+    # Without its checks, each of which would wait for a GPU.
+    log_prob = Normal(mean, torch.where(noisy, std, 1.0), validate_args=False).log_prob(x)
     return torch.where(noisy, log_prob, 0.0).sum((1, 2))

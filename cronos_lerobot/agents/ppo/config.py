@@ -174,6 +174,11 @@ class PPOConfig(RLAlgorithmConfig):
                 f"algorithm.denoising_discount={self.denoising_discount} is between factors: it needs "
                 "algorithm.ratio=factor."
             )
+        if self.denoising_discount < 1 and self.noise_steps is not None:
+            raise ValueError(
+                f"algorithm.denoising_discount={self.denoising_discount} is of all steps of a chain, of which "
+                f"algorithm.noise_steps={self.noise_steps} leaves some out: choose one of them."
+            )
         if self.target_kl is None and self.lr_schedule != "fixed":
             raise ValueError(f"algorithm.lr_schedule={self.lr_schedule} needs algorithm.target_kl.")
         if self.policy_lr_min > self.policy_lr_max:
