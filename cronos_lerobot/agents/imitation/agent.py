@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,9 @@ from cronos_lerobot.agents.imitation.memory import OpenSegments, SegmentMemory
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.agents.registry import AgentContext, register_agent
 from cronos_lerobot.agents.state import to_arrays, to_tensors
+
+FINE_TUNING = 0.1
+"""Of the learning rate of cloning from scratch. The whole of it unlearns what the few successes do not show."""
 
 
 @register_agent("imitation")
@@ -139,9 +141,10 @@ class ImitationAgent(LearningAgent):
                 f"--policy.type={self.policy.config.type} has no optimizer preset or parameters to optimise: "
                 "--algorithm.type=imitation trains the policies that lerobot-train trains."
             ) from error
-        if self.config.lr is not None:
-            preset = replace(preset, lr=self.config.lr)
         self.optimizer = preset.build(params)
+        factor = FINE_TUNING if self.config.lr is None else self.config.lr / preset.lr
+        for group in self.optimizer.param_groups:
+            group["lr"] *= factor
         self._max_grad_norm = preset.grad_clip_norm
         self._trained = [param for param in self.policy.parameters() if param.requires_grad]
 

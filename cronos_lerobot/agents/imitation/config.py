@@ -32,7 +32,8 @@ class ImitationConfig(RLAlgorithmConfig):
     batch_size: int = 64
     """Frames in one optimizer step of one process."""
     lr: float | None = None
-    """Learning rate; null takes the one that the policy has in lerobot-train. It stays as it is."""
+    """Learning rate; null takes a tenth of the one that the policy has in lerobot-train. It stays as it is, and
+    groups of parameters that have their own there are scaled alike."""
     warmup_segments: int = 32
     """Successful segments, of all processes together, before the first optimizer step."""
     tail_steps: int = 4
