@@ -131,6 +131,8 @@ class ActionSample:
     """(N,) float32 [nats], of the decision that the action is of, under the policy that drew it."""
     value: np.ndarray
     """(N,) float32, that policy's value of the observation that was decided on."""
+    expert: np.ndarray | None = None
+    """(N,) bool, whose action is an expert's (a takeover) and not the policy's; None where nobody's is."""
 
 
 @dataclass(frozen=True)

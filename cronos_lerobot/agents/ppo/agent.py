@@ -55,6 +55,7 @@ class PPOAgent(LearningAgent):
         self._seen: Columns = {}
         self._encoded: Columns = {}
         self._decision: Decision | None = None
+        self._expert: np.ndarray | bool = False
         # Dropout and the like stay off in the update too, or the ratio would not be 1 before its first step.
         ppo.policy.eval()
 
@@ -86,10 +87,13 @@ class PPOAgent(LearningAgent):
         """Take in one control step; with its last one a decision is kept, as `act` encoded what it was made on.
 
         Where the trace is cut, it is bootstrapped from the value of `o_tp1`, or of `o_t` if there is no outcome.
+        What an expert did is kept and marked: nothing is learned from it.
         """
         mine = self.streams
         tau, r_t, cut_t, diverged_t = tau[mine], r_t[mine], cut_t[mine], diverged_t[mine]
         is_first, clock = self.clock.step == 0, self.clock
+        expert = False if a_t.expert is None else a_t.expert
+        self._expert = expert if is_first else self._expert | expert
         is_over = clock.store(
             r_t, cut_t, diverged_t, self.ppo.config.gamma,
             before=lambda: a_t.value if is_first else self._values(self._seen, tau),
@@ -99,8 +103,9 @@ class PPOAgent(LearningAgent):
         if is_over:
             assert self._decision is not None
             self.buffer.add(
-                self._encoded, tau, self._decision, clock.reward, clock.cut, clock.following, clock.duration
-            )
+                self._encoded, tau, self._decision, clock.reward, clock.cut, clock.following, clock.duration,
+                self._expert,
+            )  # fmt: skip
 
     def update(self) -> dict[str, float]:
         """Learn from the buffer and clear it."""

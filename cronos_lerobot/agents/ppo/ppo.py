@@ -101,7 +101,7 @@ class PPO:
         self.base_policy = BasePolicy(policy, self._params["policy"]) if config.kl_base_coef else None
 
     def update(self, buffer: RolloutBuffer) -> dict[str, float]:
-        """Learn from every decision in `buffer`, and return metrics.
+        """Learn from every decision in `buffer` that the policy's actions followed, and return metrics.
 
         The buffer's `advantages` and `returns` are filled in, the advantages normalised if the config says so;
         all else in it stays as it is.
@@ -109,6 +109,10 @@ class PPO:
         config = self.config
         buffer.compute_advantages(config.gamma, config.gae_lambda)
         rollout = {name: self.processes.concatenate(array, axis=1) for name, array in buffer.results().items()}
+        own = ~rollout.pop("expert")
+        if self._num_own(buffer) == 0:
+            return {"policy_epochs": 0.0, "policy_lr": self.policy_lr, "value_lr": config.value_lr}
+        rollout = {name: array[own] for name, array in rollout.items()}
         described = _describe_rollout(rollout)
         if config.normalize_advantage:
             buffer.normalize_advantages(rollout["advantages"].mean(), rollout["advantages"].std())
@@ -132,7 +136,7 @@ class PPO:
     def _train_policy(self, buffer: RolloutBuffer, metrics: UpdateMetrics) -> float:
         """Train policy and value together; returns the epochs that were run, fractions included."""
         config, steps = self.config, 0
-        steps_per_epoch = -(-len(buffer) // (config.minibatch_size * config.grad_accumulation))
+        steps_per_epoch = -(-self._num_own(buffer) // (config.minibatch_size * config.grad_accumulation))
         seen: list[float] = []
         self.lr.begin_update()
         for _ in range(config.epochs):
@@ -175,10 +179,15 @@ class PPO:
 
     def _groups(self, buffer: RolloutBuffer, observations: Columns | None = None) -> Iterator[list[Minibatch]]:
         """What is backpropagated for each optimizer step of one epoch: its minibatches, or pieces of them."""
-        minibatches = buffer.minibatches(self.config.minibatch_size, self.rng, observations)
+        limit = self._num_own(buffer)
+        minibatches = buffer.minibatches(self.config.minibatch_size, self.rng, observations, limit)
         on_cpu = self.processors.device.type == "cpu"
         while group := list(itertools.islice(minibatches, self.config.grad_accumulation)):
             yield [piece for minibatch in group for piece in minibatch.split(PIECE_BYTES)] if on_cpu else group
+
+    def _num_own(self, buffer: RolloutBuffer) -> int:
+        """Decisions that every process learns from: as many in all, or they would not step together."""
+        return int(self.processes.concatenate(np.array([buffer.num_own])).min())
 
     def _accumulate(
         self,

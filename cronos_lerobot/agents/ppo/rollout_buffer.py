@@ -13,7 +13,8 @@ from cronos_lerobot.agents.base import Columns, Decision
 from cronos_lerobot.agents.ppo.gae import compute_gae
 
 STORED = (
-    "rewards", "values", "log_probs", "boundaries", "bootstrap_values", "durations", "instruction_ids", "traces"
+    "rewards", "values", "log_probs", "boundaries", "bootstrap_values", "durations", "instruction_ids", "traces",
+    "expert",
 )  # fmt: skip
 """Arrays of a buffer that are filled as the streams go on."""
 
@@ -68,6 +69,8 @@ class RolloutBuffer:
         self.boundaries = np.zeros(shape, np.bool_)
         self.bootstrap_values = np.zeros(shape, np.float32)
         self.durations = np.ones(shape, np.int64)
+        self.expert = np.zeros(shape, np.bool_)
+        """Played by an expert: nothing is learned from these."""
         self.advantages = np.zeros(shape, np.float32)
         self.returns = np.zeros(shape, np.float32)
         self.instruction_ids = np.zeros(shape, np.int64)
@@ -79,6 +82,11 @@ class RolloutBuffer:
     def __len__(self) -> int:
         """Decisions in the buffer, over all streams."""
         return self.rows * self.num_streams
+
+    @property
+    def num_own(self) -> int:
+        """Decisions in the buffer that the policy's own actions followed, over all streams."""
+        return len(self) - int(self.expert[: self.rows].sum())
 
     def state_dict(self) -> dict[str, Any]:
         """The decisions in use, stream by stream: arrays (N, rows, ...) of their types; {} if there are none."""
@@ -105,6 +113,8 @@ class RolloutBuffer:
             whole[:rows] = array[streams].swapaxes(0, 1)
             return whole
 
+        # Checkpoints from before there were takeovers have no experts.
+        state = {"expert": np.zeros(state["rewards"].shape, np.bool_)} | state
         restored = _map_arrays({name: state[name] for name in (*STORED, "observations")}, restore)
         vars(self).update(restored)
         self.rows = rows
@@ -119,6 +129,7 @@ class RolloutBuffer:
         boundary: np.ndarray,
         bootstrap_value: np.ndarray,
         duration: np.ndarray | int = 1,
+        expert: np.ndarray | bool = False,
     ) -> None:
         """Copy one decision of every stream.
 
@@ -130,6 +141,7 @@ class RolloutBuffer:
             boundary: (N,) bool, the stream's trace is cut after this decision.
             bootstrap_value: (N,), read where `boundary` is set.
             duration: (N,) or a number, control steps that were played.
+            expert: (N,) bool or one, an expert played at any of them.
 
         Raises:
             RuntimeError: the buffer is full.
@@ -151,24 +163,32 @@ class RolloutBuffer:
         self.boundaries[row] = boundary
         self.bootstrap_values[row] = bootstrap_value
         self.durations[row] = duration
+        self.expert[row] = expert
         self.rows += 1
 
     def compute_advantages(self, gamma: float, gae_lambda: float) -> None:
-        """Fill `advantages` and `returns` of the rows in use."""
+        """Fill `advantages` and `returns` of the rows in use.
+
+        Where an expert takes over or gives back, the trace is cut and bootstrapped from the next row's value.
+        """
         used = slice(0, self.rows)
+        values, expert = self.values[used], self.expert[used]
+        handed_over = np.zeros_like(expert)
+        handed_over[:-1] = (expert[1:] != expert[:-1]) & ~self.boundaries[used][:-1]
+        following = np.where(handed_over, np.roll(values, -1, axis=0), self.bootstrap_values[used])
         self.advantages[used], self.returns[used] = compute_gae(
             self.rewards[used],
-            self.values[used],
-            self.boundaries[used],
-            self.bootstrap_values[used],
+            values,
+            self.boundaries[used] | handed_over,
+            following,
             gamma,
             gae_lambda,
             self.durations[used],
         )
 
     def results(self) -> Columns:
-        """Return `rewards`, `values`, `advantages` and `returns` of the rows in use, (rows, num_streams) each."""
-        names = ("rewards", "values", "advantages", "returns")
+        """Return `rewards`, `values`, `advantages`, `returns` and `expert` of the rows in use, (rows, N) each."""
+        names = ("rewards", "values", "advantages", "returns", "expert")
         return {name: getattr(self, name)[: self.rows] for name in names}
 
     def normalize_advantages(self, mean: float, std: float) -> None:
@@ -177,17 +197,25 @@ class RolloutBuffer:
         advantages[:] = (advantages - mean) / (std + 1e-8)
 
     def minibatches(
-        self, batch_size: int, rng: np.random.Generator, observations: Columns | None = None
+        self,
+        batch_size: int,
+        rng: np.random.Generator,
+        observations: Columns | None = None,
+        limit: int | None = None,
     ) -> Iterator[Minibatch]:
-        """Yield every decision exactly once, in an order drawn from `rng`; the last batch may be smaller.
+        """Yield every decision exactly once but those that an expert played, in an order drawn from `rng`.
+
+        The last batch may be smaller.
 
         Args:
             batch_size: decisions in one.
             rng: draws the order.
             observations: columns (rows, num_streams, ...) in place of the stored ones.
+            limit: of so many decisions only, the first ones of that order.
         """
         observations = self.observations if observations is None else observations
-        order = rng.permutation(len(self))
+        own = np.flatnonzero(~self.expert[: self.rows])
+        order = own[rng.permutation(len(own))[:limit]]
         for start in range(0, len(order), batch_size):
             yield self._gather(order[start : start + batch_size], observations)
 

@@ -1,0 +1,118 @@
+"""What an expert played: PPO keeps it and learns nothing from it."""
+
+import numpy as np
+import pytest
+import torch
+from dummies import TASKS, DummyPolicy
+from ppo_samples import flat, make_ppo, reward_for_up, rollout
+
+from cronos_lerobot.agents.base import ActionSample, Decision
+from cronos_lerobot.agents.ppo.agent import PPOAgent
+from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
+
+
+def one_stream(rewards, values, boundaries, bootstrap, expert):
+    buffer = RolloutBuffer(len(rewards), 1)
+    for i in range(len(rewards)):
+        decision = Decision(np.zeros((1, 1, 7)), np.zeros((1, 7)), np.zeros(1), np.array([values[i]]))
+        row = (np.array([array[i]]) for array in (rewards, boundaries, bootstrap))
+        buffer.add({}, ["a"], decision, *row, expert=np.array([expert[i]]))
+    buffer.compute_advantages(gamma=0.5, gae_lambda=0.5)
+    return buffer
+
+
+def test_advantages_around_a_takeover_by_hand():
+    # Rows: own | expert, expert | own. The middle is a segment of its own, as a takeover is.
+    # delta_0 = 1 + .5 * 6 - 2 = 2, cut; delta_3 = 0 + .5 * 8 - 1 = 3.
+    buffer = one_stream([1, 5, 5, 0], [2, 70, 70, 1], [1, 0, 1, 1], [6, -9, 50, 8], [0, 1, 1, 0])
+    assert buffer.advantages[[0, 3], 0].tolist() == [2, 3]
+    assert buffer.returns[[0, 3], 0].tolist() == [4, 4]
+    # Whatever it earned, the policy's advantages and what an update normalises them by stay as they are.
+    other = one_stream([1, 0, 900, 0], [2, -7, 3, 1], [1, 0, 1, 1], [6, -9, 0, 8], [0, 1, 1, 0])
+    assert other.advantages[[0, 3], 0].tolist() == [2, 3]
+
+
+def test_an_expert_inside_a_segment_cuts_the_trace_before_and_after_it():
+    # Bootstrapped from V of the next row: delta_0 = 1 + .5 * 4 - 2 = 1; delta_1 = 0 + .5 * 6 - 4 = -1, cut.
+    # A_0 = 1 + .25 * -1 = .75. Row 3 ends the segment: delta_3 = 0 + .5 * 8 - 1 = 3.
+    buffer = one_stream([1, 0, 77, 0], [2, 4, 6, 1], [0, 0, 0, 1], [-9, -9, -9, 8], [0, 0, 1, 0])
+    assert buffer.advantages[[0, 1, 3], 0].tolist() == [0.75, -1, 3]
+    assert not buffer.boundaries[:3].any()
+
+
+def mark(buffer):
+    """Let an expert have played the odd streams."""
+    buffer.expert[:, 1::2] = True
+    return buffer
+
+
+def test_minibatches_and_metrics_leave_the_expert_out():
+    ppo = make_ppo()
+    buffer = mark(rollout(ppo, reward_for_up))
+    buffer.compute_advantages(0.99, 0.95)
+    batches = list(buffer.minibatches(48, np.random.default_rng(0)))
+    assert [len(batch.indices) for batch in batches] == [48, 16]
+    assert sorted(np.concatenate([batch.indices for batch in batches])) == [
+        row * 8 + stream for row in range(16) for stream in (0, 2, 4, 6)
+    ]
+    buffer.rewards[:, 1::2] = 1e6
+    metrics = ppo.update(buffer)
+    assert metrics["reward_mean"] == pytest.approx(buffer.rewards[:, ::2].mean())
+    assert buffer.advantages[:, ::2].mean() == pytest.approx(0, abs=1e-6)
+    assert buffer.advantages[:, ::2].std() == pytest.approx(1, abs=1e-4)
+
+
+def test_an_update_is_that_of_the_policys_own_decisions_alone():
+    params = []
+    for rows in ("marked", "left out"):
+        ppo = make_ppo(epochs=2, value_epochs=1, minibatch_size=64)
+        buffer = rollout(ppo, reward_for_up)
+        if rows == "marked":
+            mark(buffer).rewards[:, 1::2] = 1e6
+            buffer.values[:, 1::2] = -1e6
+        else:
+            half = RolloutBuffer(16, 4)
+            half.load_state_dict(buffer.state_dict() | {"capacity": 16}, slice(0, 8, 2))
+            buffer = half
+        ppo.update(buffer)
+        params.append(flat(ppo.policy.parameters()))
+    torch.testing.assert_close(*params, atol=0, rtol=0)
+
+
+def test_where_everything_was_the_experts_nothing_is_learned():
+    ppo = make_ppo()
+    before = flat(ppo.policy.parameters())
+    buffer = rollout(ppo, reward_for_up)
+    buffer.expert[:] = True
+    assert ppo.update(buffer)["policy_epochs"] == 0
+    assert torch.equal(flat(ppo.policy.parameters()), before)
+
+
+class TwoSteps(DummyPolicy):
+    """Decides on two actions at once."""
+
+    decision_steps = 2
+
+    def sample_actions(self, batch, **options):
+        sample = super().sample_actions(batch, **options)
+        return sample | {"actions": sample["actions"].repeat(1, 2, 1)}
+
+
+def test_a_decision_is_the_experts_if_any_of_its_steps_was():
+    ppo = make_ppo(policy=TwoSteps())
+    agent = PPOAgent(ppo, RolloutBuffer(2, 3), torch.Generator())
+    tau = [TASKS[0].instruction] * 3
+    experts = [[0, 1, 0], [0, 0, 0], [0, 0, 0], [1, 0, 0]]
+    for k, expert in enumerate(experts):
+        o_t = {"agent_pos": np.zeros((3, 2), np.float32)}
+        sample = agent.act(o_t, tau)
+        sample = ActionSample(sample.action, sample.log_prob, sample.value, np.array(expert, bool))
+        cut = np.full(3, k == 3)
+        agent.store(o_t, tau, sample, np.zeros(3, np.float32), o_t, cut, np.zeros(3, bool))
+    assert agent.buffer.expert.tolist() == [[False, True, False], [True, False, False]]
+    # A checkpoint keeps it; one from before there were experts has none.
+    other, state = RolloutBuffer(2, 3), agent.buffer.state_dict()
+    other.load_state_dict(state)
+    assert np.array_equal(other.expert, agent.buffer.expert)
+    other.load_state_dict({name: value for name, value in state.items() if name != "expert"})
+    assert not other.expert.any()
