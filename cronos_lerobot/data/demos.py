@@ -8,6 +8,7 @@ import numpy as np
 from lerobot.utils.constants import ACTION, DONE, REWARD
 from lerobot_env_cronos import CronosVectorEnv, Task
 from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS, sample_configuration
+from lerobot_env_cronos.expert.reach import sample_reach_configuration
 from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW
 
 from cronos_lerobot.agents.processing import observation_columns
@@ -16,13 +17,16 @@ from cronos_lerobot.data.perturbations import (
     GraspMisses,
     MissConfig,
     NoiseConfig,
+    drop_against_another,
     move_arm_at_random,
 )
 from cronos_lerobot.data.schema import SUCCESS, TRUNCATED
 from cronos_lerobot.data.writer import SegmentWriter
 
 ARM_POSES = ("home", "random", "after_task")
-LAYOUTS = ("train", "random")
+FREE_LAYOUTS = {"random": sample_configuration, "reach": sample_reach_configuration}
+"""How layouts are drawn that are no configuration of the benchmark."""
+LAYOUTS = ("train", *FREE_LAYOUTS)
 CONFIGURATION = "cronos.configuration"
 MAX_FAILURES_IN_A_ROW = 200
 
@@ -46,13 +50,16 @@ class StartConfig:
     """Where a demonstration starts."""
 
     layouts: str = "train"
-    """`train`: the scene's 64 training configurations in turn; `random`: freshly drawn layouts."""
+    """`train`: the scene's 64 training configurations in turn; `random`: freshly drawn in the spawn area; `reach`:
+    freshly drawn wherever the arm can do the scene's tasks, at any yaw."""
     num_configurations: int = NUM_CONFIGURATIONS
     """Of the training configurations the first so many; a policy cloned from one has only ever seen that one."""
     arm_pose: str = "home"
     """`home`; `random`: at a random place above the table; `after_task`: where another task left it."""
     occupied_receptacles: bool = False
     """The target receptacle already holds another object."""
+    leaning_share: float = 0.0
+    """Share of the layouts in which one object has fallen over the edge of another body, from 0 to 1."""
     share: float = 1.0
     """Share of the episodes that `arm_pose` and `occupied_receptacles` apply to; the others start at home."""
 
@@ -66,8 +73,9 @@ class StartConfig:
             raise ValueError(
                 f"start.num_configurations must be 1 to {NUM_CONFIGURATIONS}, got {self.num_configurations}"
             )
-        if not 0 <= self.share <= 1:
-            raise ValueError(f"start.share must be between 0 and 1, got {self.share}")
+        for name in ("share", "leaning_share"):
+            if not 0 <= (value := getattr(self, name)) <= 1:
+                raise ValueError(f"start.{name} must be between 0 and 1, got {value}")
 
 
 @dataclass
@@ -80,6 +88,8 @@ class DemoConfig:
     """Frames kept after the object lies on its receptacle and is released."""
     keep_failures: bool = False
     """Also keep episodes that did not succeed within `max_steps`."""
+    reset_tasks: bool = False
+    """Demonstrate "put the [object] on the table" as well, as often as any other task, each from a receptacle."""
     start: StartConfig = field(default_factory=StartConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     misses: MissConfig = field(default_factory=MissConfig)
@@ -132,13 +142,14 @@ class DemoCollector:
             writer: its features are those of `demonstration_features`.
             config: what a demonstration is.
             seed: decides layouts, noise, misses and starts.
-            tasks: to demonstrate; all of the scene's when None.
+            tasks: to demonstrate; all of the scene's when None, with its reset tasks if `config` says so.
         """
         self.env, self.expert, self.writer, self.config = env, expert, writer, config
         self.finished, self.successes = 0, 0
         self._started = 0
         self._seed = (seed, writer.num_episodes)
-        self._kept = dict.fromkeys(tasks or env.scene.tasks, 0)
+        everything = env.scene.tasks + (env.scene.reset_tasks if config.reset_tasks else ())
+        self._kept = dict.fromkeys(tasks or everything, 0)
         self._tried = dict.fromkeys(self._kept, 0)
         self._episodes: list[_Episode | None] = [None] * env.num_envs
         self._noise = ActionNoise(config.noise, env.num_envs)
@@ -221,7 +232,7 @@ class DemoCollector:
 
     def _end_prelude(self, stream: int, episode: _Episode) -> None:
         ids = np.array([stream])
-        if self.config.start.arm_pose == "home":
+        if self.config.start.arm_pose == "home" or episode.at_home:
             self.env.end_effector_reset(ids)
         self._begin_task(ids, episode)
         episode.prelude = None
@@ -249,9 +260,13 @@ class DemoCollector:
             self.env.scene_reset(ids, np.array([number]))
         else:
             number = -1
-            self.env.place_bodies(ids, sample_configuration(self.env.scene, rng)[None])
+            self.env.place_bodies(ids, FREE_LAYOUTS[start.layouts](self.env.scene, rng)[None])
         episode = _Episode(task, number, prelude=None, at_home=rng.random() >= start.share, rng=rng)
-        if not episode.at_home and (start.occupied_receptacles or start.arm_pose == "after_task"):
+        if start.leaning_share and rng.random() < start.leaning_share:
+            drop_against_another(self.env, stream, rng)
+        after_another = start.occupied_receptacles or start.arm_pose == "after_task"
+        # An object that lies on the table from the start would leave nothing to show of its reset task.
+        if task.receptacle is None or (after_another and not episode.at_home):
             episode.prelude = self._prelude(task, rng)
             self.env.set_task(ids, [episode.prelude])
             self.expert.reset(ids)
@@ -260,7 +275,13 @@ class DemoCollector:
         return episode
 
     def _prelude(self, task: Task, rng: np.random.Generator) -> Task:
-        """Another object onto the target receptacle, or onto another one if that shall stay free."""
+        """Another object onto the target receptacle, or onto another one if that shall stay free.
+
+        Before a reset task, its object onto any receptacle.
+        """
+        if task.receptacle is None:
+            own = [other for other in self.env.scene.tasks if other.object == task.object]
+            return own[rng.integers(len(own))]
         occupied = self.config.start.occupied_receptacles
         choices = [
             other

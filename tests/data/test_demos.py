@@ -9,10 +9,11 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.config import CronosEnvConfig
 from lerobot_env_cronos.expert.expert import ScriptedExpert
+from lerobot_env_cronos.expert.reach import find_reach
 from lerobot_env_cronos.scene.robot import HOME_QPOS
 
 from cronos_lerobot.data.demos import DemoCollector, DemoConfig, StartConfig
-from cronos_lerobot.data.perturbations import ActionNoise, MissConfig, NoiseConfig
+from cronos_lerobot.data.perturbations import ActionNoise, MissConfig, NoiseConfig, drop_against_another
 from cronos_lerobot.data.schema import demonstration_features, feature_names
 from cronos_lerobot.data.writer import SegmentWriter
 from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig, record_demos
@@ -180,6 +181,50 @@ def test_occupied_receptacles_hold_the_other_object(env, tmp_path):
         np.testing.assert_allclose(episode["observation.state"][0, :3], home, atol=2e-3)
 
 
+def test_layouts_over_the_reach(env, tmp_path):
+    dataset, _ = collect(env, tmp_path / "d", DemoConfig(start=StartConfig(layouts="reach")), 8)
+    assert dataset.meta.episodes["cronos.configuration"] == [-1] * 8
+    first = np.stack([episode["observation.environment_state"][0] for episode in episodes_of(dataset)])
+    xy = first.reshape(8, len(env.scene.bodies), -1)[..., :2].reshape(-1, 2)
+    assert find_reach(env.scene).contains(xy).all()
+    assert ((xy < env.scene.spawn_low) | (xy > env.scene.spawn_high)).any(axis=1).sum() >= 8  # of 32 bodies
+
+
+def test_reset_tasks_begin_with_the_object_on_a_receptacle(env, tmp_path):
+    dataset, _ = collect(env, tmp_path / "d", DemoConfig(reset_tasks=True, steps_after_release=2), 6)
+    tasks = [task for tasks in dataset.meta.episodes["tasks"] for task in tasks]
+    assert sorted(tasks) == sorted(task.instruction for task in env.scene.tasks + env.scene.reset_tasks)
+    home, bodies = home_position(env), env.scene.bodies
+    for episode, task in zip(episodes_of(dataset), tasks, strict=True):
+        resets = [reset for reset in env.scene.reset_tasks if reset.instruction == task]
+        if resets:
+            state = episode["observation.environment_state"][0].reshape(len(bodies), -1)
+            at = state[bodies.index(resets[0].object), :2]
+            receptacles = state[[bodies.index(name) for name in env.scene.receptacles], :2]
+            assert np.linalg.norm(receptacles - at, axis=1).min() < 0.07
+            assert not episode["next.success"][0]
+            assert episode["next.success"][-3:].all()
+            np.testing.assert_allclose(episode["observation.state"][0, :3], home, atol=2e-3)
+
+
+def test_objects_that_lean_on_others(env):
+    """Some of 24 that fall over an edge lie tilted or higher than on the table, and all have come to rest."""
+    bodies, off_the_table = env.scene.bodies, 0
+    for seed in range(6):
+        env.scene_reset(np.arange(NUM_ENVS), np.arange(NUM_ENVS))
+        before = env.simulation.body_poses().copy()
+        for stream in range(NUM_ENVS):
+            drop_against_another(env, stream, np.random.default_rng((seed, stream)))
+        after = env.simulation.body_poses().copy()
+        lift = (after - before)[:, : len(env.scene.objects), 2]
+        off_the_table += (lift > 0.002).any(axis=1).sum()
+        moved = np.linalg.norm((after - before)[..., :2], axis=-1) > 0.01
+        assert (moved[:, [bodies.index(name) for name in env.scene.objects]].sum(axis=1) >= 1).all()
+        env.step(np.tile(np.array([0, 0, 0, 0, 0, 0, 1.0]), (NUM_ENVS, 1)))
+        assert np.abs(env.simulation.body_poses() - after)[..., :3].max() < 3e-3
+    assert off_the_table >= 6
+
+
 def test_failures_are_dropped_unless_asked_for(env, tmp_path):
     """An expert that does nothing fails every episode."""
 
@@ -212,6 +257,7 @@ def test_one_task_only(env, tmp_path):
     [
         (lambda: StartConfig(arm_pose="up"), "unknown start.arm_pose 'up'; valid: \\['home'"),
         (lambda: StartConfig(layouts="held_out"), "unknown start.layouts 'held_out'"),
+        (lambda: StartConfig(leaning_share=1.5), "start.leaning_share must be between 0 and 1, got 1.5"),
         (lambda: NoiseConfig(share=2), "noise.share"),
         (lambda: MissConfig(min_offset_m=0.1), "misses.min_offset_m"),
         (lambda: RecordDemosConfig(), "--dataset.repo_id is required"),

@@ -7,6 +7,7 @@ outside the package come with a file of their own, or theirs are drawn from the 
 
 import argparse
 import json
+from collections.abc import Callable
 from functools import cache
 from importlib import import_module, resources
 from pathlib import Path
@@ -101,13 +102,30 @@ def footprint_gap(a: np.ndarray, b: np.ndarray) -> float:
     return max(gaps)
 
 
+Place = tuple[np.ndarray, float]
+"""Where a body lies: its centre (2,) on the table [m] and its yaw [rad]."""
+DrawPlace = Callable[[str, np.random.Generator], Place]
+"""Draws a place for a body, free or not."""
+
+
+def draw_spawn_place(scene: Scene, body: str, rng: np.random.Generator) -> Place:
+    """Uniform over the scene's spawn area, at one of the yaws that benchmark configurations have."""
+    xy = rng.uniform(scene.spawn_low, scene.spawn_high)
+    return xy, rng.choice(OBJECT_YAWS if body in scene.objects else RECEPTACLE_YAWS)
+
+
 def sample_place(
-    scene: Scene, body: str, others: list[np.ndarray], rng: np.random.Generator
+    scene: Scene,
+    body: str,
+    others: list[np.ndarray],
+    rng: np.random.Generator,
+    draw: DrawPlace | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw a free place for `body` in the spawn area.
+    """Draw a free place for `body`.
 
     Args:
         others: footprints (4, 2) that it must keep `CLEARANCE_M` away from.
+        draw: draws places, free or not; from the spawn area if None.
 
     Returns:
         The pose (7,) on the table, and its footprint (4, 2).
@@ -115,10 +133,8 @@ def sample_place(
     Raises:
         RuntimeError: no free place was found.
     """
-    yaws = OBJECT_YAWS if body in scene.objects else RECEPTACLE_YAWS
     for _ in range(MAX_ATTEMPTS):
-        xy = rng.uniform(scene.spawn_low, scene.spawn_high)
-        yaw = rng.choice(yaws)
+        xy, yaw = draw(body, rng) if draw else draw_spawn_place(scene, body, rng)
         corners = footprint_corners(body, xy, yaw)
         if all(footprint_gap(corners, other) > CLEARANCE_M for other in others):
             pose = [*xy, BODIES[body].size[2] / 2, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
@@ -126,25 +142,28 @@ def sample_place(
     raise RuntimeError(f"no free place for the {body} among {len(others)} bodies")
 
 
-def sample_configuration(scene: Scene, rng: np.random.Generator) -> np.ndarray:
+def sample_configuration(scene: Scene, rng: np.random.Generator, draw: DrawPlace | None = None) -> np.ndarray:
     """Draw poses (bodies, 7) of all bodies at rest on the table, no two touching.
 
+    Args:
+        draw: see `sample_place`.
+
     Raises:
-        RuntimeError: the bodies do not fit into the spawn area.
+        RuntimeError: the bodies do not fit into the spawn area, or into where `draw` puts them.
     """
     for _ in range(MAX_RESTARTS):
         poses, footprints = {}, []
         try:
             # Receptacles are large: placed first, they leave room for the objects.
             for body in scene.receptacles + scene.objects:
-                poses[body], corners = sample_place(scene, body, footprints, rng)
+                poses[body], corners = sample_place(scene, body, footprints, rng, draw)
                 footprints.append(corners)
         except RuntimeError:
             continue
         return np.stack([poses[body] for body in scene.bodies])
+    area = "the places that are drawn" if draw else f"the spawn area {scene.spawn_low} to {scene.spawn_high}"
     raise RuntimeError(
-        f"{scene.name}: {len(scene.bodies)} bodies do not fit into the spawn area {scene.spawn_low} to "
-        f"{scene.spawn_high} with {CLEARANCE_M} m between them"
+        f"{scene.name}: {len(scene.bodies)} bodies do not fit into {area} with {CLEARANCE_M} m between them"
     )
 
 
