@@ -183,10 +183,24 @@ class Agent(Protocol):
         ...
 
 
+@runtime_checkable
+class ValuingAgent(Agent, Protocol):
+    """An agent that also says how much it expects of a task: task orders and resets may go by it."""
+
+    def predict_values(self, o_t: dict[str, Any], tau: list[str]) -> np.ndarray:
+        """Values (N,) float32 of beginning the tasks `tau`, of all N streams, where `o_t` shows them to stand.
+
+        `o_t` is of this process's streams, as in `act`, and the first observation of a new trace; the answer is of
+        all N, and all processes call it. It changes nothing and draws nothing at random.
+        """
+        ...
+
+
 class LearningAgent(Agent):
     """An agent that `cronos-train` can run, save and resume; its defaults are those of one that only has a policy.
 
     `act` gets the observations of this process's streams and the instructions of all N; so do `store`'s arguments.
+    One that has values says them by `predict_values`, see `ValuingAgent`.
     """
 
     policy: Any

@@ -11,6 +11,39 @@ from cronos_lerobot.protocol.interventions import Intervention
 
 COUNTED_INTERVENTIONS = (Intervention.SCENE_RESET, Intervention.HEURISTIC_RESET, Intervention.DIVERGENCE)
 """What spends the budget B. Task switches, end-effector resets and the first placement are free."""
+MAX_FAILURES = 16
+"""Half of the segments that `LoopState` remembers: with learned resets every second one is no task."""
+
+RESET_PHASES = ("together", "staggered")
+SCENE_RESETS = ("periodic", "critic")
+
+
+@dataclass
+class CriticConfig:
+    """How the agent's values choose tasks (`task_order=critic`) and scene resets (`scene_reset=critic`)."""
+
+    certain_value: float = 0.8
+    """The value from which on a success is taken for certain: p = V / certain_value, clipped to [0, 1]. That of a
+    success some twenty steps away at gamma = 0.99, for `reward=difference`; `level` pays many times as much."""
+    floor: float = 0.02
+    """What every task has beside p (1 - p), so that none is ever left out for its value."""
+    sharpness: float = 2.0
+    """A task is drawn with a probability proportional to (p (1 - p) + floor) ** sharpness; 0 is uniform."""
+    knows_complete: bool = True
+    """Complete tasks are known, and not given while there are others. false: a robot is told no more than whether
+    the task that it has just tried is complete."""
+    failures: int = 2
+    """Tasks in a row that a stream has failed, all since its last scene reset, before it may get one."""
+
+    def __post_init__(self) -> None:
+        if self.certain_value <= 0:
+            raise ValueError(f"protocol.critic.certain_value must be > 0, got {self.certain_value}.")
+        if self.floor <= 0:
+            raise ValueError(f"protocol.critic.floor must be > 0, got {self.floor}.")
+        if self.sharpness < 0:
+            raise ValueError(f"protocol.critic.sharpness must be >= 0, got {self.sharpness}.")
+        if not 1 <= self.failures <= MAX_FAILURES:
+            raise ValueError(f"protocol.critic.failures must be 1 to {MAX_FAILURES}, got {self.failures}.")
 
 
 @dataclass
@@ -27,6 +60,14 @@ class ProtocolConfig:
     curriculum: list[tuple[int, int]] = field(default_factory=list)
     """[[until_step, T], ...]: T up to and including that interaction step (summed over the streams), later
     scene_reset_interval. The paper's curriculum of a 1.3 M step run is [[650000, 320]]."""
+    reset_phase: str = "together"
+    """When a stream's scene reset is due: `together`, all streams at multiples of T, or `staggered`, each of them
+    every T steps as well, but at times that are spread evenly over the streams."""
+    scene_reset: str = "periodic"
+    """Who asks for scene resets: `periodic`, every T steps, or `critic`, for streams in which the agent's values
+    see nothing left to learn, one at a time, `reset_budget` in the whole run."""
+    critic: CriticConfig = field(default_factory=CriticConfig)
+    """How values choose, for `task_order=critic` and `scene_reset=critic`."""
     end_effector_reset: bool = True
     """Send the arm home at every task switch (EER). The objects stay; it costs no intervention."""
     heuristic_reset: bool = False
@@ -36,10 +77,11 @@ class ProtocolConfig:
     extra_resets: list[str] = field(default_factory=list)
     """Your own strategies by their registered names, applied in this order between HSR and the scene reset."""
     reset_budget: int | None = None
-    """B: stop once this many interventions, summed over the streams, have been spent. null is no limit."""
+    """B: stop once this many interventions, summed over the streams, have been spent. null is no limit. With
+    `scene_reset=critic` the resets that are asked for are paced so that a run gets to its last step with it."""
     task_order: str = "heuristic"
-    """How the next task is chosen: `heuristic` (the fixed cycle of Appendix E), `random` (uniform) or the name of
-    a registered order."""
+    """How the next task is chosen: `heuristic` (the fixed cycle of Appendix E), `random` (uniform), `critic` (what
+    the agent's values call neither hopeless nor certain) or the name of a registered order."""
     num_configurations: int = NUM_CONFIGURATIONS
     """Scene resets draw from the first so many configurations of the training split, 1 to 64."""
     reward: str = "difference"
@@ -53,6 +95,7 @@ class ProtocolConfig:
         if self.scene_reset_interval is not None:
             self._check_multiple_of_k("scene_reset_interval", self.scene_reset_interval)
         self._check_curriculum()
+        self._check_scene_reset()
         if self.reset_budget is not None and self.reset_budget < 1:
             raise ValueError(f"protocol.reset_budget must be >= 1 or null, got {self.reset_budget}.")
         if self.reward not in REWARDS:
@@ -64,10 +107,26 @@ class ProtocolConfig:
 
     def scene_reset_interval_at(self, interaction_step: int) -> int | None:
         """T in force at `interaction_step` (summed over the streams); None means no periodic reset."""
+        if self.scene_reset != "periodic":
+            return None
         for until_step, interval in self.curriculum:
             if interaction_step <= until_step:
                 return interval
         return self.scene_reset_interval
+
+    def _check_scene_reset(self) -> None:
+        for name, valid in (("reset_phase", RESET_PHASES), ("scene_reset", SCENE_RESETS)):
+            if getattr(self, name) not in valid:
+                raise ValueError(f"protocol.{name} must be one of {valid}, got {getattr(self, name)!r}.")
+        if self.scene_reset == "periodic":
+            return
+        if self.reset_budget is None:
+            raise ValueError("protocol.scene_reset=critic spends a budget: give protocol.reset_budget, as 1000.")
+        if self.curriculum or self.reset_phase != "together":
+            raise ValueError(
+                "protocol.curriculum and protocol.reset_phase say when periodic scene resets come; with "
+                "protocol.scene_reset=critic there are none: leave them out."
+            )
 
     def _check_multiple_of_k(self, name: str, interval: int) -> None:
         if interval < 1 or interval % self.task_switch_interval:

@@ -62,6 +62,10 @@ class LoopState:
     """(N, HISTORY) whether they were a success: 1 or 0; -1 where there was none yet."""
     interventions: np.ndarray = field(init=False)
     """(N, len(Intervention)) events of each kind."""
+    task_value: np.ndarray = field(init=False)
+    """(N,) the agent's value of the current task when it was given, where the task order asked for it; else 0."""
+    reset_value: np.ndarray = field(init=False)
+    """(N,) its best value over the tasks when the stream's last scene reset was asked for, if by value; else 0."""
 
     def __post_init__(self) -> None:
         n = self.num_streams
@@ -78,6 +82,8 @@ class LoopState:
         self.recent_task = np.full((n, HISTORY), -1, np.int64)
         self.recent_success = np.full((n, HISTORY), -1, np.int64)
         self.interventions = np.zeros((n, len(Intervention)), np.int64)
+        self.task_value = np.zeros(n)
+        self.reset_value = np.zeros(n)
 
     @property
     def n(self) -> int:

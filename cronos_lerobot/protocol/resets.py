@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import LoopState
+from cronos_lerobot.protocol.task_values import RunContext, TaskValues
 
 
 class ResetStrategy(ABC):
@@ -24,6 +26,10 @@ class ResetStrategy(ABC):
 
     kind: Intervention
     """What it is counted and recorded as; `protocol.COUNTED_INTERVENTIONS` are those that spend the budget."""
+
+    def bind(self, run: RunContext) -> None:
+        """Told once, before the run begins or goes on, what it is made of. A ValueError refuses the run."""
+        return
 
     @abstractmethod
     def due(self, env: Any, loop: LoopState) -> np.ndarray:
@@ -115,19 +121,79 @@ class SceneReset(ResetStrategy):
 
 
 class PeriodicSceneReset(SceneReset):
-    """Every stream is reset every T steps (paper, Section 5), where T may follow a curriculum."""
+    """Every stream is reset every T steps (paper, Section 5), where T may follow a curriculum.
+
+    Staggered, stream i of N is reset i/N of T, in whole segments, before the multiples of T. Of the streams that
+    are reset at the same moment each then goes on with another task of the heuristic order.
+    """
 
     kind = Intervention.SCENE_RESET
 
     def __init__(self, rng: np.random.Generator, protocol: ProtocolConfig) -> None:
         super().__init__(rng, protocol.num_configurations)
         self.interval_at = protocol.scene_reset_interval_at
+        self.segment = protocol.task_switch_interval
+        self.is_staggered = protocol.reset_phase == "staggered"
 
     def due(self, env: Any, loop: LoopState) -> np.ndarray:
-        """Every stream when its step count is a multiple of the T in force."""
+        """Streams whose step count, ahead by their phase, is a multiple of the T in force."""
         interval = self.interval_at(loop.n)
-        due_now = interval is not None and loop.t % interval == 0
-        return np.arange(loop.num_streams if due_now else 0)
+        if interval is None:
+            return np.empty(0, np.int64)
+        streams = np.arange(loop.num_streams)
+        segments = interval // self.segment
+        phase = streams * segments // loop.num_streams if self.is_staggered else 0 * streams
+        return np.flatnonzero((loop.t // self.segment + phase) % segments == 0)
+
+
+class CriticSceneReset(SceneReset):
+    """Streams in which nothing can be learned any more are reset, as far as a budget goes (not in the paper).
+
+    Of the streams that have failed their last tasks, those come first whose best task has the lowest value. The
+    budget is paced: after a share of the run's steps no more than that share of it is spent. What other kinds of
+    interventions cost is taken from it, too.
+
+    Raises:
+        ValueError: in `bind`, of an agent without values.
+    """
+
+    kind = Intervention.SCENE_RESET
+
+    def __init__(self, rng: np.random.Generator, protocol: ProtocolConfig) -> None:
+        super().__init__(rng, protocol.num_configurations)
+        assert protocol.reset_budget is not None
+        self.budget, self.failures = protocol.reset_budget, protocol.critic.failures
+        self._values: TaskValues | None = None
+
+    def bind(self, run: RunContext) -> None:
+        """Take the agent's values and the length of the run."""
+        self._values, self._total_steps = TaskValues(run, "protocol.scene_reset=critic"), run.total_steps
+
+    def due(self, env: Any, loop: LoopState) -> np.ndarray:
+        """Of the streams that are stuck those with the lowest best value, as many as may be spent by now."""
+        allowance = math.floor(self.budget * loop.n / self._total_steps - loop.b) if self._is_running(loop) else 0
+        stuck = self.find_stuck(loop)
+        if allowance < 1 or not len(stuck):
+            return np.empty(0, np.int64)
+        assert self._values is not None
+        best = self._values.best(loop)
+        chosen = np.sort(stuck[np.argsort(best[stuck], kind="stable")[:allowance]])
+        loop.reset_value[chosen] = best[chosen]
+        return chosen
+
+    def find_stuck(self, loop: LoopState) -> np.ndarray:
+        """Ids (k,) of the streams that have failed their last tasks, all of them since their scene reset."""
+        # Learned reset tasks, every second segment of all streams alike, say nothing.
+        is_task = loop.recent_task[0] < loop.num_tasks
+        failed = (loop.recent_success[:, is_task][:, -self.failures :] == 0).all(axis=1)
+        num_segments = self.failures * (2 if loop.num_reset_tasks else 1)
+        return np.flatnonzero(failed & (loop.segments_since_reset >= num_segments))
+
+    def _is_running(self, loop: LoopState) -> bool:
+        """After the last segment a reset would be of no use."""
+        if self._values is None:
+            raise ValueError("protocol.scene_reset=critic works in cronos-train: here no agent tells its values.")
+        return loop.n < self._total_steps
 
 
 class InitialPlacement(SceneReset):
@@ -160,6 +226,13 @@ class Resets:
     heuristic: ResetStrategy
     extra: tuple[ResetStrategy, ...]
     scene: ResetStrategy
+
+    def bind(self, run: RunContext) -> None:
+        """Tell every strategy what the run is made of; a ValueError refuses the run."""
+        for strategy in (
+            self.initial, self.divergence, self.end_effector, self.heuristic, *self.extra, self.scene
+        ):  # fmt: skip
+            strategy.bind(run)
 
 
 ResetFactory = Callable[[np.random.Generator, ProtocolConfig], ResetStrategy]
@@ -209,11 +282,12 @@ def make_resets(protocol: ProtocolConfig, rng: Callable[[str], np.random.Generat
         ValueError: an extra reset is not registered.
     """
     check_extra_resets(protocol.extra_resets)
+    scene_reset = CriticSceneReset if protocol.scene_reset == "critic" else PeriodicSceneReset
     return Resets(
         initial=InitialPlacement(rng("resets/initial"), protocol.num_configurations),
         divergence=DivergenceReset(rng("resets/divergence"), protocol.num_configurations),
         end_effector=EndEffectorReset() if protocol.end_effector_reset else NoReset(),
         heuristic=HeuristicReset(rng("resets/heuristic")) if protocol.heuristic_reset else NoReset(),
         extra=tuple(EXTRA_RESETS[name](rng(f"resets/extra/{name}"), protocol) for name in protocol.extra_resets),
-        scene=PeriodicSceneReset(rng("resets/scene"), protocol),
+        scene=scene_reset(rng("resets/scene"), protocol),
     )

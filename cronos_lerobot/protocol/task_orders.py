@@ -10,6 +10,7 @@ import numpy as np
 
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.loop_state import LoopState
+from cronos_lerobot.protocol.task_values import RunContext, TaskValues
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,9 @@ class TaskOrder(Protocol):
 
     `loop` has each stream's history: `attempts` and `successes` by task, `recent_task` and `recent_success` one by
     one. An order keeps nothing of its own besides its generator, so that a run can be resumed.
+
+    An order may also have `bind(run)`: it is then told once, before the run begins or goes on, what the run is
+    made of, a `RunContext`; a ValueError refuses the run.
     """
 
     def draw(self, loop: LoopState) -> np.ndarray:
@@ -102,6 +106,49 @@ class RandomOrder:
         return self.rng.integers(loop.num_tasks, size=loop.num_streams)
 
 
+@register_task_order("critic")
+class CriticOrder:
+    """What is neither hopeless nor certain by the agent's own values comes first (not in the paper).
+
+    p = V / certain_value, clipped to [0, 1], stands for the chance of a success, and a task is drawn with a
+    probability proportional to (p (1 - p) + floor) ** sharpness. Tasks that are known to be complete are left out,
+    unless all are.
+
+    Raises:
+        ValueError: in `bind`, of an agent without values.
+    """
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+        self._values: TaskValues | None = None
+
+    def bind(self, run: RunContext) -> None:
+        """Take the agent's values and the protocol's `critic`."""
+        self._values, self._config = TaskValues(run, "protocol.task_order=critic"), run.protocol.critic
+
+    def draw(self, loop: LoopState) -> np.ndarray:
+        """One draw for each stream; `loop.task_value` becomes the values of what was drawn."""
+        if self._values is None:
+            raise ValueError("protocol.task_order=critic works in cronos-train: here no agent tells its values.")
+        values = self._values.ask()
+        odds = self.weigh(values, self._values.find_complete(loop)).cumsum(axis=1)
+        drawn = self.rng.random(loop.num_streams)[:, None] * odds[:, -1:]
+        task = (odds > drawn).argmax(axis=1)
+        loop.task_value = values[np.arange(loop.num_streams), task]
+        return task
+
+    def weigh(self, values: np.ndarray, complete: np.ndarray) -> np.ndarray:
+        """Weights (N, tasks) that the probabilities are proportional to.
+
+        Args:
+            values: (N, tasks).
+            complete: (N, tasks) bool, to be left out.
+        """
+        p = (values / self._config.certain_value).clip(0, 1)
+        weights = (p * (1 - p) + self._config.floor) ** self._config.sharpness
+        return np.where(complete & ~complete.all(axis=1, keepdims=True), 0.0, weights)
+
+
 class LearnedReset:
     """Every second segment, the stream puts the object of its last task back on the table (paper, Section 5, LSR).
 
@@ -114,11 +161,22 @@ class LearnedReset:
         self.order = order
         self.reset_task = reset_task
 
+    def bind(self, run: RunContext) -> None:
+        """Tell the order of the tasks in between."""
+        bind_task_order(self.order, run)
+
     def draw(self, loop: LoopState) -> np.ndarray:
         """A task for every stream, or the reset task of every stream, in turns."""
         if loop.switches % 2:
             return self.reset_task[loop.task]
         return self.order.draw(loop)
+
+
+def bind_task_order(order: TaskOrder, run: RunContext) -> None:
+    """Tell a task order what the run is made of, if it wants to know; a ValueError refuses the run."""
+    bind = getattr(order, "bind", None)
+    if bind is not None:
+        bind(run)
 
 
 def check_task_order(name: str) -> None:

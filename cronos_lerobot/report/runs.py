@@ -30,7 +30,7 @@ DESCRIBED = tuple(
     f"protocol.{name}"
     for name in (
         "scene_reset_interval", "curriculum", "end_effector_reset", "learned_reset", "heuristic_reset",
-        "extra_resets", "task_order", "num_configurations",
+        "extra_resets", "task_order", "num_configurations", "reset_phase", "scene_reset",
     )
 )  # fmt: skip
 """Fields that `describe_protocol` puts into words."""
@@ -282,10 +282,14 @@ def describe_protocol(protocol: dict[str, Any]) -> str:
     interval = protocol.get("scene_reset_interval")
     words = ["no scene resets" if interval is None else f"T = {interval}"]
     ticks = {"EER": "end_effector_reset", "CL": "curriculum", "LSR": "learned_reset", "HSR": "heuristic_reset"}
+    if protocol.get("scene_reset", "periodic") == "critic":
+        interval, words = None, [f"{protocol.get('reset_budget')} resets asked for by the critic"]
     is_episodic = interval == protocol.get("task_switch_interval") and not protocol.get("curriculum")
     if interval and is_episodic:
         # A scene reset at every task switch sends the arm home anyway.
         del ticks["EER"]
+    if protocol.get("reset_phase", "together") != "together":
+        words.append(protocol["reset_phase"])
     words += [word for word, name in ticks.items() if protocol.get(name)]
     words += protocol.get("extra_resets") or []
     if protocol.get("task_order", "heuristic") != "heuristic":

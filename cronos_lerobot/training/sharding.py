@@ -59,6 +59,14 @@ class ShardedEnv:
         """The observation now, of the streams of this process."""
         return self._env.observe()
 
+    def observe_under(self, tasks: Sequence[Any]) -> list[dict[str, Any]]:
+        """The observations under each of `tasks`, of the streams of this process."""
+        return self._env.observe_under(tasks)
+
+    def find_complete(self, tasks: Sequence[Any]) -> np.ndarray:
+        """Whether each of `tasks` is complete in each stream, (N, len(tasks)) bool."""
+        return self._concatenate(self._env.find_complete(tasks))
+
     def set_task(self, ids: Iterable[int], tasks: Sequence[Any]) -> None:
         """Give the streams `ids` their tasks."""
         given = {int(i): task for i, task in zip(ids, tasks, strict=True)}

@@ -17,10 +17,12 @@ from cronos_lerobot.processes import Processes, bit_sum
 from cronos_lerobot.protocol.loop_state import Event, SegmentEnd, Step, Update
 from cronos_lerobot.protocol.resets import make_resets
 from cronos_lerobot.protocol.rf_mtrl import rf_mtrl
-from cronos_lerobot.protocol.task_orders import TaskSet, make_task_order
+from cronos_lerobot.protocol.task_orders import TaskSet, bind_task_order, make_task_order
+from cronos_lerobot.protocol.task_values import RunContext
 from cronos_lerobot.stopwatch import Stopwatch
 from cronos_lerobot.training.checkpoint import RunState, load_checkpoint, save_checkpoint
 from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.critic_log import CriticLog
 from cronos_lerobot.training.logging import RunLogger, SilentLogger, write_manifest
 from cronos_lerobot.training.recording import FilmedEnv, StreamObserver
 from cronos_lerobot.training.rollout import RolloutStatistics, SmoothedSuccess
@@ -74,6 +76,9 @@ class Trainer:
         # Every named generator exists before a checkpoint is loaded into them.
         self.agent = self._make_agent()
         self.env = env if self.processes.count == 1 else ShardedEnv(env, self.processes)
+        run = RunContext(self.env, self.agent, self.task_set.tasks, config.protocol, config.total_steps)
+        bind_task_order(self._task_order, run)
+        self._resets.bind(run)
         self.loop = self.task_set.new_loop(config.num_envs)
         self._last_evaluation = 0
         self._last_interventions = 0
@@ -84,6 +89,7 @@ class Trainer:
             self.agent, self.loop, self.generators, self.env, preprocessor, postprocessor, self.processes
         )
         self.statistics = RolloutStatistics([t.instruction for t in self.task_set.all], len(self.task_set.tasks))
+        self.critic_log = CriticLog(config.protocol)
         self._smoothed = SmoothedSuccess(config.protocol, len(self.task_set.tasks))
 
     def _make_agent(self) -> LearningAgent:
@@ -117,6 +123,8 @@ class Trainer:
         self._last_evaluation = self._observers["last_evaluation"]
         self._last_interventions = self._observers["last_interventions"]
         self.statistics.load_state_dict(self._observers["statistics"])
+        if "critic" in self._observers:
+            self.critic_log.load_state_dict(self._observers["critic"])
         budget = self.config.protocol.reset_budget
         if self.loop.n >= self.config.total_steps:
             logging.warning(f"The run has done its {self.loop.n} steps: --steps=<more> goes on.")
@@ -175,6 +183,8 @@ class Trainer:
             self._evaluate()
         if self.config.save_checkpoint and (last_save < self.loop.n or not self._has_checkpoint()):
             self._save(self.env.get_state() if env_state is None else env_state)
+        if summary := self.critic_log.summary():
+            self.logger.log("resets", summary)
 
     def _events(self) -> Any:
         record = self.config.record
@@ -201,6 +211,7 @@ class Trainer:
         elif isinstance(event, Update):
             self._update_metrics = event.metrics
         elif isinstance(event, SegmentEnd):
+            self.critic_log.on_segment(event, self.loop)
             self.agent.end_segment(event.success, event.found_complete)
 
     def _check_processes(self) -> None:
@@ -221,7 +232,7 @@ class Trainer:
         steps_per_s = self.config.steps_per_update / wall
         rollout = self.statistics.pop()
         record = {"rollout": rollout, "agent": self._update_metrics, "steps_per_s": steps_per_s}
-        self.logger.log("update", record | {"time_share": shares})
+        self.logger.log("update", record | self.critic_log.pop() | {"time_share": shares})
         rates = self._smoothed.add(rollout, self.loop.n)
         if self.loop.updates % self.config.log_freq == 0:
             self.logger.progress(rates | {"steps_per_s": steps_per_s})
@@ -260,6 +271,7 @@ class Trainer:
             "last_evaluation": self._last_evaluation,
             "last_interventions": self._last_interventions,
             "statistics": self.statistics.state_dict(),
+            "critic": self.critic_log.state_dict(),
         }
         self.logger.log_checkpoint(save_checkpoint(self.run_state, self.config, observers, env_state))
         self.stopwatch.lap()

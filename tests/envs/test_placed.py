@@ -211,6 +211,13 @@ def test_the_expert_is_paid_after_it_has_let_go():
             assert lies_on(env, env.tasks[i])[i]
         paid |= env.is_success
     assert paid.all()
+    # What is complete does not depend on which task a stream has; no object lies on both receptacles.
+    complete, own = env.find_complete(env.scene.tasks), env.is_success.copy()
+    np.testing.assert_array_equal(complete[np.arange(16), np.arange(16) % 4], own)
+    assert (complete.reshape(16, 2, 2).sum(axis=2) <= 1).all()
+    env.set_task(range(16), [env.scene.tasks[3]] * 16)
+    np.testing.assert_array_equal(env.find_complete(env.scene.tasks), complete)
+    np.testing.assert_array_equal(env.is_success, complete[:, 3])
 
 
 def test_pushed_off_and_on_again_does_not_count():

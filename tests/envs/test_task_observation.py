@@ -47,6 +47,19 @@ def test_a_step_is_under_the_old_task_and_what_is_observed_after_the_switch_unde
     assert env.observe(np.array([1]))["agent_pos"][:, 13:].tolist() == [[0, 1, 1, 0, 0]]
 
 
+def test_what_would_be_seen_under_each_task_is_what_is_seen_under_it():
+    env = CronosVectorEnv(2, **TOLD)
+    before = [task.instruction for task in env.tasks]
+    would = env.observe_under(SCENE.tasks)
+    assert [task.instruction for task in env.tasks] == before
+    for task, observation in zip(SCENE.tasks, would, strict=True):
+        env.set_task([0, 1], [task, task])
+        for name, column in env.observe().items():
+            np.testing.assert_array_equal(observation[name], column, err_msg=task.instruction)
+    untold = CronosVectorEnv(2, **STATE).observe_under(SCENE.tasks)
+    np.testing.assert_array_equal(untold[3]["agent_pos"], would[0]["agent_pos"][:, :13])
+
+
 def test_a_chain_is_told_its_next_task_when_it_begins():
     env = SequentialVectorEnv(1, ordering=[SCENE.tasks[3], SCENE.tasks[0]], window=2, advance="on_success", **TOLD)
     observation, _ = env.reset(seed=0)

@@ -281,6 +281,16 @@ def test_many_differences_of_the_protocol_are_put_as_the_paper_does(tmp_path):
             "T = 1280, EER, LSR, shelf",
         ),
         ({"scene_reset_interval": None, "task_switch_interval": 80}, "no scene resets"),
+        (
+            {"scene_reset_interval": 1280, "task_switch_interval": 80, "end_effector_reset": True,
+             "reset_phase": "staggered", "task_order": "critic"},
+            "T = 1280, staggered, EER, critic order",
+        ),
+        (
+            {"scene_reset_interval": 80, "task_switch_interval": 80, "end_effector_reset": True,
+             "scene_reset": "critic", "reset_budget": 254},
+            "254 resets asked for by the critic, EER",
+        ),
     ],
 )  # fmt: skip
 def test_a_protocol_is_called_as_in_table_1(protocol, name):

@@ -20,6 +20,8 @@ DOCUMENTED = {
 
 def test_every_flag_has_its_default():
     expected = {f.name: getattr(ProtocolConfig(), f.name) for f in fields(ProtocolConfig)}
+    critic = expected.pop("critic")
+    expected |= {f"critic.{f.name}": getattr(critic, f.name) for f in fields(critic)}
     evaluation = PeriodicEvaluationConfig()
     expected |= {f"eval.{f.name}": getattr(evaluation, f.name) for f in fields(PeriodicEvaluationConfig)}
     config = CronosTrainConfig()

@@ -114,6 +114,14 @@ class PPOAgent(LearningAgent):
             self.buffer.clear()
             return metrics
 
+    def predict_values(self, o_t: dict[str, Any], tau: list[str]) -> np.ndarray:
+        """The policy's values of beginning the tasks `tau` now; see `ValuingAgent`."""
+        mine = tau[self.streams]
+        with self.stopwatch("infer"):
+            columns = self.history.followed_by(observation_columns(o_t), range(len(mine)))
+            values = self._values(columns, mine)
+        return self.ppo.processes.concatenate(values)
+
     def shared_tensors(self) -> Iterable[torch.Tensor]:
         """The policy's parameters and those beside it."""
         return trained_tensors(self.ppo.policy)

@@ -149,6 +149,20 @@ class SteeringAgent(LearningAgent):
         metrics |= dict(zip(done[0], means.tolist(), strict=True))
         return metrics | {"alpha": float(self.sac.log_alpha.detach().exp()), "optimizer_steps": float(steps)}
 
+    @torch.inference_mode()
+    def predict_values(self, o_t: dict[str, Any], tau: list[str]) -> np.ndarray:
+        """The critics' word on the actor's likeliest choices, 0 until they have learned; see `ValuingAgent`."""
+        mine = tau[self._streams]
+        values = np.zeros(len(mine), np.float32)
+        if self.num_steps:
+            columns = self.history.followed_by(observation_columns(o_t), range(len(mine)))
+            features = torch.from_numpy(self._observe(columns, mine)).to(self._processors.device)
+            # The mean needs no draw, and those of other generators must not depend on who asks for values.
+            unused = torch.Generator(self._processors.device)
+            choice, _ = self.steered.actor(self.steered.whitening(features), 0.0, unused)
+            values = self.sac.value(features, choice).float().cpu().numpy()
+        return self._processes.concatenate(values)
+
     def shared_tensors(self) -> Iterable[Tensor]:
         """All that is learned."""
         return self.sac.trained()

@@ -116,6 +116,13 @@ class ObservationBuilder:
             }
         return observation
 
+    def tell(self, observation: dict[str, Any], tasks: Sequence[Task]) -> dict[str, Any]:
+        """An observation (k, ...) as it would be under other `tasks`; what they do not change is shared."""
+        if not self.tells_task:
+            return observation
+        agent_pos = observation["agent_pos"][:, : len(AGENT_POS_NAMES)]
+        return observation | {"agent_pos": np.concatenate([agent_pos, self._one_hot(tasks)], axis=1)}
+
     def render(self, qpos: np.ndarray) -> np.ndarray:
         """Frames (k, height, width, 3) of states `qpos` (k, nq) for videos, from the first camera."""
         return self._renderer(self.render_size, self.cameras[0]).render(qpos)
