@@ -5,6 +5,7 @@ The same chains, random numbers and actors as `cronos-eval`'s.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
@@ -14,7 +15,7 @@ from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.evaluation.actors import make_actor
 from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
 from cronos_lerobot.evaluation.plan import make_parts
-from cronos_lerobot.evaluation.results import independent_results
+from cronos_lerobot.evaluation.results import Record, independent_results
 from cronos_lerobot.evaluation.store import chain_records
 from cronos_lerobot.processes import Processes
 
@@ -67,6 +68,15 @@ def run_independent(
     return [by_chain[chain] for chain in part.chains]
 
 
+def episode_lists(by_seed: Mapping[int, Sequence[Record]]) -> list[list[int]]:
+    """Every episode in short, for comparisons in pairs: [seed, task, configuration, success]."""
+    return [
+        [seed, record["number"], record["configuration"], record["length"]]
+        for seed, records in by_seed.items()
+        for record in records
+    ]
+
+
 def evaluate_independent(
     env: SequentialVectorEnv, *args: Any, seed: int, repetitions: int = 1, **options: Any
 ) -> dict[str, Any]:
@@ -80,14 +90,14 @@ def evaluate_independent(
         options: as there.
 
     Returns:
-        `split`, `temperature`, `steps` (control steps of all episodes) and `independent_results`.
+        `split`, `temperature`, `steps` (control steps of all episodes), `episodes` (see `episode_lists`) and
+        `independent_results`.
     """
-    records = [
-        record
-        for repetition in range(repetitions)
-        for record in chain_records(run_independent(env, *args, seed=seed + repetition, **options))
-    ]
+    by_seed = {
+        s: chain_records(run_independent(env, *args, seed=s, **options)) for s in range(seed, seed + repetitions)
+    }
+    records = [record for some in by_seed.values() for record in some]
     groups = env.benchmark.groups("independent", options["split"])
     header = {"split": options["split"], "temperature": options["temperature"]}
-    header |= {"steps": sum(record["steps"] for record in records)}
+    header |= {"steps": sum(record["steps"] for record in records), "episodes": episode_lists(by_seed)}
     return header | independent_results(records, [group.tasks[0] for group in groups])

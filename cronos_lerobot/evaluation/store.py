@@ -14,6 +14,8 @@ from cronos_lerobot.evaluation.chains import ChainResult, Trajectory
 
 IDENTITY = "evaluation.json"
 RESULTS = "results.json"
+COMPARISON = "comparison.json"
+"""In place of it, of an evaluation that ends as soon as two policies are told apart."""
 FORMAT = 2
 """Version of results.json; 1 was of version 0 of the environments."""
 

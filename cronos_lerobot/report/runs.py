@@ -147,7 +147,9 @@ def find_runs(folders: Iterable[Path], scene: str = "kitchen_2x2") -> FoundRuns:
             left_out[path] = " ".join(text.split())
 
     for folder in folders:
-        files = {name: [path.resolve() for path in _files(folder, name)] for name in (METRICS, EVAL_INFO, RESULTS)}
+        files = {
+            name: [path.resolve() for path in files_called(folder, name)] for name in (METRICS, EVAL_INFO, RESULTS)
+        }
         for path in files[METRICS]:
             keep(training, path, lambda path=path: read_training_run(path.parent))
         for path in files[EVAL_INFO]:
@@ -166,7 +168,8 @@ def find_runs(folders: Iterable[Path], scene: str = "kitchen_2x2") -> FoundRuns:
     return FoundRuns(list(training.values()), evaluations, read_suite_runs(suites), list(left_out.values()))
 
 
-def _files(folder: Path, name: str) -> Iterator[Path]:
+def files_called(folder: Path, name: str) -> Iterator[Path]:
+    """Files of a name in a folder, or else below it."""
     own = folder / name
     return iter([own] if own.is_file() else sorted(folder.rglob(name)))
 

@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cronos_lerobot.scripts import compare
+
 # What draws and what reads runs is imported where it is used: --help and a wrong flag are answered at once.
 if TYPE_CHECKING:
     from cronos_lerobot.report.page import Report
@@ -24,6 +26,9 @@ examples:
       cronos-report outputs/train/eer --before outputs/eval/base_* --after outputs/eval/eer_*
   all runs of an experiment
       cronos-reproduce table1 --scale=small; cronos-report outputs/reproduce/runs/kitchen_2x2_state_small
+
+  two policies on the same episodes: the difference, its interval and p (cronos-report compare --help)
+      cronos-report compare outputs/eval/base outputs/eval/eer
 
 OUTPUT/index.html contains everything and can be sent as it is; figures (PNG) and tables (CSV) lie beside it.
 """
@@ -91,6 +96,9 @@ def make_report(
 
 def main() -> None:
     """Entry point of `cronos-report`."""
+    if sys.argv[1:2] == ["compare"]:
+        compare.main(sys.argv[2:])
+        return
     parser = make_parser()
     args = parser.parse_args()
     if not args.runs + args.before + args.after:

@@ -1,0 +1,173 @@
+"""The two sides of `cronos-report compare`: which policies a folder stands for, and what they did."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from cronos_lerobot.evaluation.outcomes import Episode, Outcomes, read_outcomes, shared_episodes
+from cronos_lerobot.evaluation.store import COMPARISON, RESULTS
+from cronos_lerobot.report.runs import TrainingRun, files_called, group_runs, read_training_run
+from cronos_lerobot.report.suites import is_results, policy_name
+from cronos_lerobot.training.logging import METRICS
+
+LAST = "last"
+
+
+@dataclass(frozen=True)
+class Side:
+    """Some policies: one, or trainings of one kind that differ in their seed."""
+
+    folders: tuple[Path, ...]
+    evaluations: list[Outcomes]
+    """Of cronos-eval."""
+    runs: list[Outcomes] = field(default_factory=list)
+    """The last periodic evaluations of cronos-train."""
+    notes: list[str] = field(default_factory=list)
+    """What was left out, a sentence for each."""
+
+    @property
+    def suites(self) -> list[tuple[str, str]]:
+        """Pairs of suite and split that there are episodes of."""
+        return list(dict.fromkeys(pair for o in (*self.evaluations, *self.runs) for pair in o.suites))
+
+    def trainings(self, suite: str, split: str) -> list[Outcomes]:
+        """One for each policy, of several checkpoints of one run the last; of cronos-eval wherever it was run.
+
+        Raises:
+            ValueError: a policy has two different evaluations of the same episodes.
+        """
+        evaluated = [o for o in self.evaluations if o.of(suite, split)]
+        found: dict[str, dict[str, Outcomes]] = {}
+        for outcomes in evaluated or [o for o in self.runs if o.of(suite, split)]:
+            run, checkpoint = run_and_checkpoint(outcomes)
+            one, there = replace(outcomes, lengths=outcomes.of(suite, split)), found.setdefault(run, {})
+            there[checkpoint] = _together(there[checkpoint], one) if checkpoint in there else one
+        return [checkpoints[max(checkpoints, key=_order)] for checkpoints in found.values()]
+
+
+def _order(checkpoint: str) -> tuple[bool, str]:
+    return checkpoint == LAST, checkpoint
+
+
+def run_and_checkpoint(outcomes: Outcomes) -> tuple[str, str]:
+    """The run that a policy is of, and its checkpoint; a policy that is of none stands for itself."""
+    parts = Path(outcomes.policy).parts
+    if "checkpoints" not in parts[:-1]:
+        return f"{outcomes.policy} {outcomes.fingerprint}", ""
+    place = len(parts) - 1 - parts[::-1].index("checkpoints")
+    return str(Path(*parts[:place])), parts[place + 1]
+
+
+def _together(one: Outcomes, other: Outcomes) -> Outcomes:
+    """Evaluations of a policy with other seeds, or of other episodes."""
+    if one.lengths.keys() & other.lengths.keys():
+        names = [name for name in one.setting if one.setting[name] != other.setting[name]]
+        differ = "; ".join(f"{name}: {one.setting[name]} and {other.setting[name]}" for name in names)
+        raise ValueError(
+            f"{one.policy} has two evaluations of the same episodes ({differ or 'made alike'}): name the folder of"
+            " the one that is meant"
+        )
+    return replace(one, lengths=one.lengths | other.lengths)
+
+
+def read_side(folders: Sequence[Path]) -> Side:
+    """Read what `cronos-eval` and `cronos-train` wrote into some folders and below them.
+
+    Raises:
+        FileNotFoundError: a folder is missing or holds nothing of theirs.
+        ValueError: nothing in them can be paired, or they hold runs of several experiments.
+    """
+    evaluations: dict[Path, Outcomes] = {}
+    runs: dict[Path, TrainingRun] = {}
+    notes: list[str] = []
+    for folder in folders:
+        results = [path for path in files_called(folder, RESULTS) if is_results(path)]
+        stopped = [path for path in files_called(folder, COMPARISON) if not (path.parent / RESULTS).is_file()]
+        metrics = list(files_called(folder, METRICS))
+        if not results and not metrics and not stopped:
+            raise FileNotFoundError(f"{folder} has no {RESULTS} of cronos-eval and no {METRICS} of cronos-train")
+        for path in (*results, *stopped):
+            if path.resolve() not in evaluations:
+                _keep(notes, lambda path=path: evaluations.setdefault(path.resolve(), read_outcomes(path.parent)))
+        for path in metrics:
+            if path.resolve() not in runs:
+                _keep(notes, lambda path=path: runs.setdefault(path.resolve(), read_training_run(path.parent)))
+    groups = group_runs(list(runs.values()))
+    if len(groups) > 1:
+        labels = "; ".join(group.label for group in groups)
+        raise ValueError(f"{_names(folders)}: runs of {len(groups)} experiments, not seeds of one: {labels}")
+    own: list[Outcomes] = []
+    for run in groups[0].runs if groups else []:
+        _keep(notes, lambda run=run: own.append(last_evaluation(run)))
+    if not evaluations and not own:
+        raise ValueError("; ".join(notes))
+    return Side(tuple(folders), list(evaluations.values()), own, notes)
+
+
+def _keep(notes: list[str], read: Any) -> None:
+    try:
+        read()
+    except (ValueError, OSError) as error:
+        notes.append(" ".join(str(error).split()))
+
+
+def _names(folders: Sequence[Path]) -> str:
+    return ", ".join(map(str, folders))
+
+
+def last_evaluation(run: TrainingRun) -> Outcomes:
+    """The episodes of a run's last periodic evaluation.
+
+    Raises:
+        ValueError: it has none, or it was made before episodes were kept.
+    """
+    done = [evaluation for evaluation in run.evaluations if evaluation.get("episodes")]
+    if not done or not run.evaluations[-1].get("episodes"):
+        raise ValueError(
+            f"{run.folder}: its last evaluation does not say how each episode ended; evaluate its last checkpoint"
+            " with cronos-eval"
+        )
+    last, start = done[-1], run.starts[-1] if run.starts else {}
+    env = run.config.get("env") or {}
+    setting = {
+        "scene": env.get("scene"),
+        "environment": start.get("environment"),
+        "benchmark": (start.get("benchmark") or {}).get("fingerprint"),
+        # A single task has no next one.
+        "advance": None,
+        "end_effector_reset": None,
+        "temperature": last["temperature"],
+        "obs_type": env.get("obs_type"),
+        "renderer": env.get("renderer"),
+        "versions": start.get("versions"),
+    }
+    lengths = {
+        Episode("independent", last["split"], number, configuration, seed): success
+        for seed, number, configuration, success in last["episodes"]
+    }
+    policy = run.folder.resolve() / "checkpoints" / f"{last['interaction_steps']:07d}" / "policy"
+    labels = {"independent": dict(enumerate(last["per_task"]))}
+    return Outcomes(str(policy), "", setting, lengths, labels)
+
+
+def paired_episodes(sides: Sequence[Sequence[Outcomes]], suite: str, split: str) -> list[Episode]:
+    """The episodes that all policies of both sides have, sorted.
+
+    Raises:
+        ValueError: two of them cannot be paired; the sentence names what differs.
+    """
+    policies = [outcomes for side in sides for outcomes in side]
+    shared = set(policies[0].lengths)
+    for other in policies[1:]:
+        shared &= set(shared_episodes(policies[0], other, suite, split))
+    if not shared:
+        raise ValueError(f"no episode of {suite} {split} was run by all {len(policies)} policies")
+    return sorted(shared)
+
+
+def short_name(outcomes: Outcomes) -> str:
+    """A policy in short."""
+    return policy_name(outcomes.policy)

@@ -1,0 +1,252 @@
+"""The difference of two policies, or of two ways to train them, on the same episodes.
+
+What is done on the same episodes goes together: the difference of each pair says more than the two rates apart.
+The episodes of one configuration go together, too, as they begin in one scene, so errors are by configuration
+(Miller 2024, "Adding error bars to evals", arXiv:2411.00640, has both for language models).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+from lerobot_env_cronos.statistics import Z_95, wilson_interval
+from scipy.stats import t as student_t
+
+from cronos_lerobot.evaluation.sign_flip import sign_flip_p
+
+ALPHA = 0.05
+"""Of all intervals, and of the decision for which `needed` episodes are counted."""
+MOST = 10**7
+"""Configurations or trainings beyond which nobody would count."""
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """What the policies of two sides did on the same episodes: successes, or lengths of chains."""
+
+    a: np.ndarray
+    """(policies of A, episodes) int."""
+    b: np.ndarray
+    """(policies of B, episodes) int."""
+    configurations: np.ndarray
+    """(episodes,) the configuration, a cluster of episodes."""
+
+    @property
+    def differences(self) -> np.ndarray:
+        """(episodes,) mean of B's policies minus that of A's."""
+        return self.b.mean(axis=0) - self.a.mean(axis=0)
+
+    @property
+    def whole_differences(self) -> np.ndarray:
+        """(clusters,) sum of the differences of each, times the policies of both sides: whole numbers."""
+        whole = self.b.sum(axis=0) * len(self.a) - self.a.sum(axis=0) * len(self.b)
+        return np.bincount(self.clusters, weights=whole).round().astype(int)
+
+    @property
+    def clusters(self) -> np.ndarray:
+        """(episodes,) the number of its configuration, from 0."""
+        return np.unique(self.configurations, return_inverse=True)[1]
+
+    @property
+    def is_one_each(self) -> bool:
+        """Whether one policy is compared with one other."""
+        return len(self.a) == len(self.b) == 1
+
+
+@dataclass(frozen=True)
+class Difference:
+    """B minus A."""
+
+    value: float
+    ci95: tuple[float, float] | None
+    """None where no two outcomes say how much they vary."""
+    p: float | None
+    """Two-sided, of no difference."""
+    method: str
+    """Of the interval and of p."""
+    needed: int | None
+    """Configurations, or trainings of each side, with which a difference of this size is found with the power that
+    is asked for; None if there is no difference, or nothing to tell it from."""
+    detectable: float | None
+    """The difference that would have been found with that power."""
+
+    @property
+    def is_separated(self) -> bool:
+        """Whether p is below ALPHA."""
+        return self.p is not None and self.p < ALPHA
+
+
+def compare_policies(pairs: Pairs, power: float) -> Difference:
+    """These very policies, on configurations like these.
+
+    p is that of the exact sign-flip test over the configurations (McNemar's where each has one episode). The
+    interval of a difference of two policies' success rates is `newcombe_paired_interval`, of `effective_pairs`;
+    any other is Student's, over the configurations.
+    """
+    value, k = float(pairs.differences.mean()), int(pairs.clusters.max()) + 1
+    spread = sqrt(k * cluster_variance(pairs.differences, pairs.clusters)) if k > 1 else 0.0
+    is_binary = pairs.is_one_each and max(pairs.a.max(), pairs.b.max()) <= 1
+    if is_binary:
+        interval, name = _newcombe(pairs), "Newcombe's paired interval by configuration"
+    else:
+        half = float(student_t.ppf(1 - ALPHA / 2, k - 1)) * spread / sqrt(k) if k > 1 else 0.0
+        interval = (value - half, value + half) if half else None
+        name = "t-interval over configurations"
+    return Difference(
+        value,
+        interval,
+        sign_flip_p(pairs.whole_differences),
+        f"{name}, exact sign-flip p over {k} configurations",
+        samples_needed(spread, value, power, lambda n: n - 1),
+        detectable(spread, k, power, k - 1),
+    )
+
+
+def compare_trainings(pairs: Pairs, power: float) -> Difference | None:
+    """Trainings like these, on configurations like these; None if neither side has two.
+
+    The variance is clustered both ways, by training and by configuration (Cameron, Gelbach and Miller 2011,
+    "Robust inference with multiway clustering"): that between the trainings of each side, plus that between the
+    configurations, less what is in both. A side of one policy, such as the base of all, is taken as it is. The
+    t-interval has Satterthwaite's degrees of freedom.
+    """
+    sides = [side for side in (pairs.a, pairs.b) if len(side) > 1]
+    if not sides:
+        return None
+    k = int(pairs.clusters.max()) + 1
+    value = float(pairs.differences.mean())
+    of_side = [float(side.mean(axis=1).var(ddof=1)) / len(side) for side in sides]
+    trainings = sum(of_side)
+    both = sum(_variance_within(side, pairs.clusters) for side in sides)
+    configurations = cluster_variance(pairs.differences, pairs.clusters) if k > 1 else 0.0
+    more = max(0.0, configurations - both)
+    variance = trainings + more
+    spread = sqrt(sum(v * len(side) for v, side in zip(of_side, sides, strict=True)))
+    counts = f"{len(pairs.a)} against {len(pairs.b)} trainings"
+    method = f"t-interval and p by training and configuration ({counts}, {k} configurations)"
+    per_side = len(sides)
+    needed = samples_needed(spread, value, power, lambda n: per_side * (n - 1))
+    if not variance:
+        return Difference(value, None, None, method, None, None)
+    terms = [v * v / (len(side) - 1) for v, side in zip(of_side, sides, strict=True)]
+    df = variance**2 / (sum(terms) + (more**2 / (k - 1) if more else 0.0))
+    half = float(student_t.ppf(1 - ALPHA / 2, df)) * sqrt(variance)
+    p = 2 * float(student_t.sf(abs(value) / sqrt(variance), df))
+    found = (float(student_t.ppf(1 - ALPHA / 2, df)) + float(student_t.ppf(power, df))) * sqrt(variance)
+    return Difference(value, (value - half, value + half), p, method, needed, found)
+
+
+def cluster_variance(values: np.ndarray, clusters: np.ndarray) -> float:
+    """Variance of the mean of values that go together by cluster, of which there are at least two."""
+    k = int(clusters.max()) + 1
+    sums = np.bincount(clusters, weights=values - values.mean(), minlength=k)
+    return float(np.sum(sums**2)) * k / (k - 1) / len(values) ** 2
+
+
+def _variance_within(side: np.ndarray, clusters: np.ndarray) -> float:
+    """The part of the variance of a side's mean that is of neither its trainings nor its configurations."""
+    centred = side - side.mean()
+    sums = np.stack([np.bincount(clusters, weights=row) for row in centred])
+    return float(np.sum(sums**2)) / side.size**2
+
+
+def effective_pairs(differences: np.ndarray, clusters: np.ndarray) -> float:
+    """How many independent pairs would say as much as these, of which those of one cluster go together.
+
+    As `evaluation.rates.effective_trials`, of differences: n over the design effect, at least 1, with Student's
+    quantile; where no pair differs, as if clusters went together completely.
+    """
+    n, k = len(differences), int(clusters.max()) + 1
+    variance = float(differences.var())
+    if k in (1, n) or variance == 0:
+        return float(k)
+    design_effect = max(1.0, cluster_variance(differences, clusters) / (variance / n))
+    return n / design_effect * (Z_95 / float(student_t.ppf(0.975, k - 1))) ** 2
+
+
+def _newcombe(pairs: Pairs) -> tuple[float, float]:
+    a, b = pairs.a[0].astype(bool), pairs.b[0].astype(bool)
+    counts = np.array([(b & a).sum(), (b & ~a).sum(), (~b & a).sum(), (~b & ~a).sum()])
+    n = effective_pairs(pairs.differences, pairs.clusters)
+    return newcombe_paired_interval(*(counts / len(a) * n).tolist())
+
+
+def newcombe_paired_interval(both: float, first: float, second: float, neither: float) -> tuple[float, float]:
+    """95 % interval of the difference of two success rates on the same pairs, first minus second.
+
+    Newcombe 1998, "Improved confidence intervals for the difference between binomial proportions based on paired
+    data", method 10: the Wilson intervals of the two rates, put together with the correlation of the pairs,
+    continuity corrected.
+
+    Args:
+        both: pairs in which both succeed; not necessarily a whole number, as the others.
+        first: only the first.
+        second: only the second.
+        neither: none of them.
+    """
+    n = both + first + second + neither
+    p1, p2 = (both + first) / n, (both + second) / n
+    (low1, high1), (low2, high2) = (wilson_interval(min(n, p * n), n) for p in (p1, p2))
+    margins = (both + first) * (second + neither) * (both + second) * (first + neither)
+    product = both * neither - first * second
+    if product > 0:
+        product = max(0.0, product - n / 2)
+    phi = product / sqrt(margins) if margins > 0 else 0.0
+
+    def distance(of_first: float, of_second: float) -> float:
+        return sqrt(max(0.0, of_first**2 - 2 * phi * of_first * of_second + of_second**2))
+
+    difference = p1 - p2
+    return difference - distance(p1 - low1, high2 - p2), difference + distance(high1 - p1, p2 - low2)
+
+
+def samples_needed(spread: float, difference: float, power: float, df: Callable[[int], int]) -> int | None:
+    """Samples for which a t-test at ALPHA finds a difference with a power, about.
+
+    The smallest n with (t_(1 - alpha/2) + t_power) spread / sqrt(n) <= |difference|.
+
+    Args:
+        spread: standard deviation of a sample.
+        difference: between the means.
+        power: 0.5 to 1.
+        df: the test's degrees of freedom of n samples.
+
+    Returns:
+        None if there is no difference, no spread, or if it is more than MOST.
+    """
+    if not spread or not difference:
+        return None
+
+    def is_enough(n: int) -> bool:
+        found = detectable(spread, n, power, df(n))
+        return found is not None and found <= abs(difference)
+
+    low, high = 1, 2
+    while not is_enough(high):
+        low, high = high, 2 * high
+        if high > MOST:
+            return None
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if is_enough(middle) else (middle, high)
+    return high
+
+
+def detectable(spread: float, n: int, power: float, df: int) -> float | None:
+    """The difference that a t-test of n samples at ALPHA finds with a power, about; None if they do not vary."""
+    if df < 1 or not spread:
+        return None
+    quantiles = float(student_t.ppf(1 - ALPHA / 2, df)) + float(student_t.ppf(power, df))
+    return quantiles * spread / sqrt(n)
+
+
+def holm(ps: list[float]) -> list[float]:
+    """p-values of several tests, adjusted so that the chance of any false decision stays in bounds (Holm 1979)."""
+    adjusted, largest = [0.0] * len(ps), 0.0
+    for rank, i in enumerate(np.argsort(ps)):
+        largest = max(largest, min(1.0, (len(ps) - rank) * ps[i]))
+        adjusted[i] = largest
+    return adjusted

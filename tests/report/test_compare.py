@@ -1,0 +1,209 @@
+"""`cronos-report compare`: folders of evaluations and runs, paired episode by episode."""
+
+import json
+import re
+import sys
+
+import pytest
+from synthetic_runs import INSTRUCTIONS
+
+from cronos_lerobot.scripts import report
+
+HEAD = {"format": 2, "scene": "kitchen_2x2", "temperature": 0.6, "seed": 1000, "obs_type": "pixels_agent_pos"}
+HEAD |= {"advance": "window", "end_effector_reset": False, "renderer": "classic", "versions": {"mujoco": "4"}}
+BENCHMARK = {"environment": "lerobot_env_cronos/kitchen_2x2-v1", "fingerprint": "b6d1"}
+
+
+def write_evaluation(folder, policy, *, tasks=None, chains=None, split="held_out", **changes):
+    """Results of cronos-eval: `tasks` has a string of 0 and 1 for each, `chains` the lengths of each ordering."""
+    benchmark = BENCHMARK | changes.pop("benchmark", {})
+    head = HEAD | {"policy": policy, "policy_fingerprint": policy, "benchmark": benchmark} | changes
+    parts = {}
+    if tasks:
+        parts[f"independent_{split}"] = ("independent", [[int(x) for x in line] for line in tasks])
+        head["independent"] = {split: {"per_task": {text: {} for text in INSTRUCTIONS[: len(tasks)]}}}
+    if chains:
+        parts[f"sequential_{split}_0"] = ("sequential", chains)
+        head["sequential"] = {split: {"positions": [{}] * 4}}
+    (folder / "parts").mkdir(parents=True)
+    for name, (suite, lengths) in parts.items():
+        records = [
+            {"number": number, "configuration": configuration, "length": length}
+            for number, row in enumerate(lengths)
+            for configuration, length in enumerate(row)
+        ]
+        content = {"suite": suite, "split": split, "chains": records}
+        (folder / "parts" / f"{name}.json").write_text(json.dumps(content))
+    (folder / "results.json").write_text(json.dumps(head | {"made_by": [{"parts": list(parts)}]}))
+    return folder
+
+
+def write_run(folder, seed, tasks, **changes):
+    """A run of cronos-train with one evaluation before and one after."""
+    folder.mkdir(parents=True)
+    lines = []
+    for step, strings in ((0, ["0" * len(tasks[0])] * len(tasks)), (10240, tasks)):
+        episodes = [[1000, number, c, int(x)] for number, line in enumerate(strings) for c, x in enumerate(line)]
+        line = {"kind": "evaluation", "interaction_steps": step, "interventions": 0, "split": "train"}
+        line |= {
+            "temperature": 0.6,
+            "per_task": {text: {} for text in INSTRUCTIONS[: len(tasks)]},
+            "episodes": episodes,
+        }
+        lines.append(json.dumps(line))
+    (folder / "metrics.jsonl").write_text("\n".join(lines))
+    config = {"seed": seed, "env": {"scene": "kitchen_2x2"}, "protocol": {"scene_reset_interval": 80} | changes}
+    start = {"config": config, "environment": BENCHMARK["environment"], "benchmark": BENCHMARK}
+    (folder / "manifest.json").write_text(json.dumps({"starts": [start]}))
+    return folder
+
+
+def compare(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["cronos-report", "compare", *map(str, arguments)])
+    report.main()
+
+
+def compared(monkeypatch, capsys, *arguments):
+    compare(monkeypatch, *arguments, "--json")
+    return json.loads(capsys.readouterr().out)
+
+
+def test_two_policies_task_by_task(tmp_path, monkeypatch, capsys):
+    a = write_evaluation(tmp_path / "a", "me/a", tasks=["1100000000", "0000000000"])
+    b = write_evaluation(tmp_path / "b", "me/b", tasks=["1011111111", "0000000000"])
+    (suite,) = compared(monkeypatch, capsys, a, b)["comparisons"]
+    assert (suite["suite"], suite["split"], suite["seeds"]) == ("independent", "held_out", [1000])
+    assert (suite["a"], suite["b"], suite["left_out"], suite["differs"]) == (["me/a"], ["me/b"], 0, [])
+    overall, one, other = suite["rows"]
+    assert [row["what"] for row in suite["rows"]] == ["all tasks", *INSTRUCTIONS[:2]]
+    assert (overall["pairs"], overall["configurations"], overall["a"], overall["b"]) == (20, 10, 0.1, 0.45)
+    assert (overall["only_a"], overall["only_b"], overall["trainings"]) == (1, 8, None)
+    # By configuration as by episode: 8 of 9 that differ, 2 (1 + 9) / 2^9.
+    assert overall["policies"]["p"] == one["policies"]["p"] == 20 / 512
+    assert (one["p_holm"], other["policies"]["p"], other["p_holm"]) == (40 / 512, 1, 1)
+    compare(monkeypatch, a, b)
+    text = capsys.readouterr().out
+    assert "independent held_out: 20 pairs of episodes from 10 configurations, sampling seed 1000" in text
+    assert "B is better, of these policies (p = 0.039 < 0.05)." in text
+    assert "One training each: this says nothing of how they were trained." in text
+    compare(monkeypatch, b, a)
+    assert "A is better, of these policies (p = 0.039 < 0.05)." in capsys.readouterr().out
+
+
+def test_a_decision_would_need_more_episodes(tmp_path, monkeypatch, capsys):
+    a = write_evaluation(tmp_path / "a", "me/a", tasks=["1100000000", "0000000000"])
+    b = write_evaluation(tmp_path / "b", "me/b", tasks=["1011000000", "0000000000"])
+    row = compared(monkeypatch, capsys, a, b)["comparisons"][0]["rows"][0]
+    assert row["policies"]["p"] == 1
+    # Means of two episodes: -.5, .5, .5 and seven 0, mean .05, standard deviation .2838. (1.976 + .844) .2838 /
+    # sqrt(n) <= .05 at n = 255: 245 more configurations of two episodes.
+    assert row["policies"]["needed"] == 255
+    assert row["more_episodes"] == 490
+    compare(monkeypatch, a, b)
+    text = capsys.readouterr().out
+    assert "Not separated, of these policies (p = 1): this is no sign that they do alike." in text
+    assert "One of 0.050 takes about 490 more episodes of each policy, from 255 configurations in all." in text
+
+
+def test_chains_are_paired_by_ordering_and_configuration(tmp_path, monkeypatch, capsys):
+    a = write_evaluation(tmp_path / "a", "me/a", chains=[[0, 1, 2], [0, 1, 4]])
+    b = write_evaluation(tmp_path / "b", "me/b", chains=[[1, 1, 4], [2, 2, 4]])
+    rows = compared(monkeypatch, capsys, a, b)["comparisons"][0]["rows"]
+    assert [row["what"] for row in rows] == ["chain length", "SEQ 0", "SEQ 1", "SEQ 2", "SEQ 3"]
+    length = rows[0]
+    assert (length["a"], length["b"], length["only_a"]) == (8 / 6, 14 / 6, None)
+    # Sums of the differences by configuration: 1 + 2, 0 + 1, 2 + 0; all of one sign, 2 of 8 ways.
+    assert length["policies"]["value"] == 1
+    assert length["policies"]["p"] == 2 / 8
+    # SEQ 2 is success of the third task: only B's first chain of the last configuration is new.
+    assert (rows[3]["a"], rows[3]["b"], rows[3]["only_b"]) == (pytest.approx(1 / 6), pytest.approx(2 / 6), 1)
+
+
+def test_trainings_of_several_seeds(tmp_path, monkeypatch, capsys):
+    path = "runs/{}/seed{}/train/checkpoints/{}/pretrained_model"
+    for side, per_seed in (("a", ("1000", "0010", "0100")), ("b", ("1110", "1011", "1111"))):
+        for seed, line in enumerate(per_seed):
+            policy = path.format(side, seed, "0010240")
+            write_evaluation(tmp_path / side / f"seed{seed}/eval/x", policy, tasks=[line])
+    # An earlier checkpoint of one of them is not another training.
+    write_evaluation(tmp_path / "b/seed0/eval/w", path.format("b", 0, "0005120"), tasks=["0000"])
+    (suite,) = compared(monkeypatch, capsys, tmp_path / "a", tmp_path / "b")["comparisons"]
+    (row, _) = suite["rows"]
+    assert suite["b"] == ["b/seed0 0010240", "b/seed1 0010240", "b/seed2 0010240"]
+    assert (row["a"], row["b"]) == (pytest.approx(0.25), pytest.approx(10 / 12))
+    # Configurations: 3 of B against 1, 1, 1, 0 of A: sums 2, 1, 2, 2 of three, all of one sign: 2 of 16 ways.
+    assert row["policies"]["p"] == 2 / 16
+    assert "3 against 3 trainings" in row["trainings"]["method"]
+    assert row["trainings"]["value"] == pytest.approx(7 / 12)
+    compare(monkeypatch, *sorted(tmp_path.glob("a/seed*")), "--with", *sorted(tmp_path.glob("b/seed*")))
+    text = capsys.readouterr().out
+    assert re.search(r"trainings like these +\+0\.583 \[", text)
+    assert "B is better, of trainings like these" in text
+    assert "One training each" not in text
+
+
+def test_run_folders_have_their_last_evaluation(tmp_path, monkeypatch, capsys):
+    a = write_run(tmp_path / "a", 1, ["1000", "0000"])
+    for seed, tasks in ((1, ["1110", "0001"]), (2, ["1111", "0000"])):
+        write_run(tmp_path / f"b/seed{seed}", seed, tasks)
+    (suite,) = compared(monkeypatch, capsys, a, tmp_path / "b")["comparisons"]
+    assert (suite["suite"], suite["split"], suite["rows"][0]["pairs"]) == ("independent", "train", 8)
+    assert (suite["rows"][0]["a"], suite["rows"][0]["b"]) == (0.125, 0.5)
+    assert suite["b"] == ["seed1 0010240", "seed2 0010240"]
+    write_run(tmp_path / "b/other", 1, ["1111", "0000"], scene_reset_interval=1280)
+    with pytest.raises(SystemExit, match=r"runs of 2 experiments, not seeds of one: .*1280"):
+        compare(monkeypatch, a, tmp_path / "b")
+
+
+def test_what_was_left_out_and_what_is_not_alike_is_said(tmp_path, monkeypatch, capsys):
+    a = write_evaluation(tmp_path / "a", "me/a", tasks=["110"], temperature=0)
+    b = write_evaluation(tmp_path / "b", "me/b", tasks=["11010"], versions={"mujoco": "5"})
+    compare(monkeypatch, a, b)
+    text = capsys.readouterr().out
+    assert "3 pairs of episodes" in text
+    assert "left out: 2 that not all of them ran" in text
+    assert "not alike: temperature: 0 in A, 0.6 in B" in text
+    assert "mujoco 4" in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"scene": "playroom_2x2"}, "they differ in scene: kitchen_2x2 and playroom_2x2"),
+        ({"benchmark": {"fingerprint": "77aa"}}, r"benchmark \(configurations, .*\): b6d1 and 77aa"),
+        ({"seed": 7}, r"their action sampling has other seeds: \[1000\] and \[7\]"),
+        (
+            {"split": "train"},
+            "no suite and split is in both: A has independent held_out, .* B has independent train",
+        ),
+        (
+            {"advance": "on_success"},
+            "on sequential held_out: they differ in advance: window and on_success",
+        ),
+        ({"benchmark": {"environment": "lerobot_env_cronos/kitchen_2x2-v0"}}, "v0"),
+        ({"format": 1}, "is in format 1"),
+    ],
+)
+def test_evaluations_that_cannot_be_paired_are_refused(tmp_path, monkeypatch, changes, sentence):
+    what = {"tasks": ["10"]} if "advance" not in changes else {}
+    a = write_evaluation(tmp_path / "a", "me/a", tasks=["10"], chains=[[1, 2]])
+    b = write_evaluation(tmp_path / "b", "me/b", **what, chains=[[1, 2]], **changes)
+    with pytest.raises(SystemExit, match=sentence):
+        compare(monkeypatch, a, b)
+
+
+def test_folders_that_say_nothing_are_refused(tmp_path, monkeypatch, capsys):
+    a = write_evaluation(tmp_path / "a", "me/a", tasks=["10"])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SystemExit, match=r"empty has no results.json of cronos-eval and no metrics.jsonl"):
+        compare(monkeypatch, a, tmp_path / "empty")
+    again = write_evaluation(tmp_path / "two/1", "me/a", tasks=["10"])
+    write_evaluation(tmp_path / "two/2", "me/a", tasks=["11"], temperature=0)
+    with pytest.raises(SystemExit, match=r"two evaluations of the same episodes \(temperature: 0.6 and 0\)"):
+        compare(monkeypatch, a, tmp_path / "two")
+    (again / "parts/independent_held_out.json").unlink()
+    with pytest.raises(SystemExit, match=r"has no parts/independent_held_out.json"):
+        compare(monkeypatch, a, again)
+    with pytest.raises(SystemExit, match="2"):
+        compare(monkeypatch, a)
+    assert "name two folders, A and B, or --with: got 1" in capsys.readouterr().err

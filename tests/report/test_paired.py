@@ -1,0 +1,163 @@
+"""Differences of two policies on the same episodes, with numbers worked out by hand or published."""
+
+import numpy as np
+import pytest
+from scipy.stats import ttest_1samp, ttest_ind
+
+from cronos_lerobot.report.paired import (
+    Pairs,
+    compare_policies,
+    compare_trainings,
+    detectable,
+    effective_pairs,
+    holm,
+    newcombe_paired_interval,
+    samples_needed,
+)
+
+
+@pytest.mark.parametrize(
+    ("counts", "ends"),
+    [
+        # Newcombe 1998, Table II; method 10.
+        ((36, 12, 2, 0), (0.0569, 0.3404)),
+        ((20, 12, 2, 16), (0.0562, 0.3292)),
+        # Fagerland, Lydersen and Laake 2014, airway hyper-responsiveness.
+        ((1, 1, 7, 12), (-0.507, -0.026)),
+    ],
+)
+def test_newcombes_interval_is_the_published_one(counts, ends):
+    assert newcombe_paired_interval(*counts) == pytest.approx(ends, abs=6e-5 if ends[0] > 0 else 6e-4)
+
+
+def one_each(counts):
+    """Pairs of one episode from each configuration, by (both, only B, only A, neither)."""
+    a = np.repeat([1, 0, 1, 0], counts)
+    b = np.repeat([1, 1, 0, 0], counts)
+    return Pairs(a[None], b[None], np.arange(len(a)))
+
+
+def test_one_episode_from_each_configuration():
+    found = compare_policies(one_each((20, 12, 2, 16)), power=0.8)
+    assert found.value == 0.2
+    assert found.ci95 == pytest.approx((0.0562, 0.3292), abs=6e-5)
+    # 14 pairs differ, 12 of them one way: 2 (1 + 14 + 91) / 2^14.
+    assert found.p == 212 / 16384
+    assert found.is_separated
+    # The differences have variance 14/50 - .2^2 = .24, by n - 1 .24 x 50/49: spread .4949. With n = 50 and about
+    # (2.01 + .85) .4949 / sqrt(50) = .2001, just too much: it takes one more.
+    assert found.detectable == pytest.approx(0.2001, abs=1e-4)
+    assert found.needed == 51
+
+
+def test_no_pair_differs():
+    found = compare_policies(one_each((30, 0, 0, 20)), power=0.8)
+    assert (found.value, found.p, found.needed, found.detectable) == (0, 1, None, None)
+    # Not certain to be alike; if A always fails where B succeeds, 0 of 50 has Wilson's [0, .0713].
+    low, high = found.ci95
+    assert low == pytest.approx(-high)
+    assert 0 < high < 0.0713
+
+
+def test_episodes_of_a_configuration_that_go_together_count_as_one():
+    # Ten configurations of four episodes that come out alike: as ten pairs, of which 8 and 2 differ.
+    d = np.repeat([1] * 8 + [-1] * 2, 4)
+    pairs = Pairs((d < 0).astype(int)[None], (d > 0).astype(int)[None], np.repeat(np.arange(10), 4))
+    found = compare_policies(pairs, power=0.8)
+    assert found.value == pytest.approx(0.6)
+    # 2 (1 + 10 + 45) / 2^10, by configuration; by episode it would be 2e-5.
+    assert found.p == 112 / 1024
+    # The variance of the mean is that of ten numbers, .64 x 10/9 / 10, that of 40 alone .64 / 40: design effect
+    # 40/9, so 9 pairs, and with (1.960 / 2.262)^2 for ten clusters 6.757.
+    assert effective_pairs(d.astype(float), pairs.clusters) == pytest.approx(6.757, abs=1e-3)
+    theirs = ttest_1samp([1] * 8 + [-1] * 2, 0)
+    assert found.detectable == pytest.approx((2.2622 + 0.8834) * theirs._standard_error, abs=1e-3)
+
+
+def test_chains_are_compared_by_their_lengths():
+    a, b = np.array([[4, 1, 0, 2, 3, 1]]), np.array([[4, 2, 1, 4, 2, 4]])
+    found = compare_policies(Pairs(a, b, np.arange(6)), power=0.9)
+    # Differences 0, 1, 1, 2, -1, 3: mean 1, standard deviation sqrt(2).
+    assert found.value == 1
+    half = 2.5706 * np.sqrt(2 / 6)
+    assert found.ci95 == pytest.approx((1 - half, 1 + half), abs=1e-4)
+    # Of the 32 ways to sign 1, 1, 2, 1, 3, with sum 6 of 8: |sum| = 8 has 2, |sum| = 6 has 2 x 3 (a 1 is flipped).
+    assert found.p == 8 / 32
+    low, high = ttest_1samp((b - a)[0], 0).confidence_interval()
+    assert found.ci95 == pytest.approx((low, high))
+
+
+def test_trainings_where_configurations_make_no_difference_are_welchs_t_test():
+    # Every configuration has the same number in a policy: nothing is between them.
+    a, b = np.array([2, 3, 7]), np.array([6, 9, 9])
+    sides = [np.repeat(side[:, None], 8, axis=1) for side in (a, b)]
+    found = compare_trainings(Pairs(*sides, np.arange(8)), power=0.8)
+    assert found is not None
+    theirs = ttest_ind(b, a, equal_var=False)
+    assert found.value == 4
+    # Variances 7 and 3 of 3 trainings: (7 + 3) / 3; t = 4 / sqrt(10 / 3) = 2.19.
+    assert found.p == pytest.approx(theirs.pvalue)
+    assert found.ci95 == pytest.approx(tuple(theirs.confidence_interval()))
+    # With n each, 2 n - 2 degrees of freedom, (t_.975 + t_.8) sqrt(10 / n) <= 4: n = 6 has (2.228 + .879) 1.291 =
+    # 4.01, n = 7 (2.179 + .873) 1.195 = 3.65.
+    assert found.needed == 7
+
+
+def test_trainings_that_do_alike_vary_by_configuration():
+    # Two trainings each, all of A's alike and all of B's: only the configurations differ.
+    d = np.array([1, 1, 0, 1, -1, 1])
+    a = np.repeat((d < 0).astype(int)[None], 2, axis=0)
+    b = np.repeat((d > 0).astype(int)[None], 2, axis=0)
+    found = compare_trainings(Pairs(a, b, np.arange(6)), power=0.8)
+    assert found is not None
+    # Configurations: sum of squares 5 - 6/4 = 3.5, x 6/5 / 36. In both: of A 5/6 x 2 / 144, of B 4/3 x 2 / 144.
+    variance = 3.5 * 6 / 5 / 36 - (5 / 6 + 4 / 3) * 2 / 144
+    half = 2.5706 * np.sqrt(variance)
+    assert found.ci95 == pytest.approx((0.5 - half, 0.5 + half), abs=1e-4)
+
+
+def test_one_training_each_says_nothing_of_trainings_and_a_fixed_base_is_none():
+    lengths = np.array([[1, 0, 1, 1], [0, 0, 1, 1], [1, 1, 1, 1]])
+    assert compare_trainings(Pairs(lengths[:1], lengths[1:2], np.arange(4)), power=0.8) is None
+    against_base = compare_trainings(Pairs(lengths[:1], lengths, np.arange(4)), power=0.8)
+    assert against_base is not None
+    assert against_base.method.startswith("t-interval and p by training and configuration (1 against 3 trainings")
+
+
+def test_intervals_cover_the_difference_as_often_as_they_say():
+    """Trainings and configurations of their own effects: 3 against 3, 24 configurations of 4 episodes."""
+    rng, covered, runs = np.random.default_rng(5), 0, 300
+    for _ in range(runs):
+        scenes, episodes = rng.normal(0, 1, 24).repeat(4), (3, 96)
+        sides = []
+        for better in (0.0, 0.5):
+            own = rng.normal(0, 0.5, (3, 1)) + rng.normal(0, 0.5, 24).repeat(4)
+            p = 1 / (1 + np.exp(-(better + scenes + own)))
+            sides.append((rng.random(episodes) < p).astype(int))
+        found = compare_trainings(Pairs(*sides, np.arange(24).repeat(4)), power=0.8)
+        assert found is not None
+        assert found.ci95 is not None
+        covered += found.ci95[0] < TRUE_DIFFERENCE < found.ci95[1]
+    # Of 300 with 95 %, 3 standard deviations below 285 are 273.7.
+    assert covered >= 274
+
+
+def _true_difference():
+    x = np.random.default_rng(1).normal(0, np.sqrt(1 + 0.25 + 0.25), 400_000)
+    return float(np.mean(1 / (1 + np.exp(-(x + 0.5)))) - np.mean(1 / (1 + np.exp(-x))))
+
+
+TRUE_DIFFERENCE = _true_difference()
+
+
+def test_holms_adjustment():
+    # Smallest first: 3 x .01, 2 x .02, 1 x .04, never falling.
+    assert holm([0.04, 0.01, 0.02]) == pytest.approx([0.04, 0.03, 0.04])
+    assert holm([0.6, 0.5]) == [1, 1]
+
+
+def test_how_many_it_takes():
+    # (t_.975 + t_.8) 1 / sqrt(n) <= .5: n = 34 has (2.0345 + .8530) / 5.831 = .4952, n = 33 .5028.
+    assert samples_needed(1.0, 0.5, 0.8, lambda n: n - 1) == 34
+    assert samples_needed(1.0, 0.0, 0.8, lambda n: n - 1) is None
+    assert detectable(1.0, 1, 0.8, 0) is None
