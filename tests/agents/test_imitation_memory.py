@@ -152,6 +152,27 @@ def test_a_batch_is_that_of_a_dataset_of_the_same_frames(name, episodes, dataset
     assert {len(column) for column in joined.values()} == {len(draws) + 2}
 
 
+@pytest.mark.parametrize("drop_last", [0, 2])
+@pytest.mark.parametrize("name", DELTAS)
+def test_vectors_are_drawn_from_memory_as_a_dataset_gives_them(name, drop_last, dataset_root, monkeypatch):
+    """The same draws, once by LeRobotDataset and PyTorch's collation, once from the columns in memory."""
+    config = policy_config(name)
+    config.drop_n_last_frames = drop_last
+    options = DemosConfig("me/demos", dataset_root)
+    theirs = Demonstrations(options, config).batch(20, np.random.default_rng(7))
+    del config.input_features["observation.images.front"]
+    demos = Demonstrations(options, config)
+    monkeypatch.delattr(LeRobotDataset, "__getitem__")
+    own = demos.batch(20, np.random.default_rng(7))
+    assert own.pop("task") == theirs["task"]
+    assert {"observation.state", "action"} <= own.keys()
+    assert ("next.reward" in own) == (name == "tdmpc")
+    assert len({tuple(row.flatten().tolist()) for row in own["action"]}) > 2
+    for key, column in own.items():
+        assert column.dtype == theirs[key].dtype, key
+        assert torch.equal(column, theirs[key]), key
+
+
 def test_a_dataset_without_what_the_policy_reads_is_refused(dataset_root):
     config = policy_config("act")
     config.input_features["observation.environment_state"] = None
