@@ -19,7 +19,7 @@ from cronos_lerobot.agents.base import (
 from cronos_lerobot.agents.chunk_player import ChunkPlayer, Player, make_player
 from cronos_lerobot.agents.imitation.batches import Demonstrations, join_batches, segment_batch
 from cronos_lerobot.agents.imitation.config import ImitationConfig
-from cronos_lerobot.agents.imitation.memory import OpenSegments, SegmentMemory
+from cronos_lerobot.agents.imitation.memory import OpenSegments, SegmentMemory, own_share
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.agents.registry import AgentContext, register_agent
 from cronos_lerobot.agents.state import to_arrays, to_tensors
@@ -114,11 +114,8 @@ class ImitationAgent(LearningAgent):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on with the segments of this process, or with its share if there are more or fewer processes now."""
-        rank, count = self._processes.rank, self._processes.count
-        memories = to_arrays(state["memory"])
-        if len(memories) != count:
-            memories = [[s for memory in memories for s in memory][i::count] for i in range(count)]
-        self.memory.load_state_dict(memories[rank])
+        processes = self._processes
+        self.memory.load_state_dict(own_share(to_arrays(state["memory"]), processes.rank, processes.count))
 
     def _make_player(self, generator: torch.Generator) -> Player:
         if not isinstance(self.policy, TrainablePolicy):

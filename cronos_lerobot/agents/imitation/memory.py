@@ -19,6 +19,8 @@ class Segment:
     instruction: str
     columns: Columns
     """(T, ...) each: raw observations, `action` float32 in physical units, `next.reward` float32."""
+    update: int = 0
+    """Updates of the policy before the segment was over, if the agent counts them."""
 
     def __len__(self) -> int:
         return len(self.columns[ACTION])
@@ -106,7 +108,12 @@ class SegmentMemory:
     @property
     def num_frames(self) -> int:
         """Frames that can be drawn."""
-        return sum(len(segment) - self.drop_last for segment in self.segments)
+        return int(self.lengths.sum())
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """Frames of each segment that can be drawn, int64."""
+        return np.array([len(segment) - self.drop_last for segment in self.segments], np.int64)
 
     def add(self, segment: Segment) -> None:
         """Keep a segment, unless no frame of it could be drawn."""
@@ -117,17 +124,36 @@ class SegmentMemory:
         while self._bytes > self.max_bytes and len(self.segments) > 1:
             self._bytes -= self.segments.popleft().nbytes
 
-    def draw(self, count: int, rng: np.random.Generator) -> list[tuple[Segment, int]]:
-        """Return `count` uniform draws of a segment and the index of a frame in it."""
-        ends = np.cumsum([len(segment) - self.drop_last for segment in self.segments])
-        picks = rng.integers(ends[-1], size=count)
-        numbers = np.searchsorted(ends, picks, side="right")
-        begins = np.concatenate([[0], ends])[numbers]
-        return [(self.segments[n], int(pick)) for n, pick in zip(numbers, picks - begins, strict=True)]
+    def forget(self, before: int) -> None:
+        """Let the segments go that were over before so many updates."""
+        self.segments = deque(segment for segment in self.segments if segment.update >= before)
+        self._bytes = sum(segment.nbytes for segment in self.segments)
+
+    def draw(
+        self, count: int, rng: np.random.Generator, weights: np.ndarray | None = None
+    ) -> list[tuple[Segment, int]]:
+        """Return `count` draws of a segment and the index of a frame in it.
+
+        Args:
+            count: how many.
+            rng: draws them.
+            weights: (segments,), in proportion to which each frame of a segment is drawn; None draws all alike.
+        """
+        lengths = self.lengths
+        if weights is None:
+            ends = np.cumsum(lengths)
+            picks = rng.integers(ends[-1], size=count)
+            numbers = np.searchsorted(ends, picks, side="right")
+            frames = picks - (ends - lengths)[numbers]
+        else:
+            mass = lengths * weights
+            numbers = rng.choice(len(lengths), size=count, p=mass / mass.sum())
+            frames = rng.integers(lengths[numbers])
+        return [(self.segments[n], int(frame)) for n, frame in zip(numbers, frames, strict=True)]
 
     def state_dict(self) -> list[dict[str, Any]]:
         """Every segment, oldest first."""
-        return [{"instruction": s.instruction, "columns": s.columns} for s in self.segments]
+        return [dict(vars(segment)) for segment in self.segments]
 
     def load_state_dict(self, state: list[dict[str, Any]]) -> None:
         """Go on from `state_dict`."""
@@ -135,3 +161,10 @@ class SegmentMemory:
         self._bytes = 0
         for segment in state:
             self.add(Segment(**segment))
+
+
+def own_share(memories: list[list[Any]], rank: int, count: int) -> list[Any]:
+    """What process `rank` of `count` goes on with of the memories of all processes that made a checkpoint."""
+    if len(memories) == count:
+        return memories[rank]
+    return [segment for memory in memories for segment in memory][rank::count]

@@ -91,6 +91,8 @@ class PPOAgent(LearningAgent):
         """
         mine = self.streams
         tau, r_t, cut_t, diverged_t = tau[mine], r_t[mine], cut_t[mine], diverged_t[mine]
+        if self.ppo.self_imitation is not None:
+            self.ppo.self_imitation.store(observation_columns(o_t), tau, a_t.action, r_t, diverged_t)
         is_first, clock = self.clock.step == 0, self.clock
         expert = False if a_t.expert is None else a_t.expert
         self._expert = expert if is_first else self._expert | expert
@@ -106,6 +108,16 @@ class PPOAgent(LearningAgent):
                 self._encoded, tau, self._decision, clock.reward, clock.cut, clock.following, clock.duration,
                 self._expert,
             )  # fmt: skip
+
+    def end_step(self, success: np.ndarray) -> None:
+        """Note where the task is complete, if successes are kept."""
+        if self.ppo.self_imitation is not None:
+            self.ppo.self_imitation.end_step(success[self.streams])
+
+    def end_segment(self, success: np.ndarray, found_complete: np.ndarray) -> None:
+        """Keep the successes of its streams, if that is asked for."""
+        if self.ppo.self_imitation is not None:
+            self.ppo.self_imitation.end_segment(found_complete[self.streams], self.ppo.num_updates)
 
     def update(self) -> dict[str, float]:
         """Learn from the buffer and clear it."""
@@ -127,8 +139,8 @@ class PPOAgent(LearningAgent):
         return trained_tensors(self.ppo.policy)
 
     def state_dict(self) -> dict[str, Any]:
-        """The rollout that a budget's end left, the base policy, the count of updates; see `LearningAgent`."""
-        ppo = self.ppo
+        """The rollout that a budget's end left, the base policy, successes, updates; see `LearningAgent`."""
+        ppo, kept = self.ppo, self.ppo.self_imitation
         base = {} if ppo.base_policy is None else ppo.base_policy.parameters
         return {
             "num_updates": ppo.num_updates,
@@ -136,6 +148,7 @@ class PPOAgent(LearningAgent):
             "base_policy": base,
             "adapter": {} if self._adapter is None else self._adapter.own_parameters(),
             "rollout": to_tensors(join_rollouts(self.buffer.state_dict(), ppo.processes)),
+            "self_imitation": [] if kept is None else to_tensors(kept.state_dict()),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -147,6 +160,9 @@ class PPOAgent(LearningAgent):
         if self._adapter is not None:
             self._adapter.load_own_parameters(state["adapter"])
         self.buffer.load_state_dict(to_arrays(state["rollout"]), self.streams)
+        # A flag may have switched it on since: it then begins with nothing.
+        if self.ppo.self_imitation is not None and state["self_imitation"]:
+            self.ppo.self_imitation.load_state_dict(to_arrays(state["self_imitation"]))
 
     def _decide(self, columns: Columns, tau: list[str]) -> tuple[Columns, Decision]:
         encoded = self.ppo.processors.encode(columns, tau)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
+
+from cronos_lerobot.agents.imitation.config import DemosConfig
 
 LR_SCHEDULES = ("fixed", "kl_step", "kl_update")
 VALUE_LOSSES = ("huber", "mse")
@@ -69,8 +71,42 @@ RANGES = {
     "noise_std": ABOVE_0,
     "noise_level": ABOVE_0,
     "noise_steps": COUNT,
+    "demos_share": SHARE,
 }
 """Valid values of the numbers; those that may be null are free to be."""
+SELF_IMITATION_RANGES = {
+    "coef": FROM_0,
+    "batch_size": COUNT,
+    "max_age": FROM_0,
+    "tail_steps": FROM_0,
+    "memory_gib": ABOVE_0,
+}
+
+
+@dataclass
+class SelfImitationConfig:
+    """Cloning of the streams' own successes beside PPO's loss. Bad values are a ValueError."""
+
+    coef: float = 0.0
+    """Weight of the policy's cloning loss (its LeRobot `forward`) in every optimizer step; 0 keeps no memory."""
+    batch_size: int = 256
+    """Frames that are cloned in one optimizer step of one process."""
+    max_age: int = 10
+    """Policy updates after which a success is no longer cloned; 0 keeps those of the last rollout."""
+    tail_steps: int = 4
+    """Control steps of a segment that are kept after its first success."""
+    memory_gib: float = 4.0
+    """Memory of each process for segments [GiB]; the newest stay. A checkpoint holds them."""
+
+    def __post_init__(self) -> None:
+        _check_ranges(self, SELF_IMITATION_RANGES, "algorithm.self_imitation")
+
+
+def _check_ranges(config: Any, ranges: dict[str, Interval], group: str) -> None:
+    for name, interval in ranges.items():
+        value = getattr(config, name)
+        if value is not None and value not in interval:
+            raise ValueError(f"{group}.{name} must be {interval}, got {value}.")
 
 
 @RLAlgorithmConfig.register_subclass("ppo")
@@ -157,12 +193,16 @@ class PPOConfig(RLAlgorithmConfig):
     """What the critic beside a policy that has none of its own (ACT, Diffusion, SmolVLA, pi0) reads: what the
     `policy` makes of its observation, or the privileged `environment_state`, the robot's state and the
     instruction; the environment then shows it beside pixels."""
+    self_imitation: SelfImitationConfig = field(default_factory=SelfImitationConfig)
+    """The streams' successes, cloned beside PPO's loss."""
+    demos: DemosConfig = field(default_factory=DemosConfig)
+    """Demonstrations that are cloned with them, against forgetting."""
+    demos_share: float = 0.0
+    """Share of what is cloned that is of the demonstrations; all of it as long as there are no successes."""
 
     def __post_init__(self) -> None:
-        for name, interval in RANGES.items():
-            value = getattr(self, name)
-            if value is not None and value not in interval:
-                raise ValueError(f"algorithm.{name} must be {interval}, got {value}.")
+        _check_ranges(self, RANGES, "algorithm")
+        self._check_demos()
         for name, choices in (
             ("lr_schedule", LR_SCHEDULES), ("value_loss", VALUE_LOSSES), ("ratio", RATIOS),
             ("critic_observation", CRITIC_OBSERVATIONS),
@@ -185,6 +225,17 @@ class PPOConfig(RLAlgorithmConfig):
             raise ValueError(
                 f"algorithm.policy_lr_min must be at most policy_lr_max={self.policy_lr_max}, got "
                 f"{self.policy_lr_min}."
+            )
+
+    def _check_demos(self) -> None:
+        if not self.demos_share:
+            return
+        if self.demos.repo_id is None:
+            raise ValueError(f"algorithm.demos_share={self.demos_share} needs --algorithm.demos.repo_id.")
+        if not self.self_imitation.coef:
+            raise ValueError(
+                f"algorithm.demos_share={self.demos_share} is of what PPO clones beside its loss, with a weight "
+                "--algorithm.self_imitation.coef above 0."
             )
 
     @classmethod

@@ -11,6 +11,7 @@ from cronos_lerobot.agents.base import decision_steps
 from cronos_lerobot.agents.ppo.agent import PPOAgent
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
+from cronos_lerobot.agents.ppo.self_imitation import SelfImitation
 from cronos_lerobot.agents.registry import AgentContext, register_agent
 
 
@@ -20,7 +21,8 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
     """Return the agent.
 
     Raises:
-        ValueError: the policy does not say how likely its decisions were, or decides beyond a task switch.
+        ValueError: the policy does not say how likely its decisions were, or decides beyond a task switch, or
+            cannot be cloned though the config asks for it.
     """
     config = context.config
     options = AdapterOptions(config.noise_std, config.noise_level, config.noise_steps)
@@ -36,10 +38,19 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
         context.processes.copy_from_main([*policy.own_parameters().values()])
     mine = context.streams
     # Every process draws its own minibatches and actions.
-    ppo = PPO(policy, context.processors, config, context.rng("minibatches"), context.processes)
+    rng, cloned = context.rng("minibatches"), _self_imitation(context)
+    ppo = PPO(policy, context.processors, config, rng, context.processes, cloned)
     steps = decision_steps(policy, context.task_switch_interval)
     buffer = RolloutBuffer(context.update_interval // steps, mine.stop - mine.start)
     return PPOAgent(ppo, buffer, context.torch_rng("actions"), context.stopwatch, mine)
+
+
+def _self_imitation(context: AgentContext) -> SelfImitation | None:
+    if not context.config.self_imitation.coef:
+        return None
+    num_streams = context.streams.stop - context.streams.start
+    rng = context.rng("self_imitation")
+    return SelfImitation(context.policy, context.processors, context.config, num_streams, rng, context.processes)
 
 
 def _with_privileged_critic(policy: Any, context: AgentContext) -> PrivilegedCritic:

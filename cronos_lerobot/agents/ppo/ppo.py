@@ -29,6 +29,7 @@ from cronos_lerobot.agents.ppo.losses import (
 )
 from cronos_lerobot.agents.ppo.metrics import UpdateMetrics
 from cronos_lerobot.agents.ppo.rollout_buffer import Minibatch, RolloutBuffer
+from cronos_lerobot.agents.ppo.self_imitation import SelfImitation
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.processes import Processes
 
@@ -62,9 +63,11 @@ class PPO:
         rng: draws the order of the minibatches.
         processes: each learns from its own rollout, in minibatches of its own; they take every optimizer step
             together, with the mean of their gradients. Their rollouts have the same size.
+        self_imitation: what is cloned in each optimizer step that trains the policy.
 
     Raises:
         TypeError: the policy is not trainable.
+        ValueError: cloning would train nothing of it.
     """
 
     def __init__(
@@ -74,6 +77,7 @@ class PPO:
         config: PPOConfig,
         rng: np.random.Generator,
         processes: Processes | None = None,
+        self_imitation: SelfImitation | None = None,
     ) -> None:
         check_trainable(policy)
         self.policy = policy
@@ -93,6 +97,9 @@ class PPO:
             group["params"] = [p for p in group["params"] if p.requires_grad]
             self._params[group["name"]] += group["params"]
         _freeze_all_but(self._params["policy"] + self._params["value"], policy)
+        self.self_imitation = self_imitation
+        if self_imitation is not None:
+            self_imitation.check(self._params["policy"])
         betas = (config.beta1, config.beta2)
         # Without `fused`, a small network's step on a CPU costs as much as a tenth of its backward pass.
         fused = True if processors.device.type == "cpu" else None
@@ -116,6 +123,8 @@ class PPO:
         described = _describe_rollout(rollout)
         if config.normalize_advantage:
             buffer.normalize_advantages(rollout["advantages"].mean(), rollout["advantages"].std())
+        if self.self_imitation is not None:
+            described |= self.self_imitation.begin_update(self.num_updates)
         metrics = UpdateMetrics()
         warming_up = self.num_updates < config.value_warmup_updates
         epochs = 0 if warming_up else self._train_policy(buffer, metrics)
@@ -150,6 +159,8 @@ class PPO:
                 if steps:
                     seen.append(kl)
                     self.lr.see("kl_step", kl)
+                if self.self_imitation is not None:
+                    metrics.add_means(self.self_imitation.add_gradients(self._params["policy"]))
                 norms = self._optimizer_step(metrics)
                 self.lr.after_step(norms["policy"])
                 steps += 1
