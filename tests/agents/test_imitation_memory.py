@@ -50,6 +50,22 @@ def test_the_memory_keeps_successes_up_to_a_step_after_the_first():
         assert segment.columns["next.reward"].tolist() == steps
 
 
+def test_failed_segments_are_kept_whole_where_they_are_asked_for():
+    segments = OpenSegments(len(TAPE))
+    for step in range(6):
+        marks = np.array([tape[step] for tape, _ in TAPE.values()])
+        state = np.full((len(TAPE), 1), step, np.float32)
+        segments.add({"observation.state": state}, ["go"] * len(TAPE), state, state[:, 0], marks == "D")
+        segments.note(marks == "S")
+    found = np.array([tape[0] == "S" for tape, _ in TAPE.values()])
+    kept = segments.close(found, tail_steps=1, with_failed=True)
+    # Of a divergence what follows is left; after one in the last step there is nothing.
+    expected = {True: [[0, 1, 2, 3], [0, 1, 2, 3, 4, 5], [2, 3, 4, 5]], False: [[0, 1, 2, 3, 4, 5], [4, 5]]}
+    for success, steps in expected.items():
+        own = [s.columns["observation.state"][:, 0].tolist() for s in kept if s.success == success]
+        assert own == steps
+
+
 def make_segment(length, number):
     column = np.full((length, 2), number, np.float32)  # 8 bytes a frame
     return Segment(f"task {number}", {"action": column})
@@ -187,6 +203,13 @@ def test_a_dataset_without_what_the_policy_reads_is_refused(dataset_root):
         ({"tail_steps": -1}, "algorithm.tail_steps must be >= 0, got -1"),
         ({"lr": 0.0}, "algorithm.lr must be > 0, got 0.0"),
         ({"memory_gib": float("nan")}, "algorithm.memory_gib must be > 0, got nan"),
+        (
+            {"weighting": "loss"},
+            r"algorithm.weighting must be one of \('none', 'return', 'advantage'\), got 'loss'",
+        ),
+        ({"weighting_beta": 0.0}, "algorithm.weighting_beta must be > 0, got 0.0"),
+        ({"max_weight": 0.5}, "algorithm.max_weight must be >= 1, got 0.5"),
+        ({"gamma": 1.5}, "algorithm.gamma must be >= 0 and <= 1, got 1.5"),
         ({"demos_share": 1.5}, "algorithm.demos_share must be >= 0 and <= 1, got 1.5"),
         ({"demos_share": 0.5}, "algorithm.demos_share=0.5 needs --algorithm.demos.repo_id"),
     ],

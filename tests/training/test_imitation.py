@@ -110,6 +110,32 @@ def test_a_resumed_run_equals_the_unbroken_one_and_learns(tmp_path):
     assert torch.equal(weights(unbroken)["critic.weight"], ClonedPolicy().critic.weight)
 
 
+@pytest.mark.parametrize("weighting", ["return", "advantage"])
+def test_a_weighted_run_keeps_what_failed_and_resumes(tmp_path, weighting):
+    unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
+    algorithm = ImitationConfig(
+        steps_per_update=2, batch_size=8, warmup_segments=1, tail_steps=1, weighting=weighting
+    )
+    trainer = train(settings(unbroken, algorithm=algorithm))
+    updates = [line for line in metrics(unbroken) if line["kind"] == "update"]
+    rollouts = [line["rollout"] for line in updates]
+    memory = trainer.agent.memory
+    won = sum(segment.success for segment in memory.segments)
+    assert won == sum(r["success"] * r["segments"] - r["found_complete"][0] for r in rollouts)
+    failed = sum(r["segments"] - r["success"] * r["segments"] for r in rollouts)
+    assert len(memory) - won == failed >= 1
+    last = updates[-1]["agent"]
+    assert 1 <= last["failed_segments"] <= failed
+    assert 0 < last["effective_share"] < 1
+    assert last["optimizer_steps"] == 2
+    assert train(settings(broken, algorithm=algorithm), MortalEnv) is None
+    resumed = settings(broken, algorithm=algorithm)
+    resumed.checkpoint_path = (broken / "checkpoints/last").resolve()
+    torch.manual_seed(999)
+    train(resumed, policy_seed=8)
+    assert_same_run(unbroken, broken)
+
+
 def in_processes(processes, cfg, env_class=DummyEnv):
     trainer = train(cfg, env_class, processes)
     if trainer is None:

@@ -20,6 +20,7 @@ from cronos_lerobot.agents.chunk_player import ChunkPlayer, Player, make_player
 from cronos_lerobot.agents.imitation.batches import Demonstrations, join_batches, segment_batch
 from cronos_lerobot.agents.imitation.config import ImitationConfig
 from cronos_lerobot.agents.imitation.memory import OpenSegments, SegmentMemory, own_share
+from cronos_lerobot.agents.imitation.weights import by_advantage, by_return, effective_share
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.agents.registry import AgentContext, register_agent
 from cronos_lerobot.agents.state import to_arrays, to_tensors
@@ -31,6 +32,9 @@ FINE_TUNING = 0.1
 @register_agent("imitation")
 class ImitationAgent(LearningAgent):
     """Acts as the policy does, remembers the segments that succeeded, and clones them.
+
+    With a weighting it remembers those that failed as well, and draws frames by weight: the gradient has the
+    expectation of the weighted loss's, with any policy, and no forward pass is spent on what weighs nothing.
 
     The loss is the policy's own `forward`, the optimizer the one of its preset, the batches those that
     `lerobot-train` would make of a dataset of these segments. An update learns from the segments that were over
@@ -55,6 +59,7 @@ class ImitationAgent(LearningAgent):
         self._open = OpenSegments(self._streams.stop - self._streams.start)
         drop_last = getattr(policy_config, "drop_n_last_frames", 0) or 0
         self.memory = SegmentMemory(int(self.config.memory_gib * 2**30), drop_last)
+        self._weights: np.ndarray | None = None
         self._demos = None
         if self.config.demos_share:
             self._demos = Demonstrations(self.config.demos, policy_config)
@@ -88,16 +93,20 @@ class ImitationAgent(LearningAgent):
         self._open.note(success[self._streams])
 
     def end_segment(self, success: np.ndarray, found_complete: np.ndarray) -> None:
-        """Remember the successful segments of its streams."""
-        for segment in self._open.close(found_complete[self._streams], self.config.tail_steps):
+        """Remember the successful segments of its streams, and the failed ones if they are weighted."""
+        with_failed = self.config.weighting != "none"
+        for segment in self._open.close(found_complete[self._streams], self.config.tail_steps, with_failed):
             self.memory.add(segment)
 
     def update(self) -> dict[str, float]:
         """Take the update's optimizer steps, once there are enough successes."""
-        found = self._processes.concatenate(np.array([[len(self.memory), self.memory.num_frames]]))
+        memory = self.memory
+        successes = sum(segment.success for segment in memory.segments)
+        found = self._processes.concatenate(np.array([[successes, memory.num_frames, len(memory)]]))
         metrics = {"segments": float(found[:, 0].sum()), "frames": float(found[:, 1].sum())}
+        metrics |= self._weigh()
         # All processes take a step, or none.
-        has_batch = self._demos is not None or found[:, 0].all()
+        has_batch = self._demos is not None or found[:, 2].all()
         if found[:, 0].sum() < self.config.warmup_segments or not has_batch:
             return metrics | {"optimizer_steps": 0.0}
         with self._stopwatch("update"):
@@ -150,15 +159,33 @@ class ImitationAgent(LearningAgent):
         inputs = self.policy.config.input_features or {}
         return {name: column for name, column in observation_columns(observation).items() if name in inputs}
 
+    def _weigh(self) -> dict[str, float]:
+        """Weigh what is remembered; returns metrics of all processes, none of memory that is not weighted."""
+        config, memory = self.config, self.memory
+        if config.weighting == "none":
+            return {}
+        failed, share = sum(not segment.success for segment in memory.segments), 0.0
+        self._weights = None
+        if len(memory):
+            if config.weighting == "return":
+                self._weights = by_return(memory.segments, config.gamma, config.weighting_beta)
+            else:
+                self._weights = by_advantage(
+                    memory.segments, config.gamma, config.weighting_beta, config.max_weight
+                )
+            share = effective_share(self._weights, memory.lengths)
+        found = self._processes.concatenate(np.array([[float(failed), share]]))
+        return {"failed_segments": float(found[:, 0].sum()), "effective_share": float(found[:, 1].mean())}
+
     def _batch(self) -> Batch:
         size = self.config.batch_size
         num_demos = round(self.config.demos_share * size) if len(self.memory) else size
         if self._demos is None or num_demos == 0:
-            return segment_batch(self.memory.draw(size, self._rng), self.policy.config)
+            return segment_batch(self.memory.draw(size, self._rng, self._weights), self.policy.config)
         demos = self._demos.batch(num_demos, self._rng)
         if num_demos == size:
             return demos
-        own = segment_batch(self.memory.draw(size - num_demos, self._rng), self.policy.config)
+        own = segment_batch(self.memory.draw(size - num_demos, self._rng, self._weights), self.policy.config)
         return join_batches(own, demos)
 
     def _step(self) -> tuple[float, float]:

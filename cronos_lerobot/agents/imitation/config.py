@@ -19,10 +19,13 @@ class DemosConfig:
     """Its folder; null takes LeRobot's cache or the Hub."""
 
 
+WEIGHTINGS = ("none", "return", "advantage")
+
+
 @RLAlgorithmConfig.register_subclass("imitation")
 @dataclass
 class ImitationConfig(RLAlgorithmConfig):
-    """Filtered behaviour cloning of the streams' successes, with the policy's own loss and optimizer.
+    """Cloning of the streams' successes, or of all segments by weight, with the policy's own loss and optimizer.
 
     Bad values are a ValueError.
     """
@@ -46,16 +49,31 @@ class ImitationConfig(RLAlgorithmConfig):
     """Share of a batch that is of the demonstrations; all of it as long as there are no successes."""
     temperature: float = 1.0
     """Sampling temperature while training, of policies that have one (`sample_actions`)."""
+    weighting: str = "none"
+    """`none` clones the successful segments; with the others failed ones are kept as well, and frames are drawn in
+    proportion to exp(R / beta) of their segment's `return` R, or to exp(A / beta) of its `advantage` A over the
+    mean return of its instruction."""
+    weighting_beta: float = 0.2
+    """The smaller, the more the better segments count [reward]."""
+    max_weight: float = 20.0
+    """Largest exp(A / beta) of `advantage`."""
+    gamma: float = 0.99
+    """Discount factor per control step of the returns that weigh."""
 
     def __post_init__(self) -> None:
         for name, low in (("steps_per_update", 1), ("batch_size", 1), ("warmup_segments", 0), ("tail_steps", 0)):
             if getattr(self, name) < low:
                 raise ValueError(f"algorithm.{name} must be >= {low}, got {getattr(self, name)}.")
-        for name in ("lr", "memory_gib", "temperature"):
+        if self.weighting not in WEIGHTINGS:
+            raise ValueError(f"algorithm.weighting must be one of {WEIGHTINGS}, got {self.weighting!r}.")
+        if not self.max_weight >= 1:
+            raise ValueError(f"algorithm.max_weight must be >= 1, got {self.max_weight}.")
+        for name in ("lr", "memory_gib", "temperature", "weighting_beta"):
             if (value := getattr(self, name)) is not None and not value > 0:
                 raise ValueError(f"algorithm.{name} must be > 0, got {value}.")
-        if not 0 <= self.demos_share <= 1:
-            raise ValueError(f"algorithm.demos_share must be >= 0 and <= 1, got {self.demos_share}.")
+        for name in ("demos_share", "gamma"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"algorithm.{name} must be >= 0 and <= 1, got {getattr(self, name)}.")
         if self.demos_share and self.demos.repo_id is None:
             raise ValueError(f"algorithm.demos_share={self.demos_share} needs --algorithm.demos.repo_id.")
 

@@ -21,6 +21,8 @@ class Segment:
     """(T, ...) each: raw observations, `action` float32 in physical units, `next.reward` float32."""
     update: int = 0
     """Updates of the policy before the segment was over, if the agent counts them."""
+    success: bool = True
+    """Whether the task was complete at any of its steps."""
 
     def __len__(self) -> int:
         return len(self.columns[ACTION])
@@ -67,21 +69,24 @@ class OpenSegments:
         """Of the step last added: where the task was complete after it, (N,) bool."""
         self._success.append(np.array(success))
 
-    def close(self, found_complete: np.ndarray, tail_steps: int) -> list[Segment]:
+    def close(self, found_complete: np.ndarray, tail_steps: int, with_failed: bool = False) -> list[Segment]:
         """Return the successful segments, up to `tail_steps` after the first success, and begin new ones.
 
-        One that was found complete is none: nothing had to be done.
+        One that was found complete is none: nothing had to be done. Those that failed are returned whole, if they
+        are asked for.
         """
         success = np.array(self._success).reshape(len(self._rows), self.num_streams)
         segments = []
         for i in range(self.num_streams):
             begin = int(self._begin[i])
             steps = np.flatnonzero(success[begin:, i])
-            if not len(steps) or steps[0] == 0 or found_complete[i]:
+            rows, success_i = self._rows[begin:], bool(len(steps))
+            if found_complete[i] or not (success_i or (with_failed and rows)) or (success_i and steps[0] == 0):
                 continue
-            rows = self._rows[begin : begin + int(steps[0]) + 1 + tail_steps]
+            if success_i:
+                rows = rows[: int(steps[0]) + 1 + tail_steps]
             columns = {name: np.stack([row[name][i] for row in rows]) for name in rows[0]}
-            segments.append(Segment(self._instructions[i], columns))
+            segments.append(Segment(self._instructions[i], columns, success=success_i))
         self.clear()
         return segments
 
