@@ -89,6 +89,7 @@ def write_report(report: Report, output: Path) -> Path:
         "updates": tables.update_rows(groups),
         "segments": tables.segment_rows(groups),
         "interventions": tables.intervention_rows(groups),
+        "resets": tables.reset_rows(groups),
         "speed": tables.speed_rows(groups),
     }
     for name, table in rows.items():

@@ -151,6 +151,19 @@ def intervention_rows(groups: Iterable[Group]) -> list[Row]:
     return rows
 
 
+def reset_rows(groups: Iterable[Group]) -> list[Row]:
+    """How runs whose values asked for scene resets spent them: by segments since the stream's last one."""
+    rows = []
+    for group in groups:
+        for run in group.runs:
+            resets = [reset for update in run.updates for reset in update.get("critic", {}).get("resets", [])]
+            for segments in sorted({reset["segments"] for reset in resets}):
+                values = [reset["value"] for reset in resets if reset["segments"] == segments]
+                row = {"segments": segments, "resets": len(values), "mean best value": sum(values) / len(values)}
+                rows.append(_identity(group, run) | row)
+    return rows
+
+
 def speed_rows(groups: Iterable[Group]) -> list[Row]:
     """Steps per second of every run and where its time went, evaluations and checkpoints left out."""
     rows = []

@@ -86,6 +86,19 @@ def test_an_update_sees_what_was_decided_on(agent):
     assert metrics["ratio_max"] == pytest.approx(1, abs=0.1)
 
 
+def test_a_task_that_is_given_now_is_judged_by_its_first_observation(agent):
+    """At a switch nothing is left of the task before; however often it is asked, the agent stays as it was."""
+    play(agent, 8, [[0, 0]] * 8, cut={(7, 0), (7, 1)})
+    for tau in (["a", "b"], ["c", "c"]):
+        values = agent.predict_values(at(9, 109), tau)
+        assert values.dtype == np.float32
+        assert values.tolist() == [90909, 1090909]
+    # In the middle of a decision, too, nothing is changed.
+    play(agent, 1, [[0, 0]])
+    agent.predict_values(at(50, 150), ["a", "b"])
+    assert agent.act(at(2, 102), ["a", "b"]).action[:, 0].tolist() == [11, 1011]
+
+
 def test_without_a_history_columns_are_as_they_were():
     columns = {"observation.state": np.ones((2, 4))}
     history = ObservationHistory(1)

@@ -141,6 +141,24 @@ def test_what_a_policy_that_looks_back_has_seen_ends_with_the_trace():
     assert kept["next_features"].tolist() == [[4, 5], [104, 105], [8, 9], [105, 106]]
 
 
+def test_its_values_are_the_critics_of_the_likeliest_choice():
+    agent = make_agent()
+    assert agent.predict_values(at(9, 109), ["a", "b"]).tolist() == [0, 0]
+    play(agent, [[1, 0]] * 8, cut={(7, 0), (7, 1)})
+    agent.update()
+    before = agent._generator.get_state(), torch.get_rng_state()
+    values = agent.predict_values(at(9, 109), ["a", "b"])
+    assert torch.equal(before[0], agent._generator.get_state())
+    assert torch.equal(before[1], torch.get_rng_state())
+    features = torch.tensor([[9.0], [109.0]])
+    with torch.no_grad():
+        whitened = agent.steered.whitening(features)
+        mean, _ = agent.steered.actor.head(agent.steered.actor.body(whitened)).chunk(2, -1)
+        expected = agent.sac.critics(whitened, torch.tanh(mean)).min(0).values
+    assert values.dtype == np.float32
+    np.testing.assert_allclose(values, expected, rtol=1e-5)
+
+
 def make_sac(**options):
     config = SteeringConfig(**{"hidden_width": 8, "initial_alpha": 0.5} | options)
     torch.manual_seed(0)

@@ -15,7 +15,7 @@ from cronos_lerobot.report.page import write_report
 from cronos_lerobot.report.runs import describe_protocol, find_runs, group_runs
 from cronos_lerobot.report.series import evaluation_curve, segment_history, segment_rates
 from cronos_lerobot.report.statistics import Gain, Rate, newcombe_interval
-from cronos_lerobot.report.tables import comparison_text, merge_statistics, seed_rows, speed_rows
+from cronos_lerobot.report.tables import comparison_text, merge_statistics, reset_rows, seed_rows, speed_rows
 from cronos_lerobot.scripts.report import main, make_report
 
 
@@ -177,6 +177,24 @@ def test_speed_weighs_updates_by_their_time(tmp_path):
     # As many steps at 500/s as at 1000/s: the harmonic mean.
     assert row["steps_per_s"] == pytest.approx(2000 / 3)
     assert row["env share"] == pytest.approx(0.5)
+
+
+def test_resets_that_values_asked_for_are_told_by_age(tmp_path):
+    run = write_training_run(tmp_path / "a")
+    assert reset_rows(group_runs(find_runs([run]).training)) == []
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    resets = [{"interaction_steps": 9, "stream": i, "segments": k, "value": v}
+              for i, (k, v) in enumerate([(3, 0.1), (2, 0.2), (3, 0.3)])]  # fmt: skip
+    lines[1]["critic"], lines[3]["critic"] = {"resets": resets[:2]}, {"resets": resets[2:]}
+    (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    report = make_report([run])
+    rows = reset_rows(group_runs(report.training))
+    assert [(row["segments"], row["resets"], row["mean best value"]) for row in rows] == [
+        (2, 1, 0.2),
+        (3, 2, pytest.approx(0.2)),
+    ]
+    write_report(report, tmp_path / "report")
+    assert "Resets that values asked for" in (tmp_path / "report/index.html").read_text()
 
 
 @pytest.fixture

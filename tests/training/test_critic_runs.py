@@ -7,12 +7,12 @@ import pytest
 import torch
 from dummies import DummyEnv, DummyPolicy
 from forked_processes import ScriptedPolicy, together
+from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
 from test_distributed import settings
 from test_distributed import train as train_in
 from test_trainer import STREAMS, KilledError, MortalEnv, assert_same_run, config, make_trainer, metrics, train
 
 from cronos_lerobot.agents.base import ValuingAgent
-from cronos_lerobot.agents.imitation.agent import ImitationAgent
 from cronos_lerobot.agents.ppo.agent import PPOAgent
 from cronos_lerobot.agents.steering.agent import SteeringAgent
 from cronos_lerobot.processes import Processes
@@ -169,10 +169,46 @@ def test_asking_for_values_changes_nothing_else(tmp_path):
     assert_same_run(tmp_path / "quiet", tmp_path / "asked")
 
 
-def test_which_agents_have_values():
+REAL = (*SMALL, *OBSERVATIONS["state"], "--protocol.task_order=critic", "--protocol.critic.failures=1")
+
+
+def test_the_real_scene_stopped_and_resumed(tmp_path, monkeypatch):
+    """Asking for observations and for what is complete changes nothing in the simulation."""
+    flags = (*REAL, "--protocol.reset_phase=staggered", "--protocol.heuristic_reset=true")
+    cronos_train(monkeypatch, *flags, f"--output_dir={tmp_path / 'whole'}")
+    cronos_train(monkeypatch, *flags, f"--output_dir={tmp_path / 'broken'}", "--steps=16")
+    last = tmp_path / "broken/checkpoints/last/pretrained_model/train_config.json"
+    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}", "--steps=32")
+    assert_same_run(tmp_path / "whole", tmp_path / "broken")
+    # T = 8 is two segments: one of the two streams is reset at every switch.
+    lines = metrics(tmp_path / "whole")
+    assert lines[-1]["interventions_by_kind"]["scene_reset"] == 4
+    assert all(np.isfinite(line["critic"]["task_value"]) for line in lines)
+
+
+def test_the_real_scene_reset_by_the_critic(tmp_path, monkeypatch):
+    cronos_train(
+        monkeypatch, *REAL, "--protocol.scene_reset=critic", "--protocol.reset_budget=8",
+        "--env.task_observation=one_hot", "--protocol.critic.knows_complete=false",
+        f"--output_dir={tmp_path / 'run'}",
+    )  # fmt: skip
+    last = metrics(tmp_path / "run")[-1]
+    # Two streams, four segments, of which all fail: after the first one two of eight may be spent, and so on.
+    assert (last["kind"], last["interaction_steps"]) == ("resets", 32)
+    assert (last["by_stream"], last["by_segments"]) == ({"0": 3, "1": 3}, {"1": 6})
+
+
+def test_which_agents_have_values(tmp_path, monkeypatch):
     assert issubclass(PPOAgent, ValuingAgent)
     assert issubclass(SteeringAgent, ValuingAgent)
-    assert not issubclass(ImitationAgent, ValuingAgent)
+    message = "^error: protocol.task_order=critic goes by the agent's values, and ImitationAgent has none"
+    with pytest.raises(SystemExit, match=message):
+        cronos_train(
+            monkeypatch, "--algorithm.type=imitation", "--policy.type=pocketvla", "--policy.device=cpu",
+            "--env.type=cronos", "--env.obs_type=environment_state_agent_pos", "--num_envs=2",
+            "--protocol.task_order=critic", f"--output_dir={tmp_path / 'run'}",
+        )  # fmt: skip
+    assert not (tmp_path / "run").exists()
 
 
 def test_values_of_two_processes_are_of_all_streams():
