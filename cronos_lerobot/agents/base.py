@@ -207,6 +207,8 @@ class LearningAgent(Agent):
     """The LeRobot policy that acts: what is saved, and evaluated unless `acting` is another."""
     optimizer: Optimizer | dict[str, Optimizer] | None = None
     """Saved and loaded as LeRobot does it."""
+    learns_beside_expert: bool = True
+    """Whether it knows what to make of steps whose action is an expert's, `ActionSample.expert`."""
 
     @property
     def acting(self) -> Any:

@@ -14,6 +14,7 @@ from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.data.drawing import LateCamera, UndrawnFrames
 from cronos_lerobot.data.origin import STREAMS, origin_of
 from cronos_lerobot.data.schema import (
+    EXPERT,
     INTERVENTION,
     LOG_PROB,
     POLICY_VERSION,
@@ -171,6 +172,7 @@ class StreamRecorder:
             STREAM_ID: np.arange(self.num_envs),
             TOTAL_INTERVENTIONS: same(int(np.sum(step.interventions))),
             POLICY_VERSION: same(step.policy_version),
+            EXPERT: same(False) if step.action.expert is None else step.action.expert,
         }
         columns = {key: np.asarray(column) for key, column in columns.items()}
         for key, column in columns.items():
@@ -256,6 +258,8 @@ class StreamRecorder:
             SUCCESS: bool(success.any()),
             SUCCESS_FRAME: int(success.argmax()) if success.any() else -1,
         }
+        # A resumed recording from before there were takeovers goes on without the column.
+        metadata |= {EXPERT: bool(frames[EXPERT].any())} if EXPERT in frames else {}
         self.writer.add_segment(
             frames, self._tasks[stream], episode_metadata=metadata, written=partial(self._written.append, whole)
         )

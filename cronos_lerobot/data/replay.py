@@ -12,14 +12,17 @@ from typing import TYPE_CHECKING, Any
 import torch
 from lerobot.utils.constants import ACTION, REWARD
 
-from cronos_lerobot.data.schema import STREAM_COLUMNS, TRUNCATED
+from cronos_lerobot.data.schema import EXPERT, STREAM_COLUMNS, TRUNCATED
 from cronos_lerobot.data.streams import Segment, StreamDataset
 from cronos_lerobot.protocol.interventions import Intervention
 
 if TYPE_CHECKING:
     from lerobot.rl import ReplayBuffer
 
-INFO = (*STREAM_COLUMNS, "task_index")
+INFO = {name: name.removeprefix("cronos.") for name in (*STREAM_COLUMNS, "task_index")}
+"""Columns that become `complementary_info`, and what they are called there."""
+IS_INTERVENTION = "is_intervention"
+"""What LeRobot's actor calls EXPERT there (`TeleopEvents.IS_INTERVENTION`)."""
 
 
 def to_replay_buffer(
@@ -40,7 +43,8 @@ def to_replay_buffer(
 
     Returns:
         The buffer, with `complementary_info` of each transition: `STREAM_COLUMNS` without `cronos.`, such as
-        `log_prob`, `policy_version`, `stream_id` and `step`, and LeRobot's `task_index`.
+        `log_prob`, `policy_version`, `stream_id` and `step`, LeRobot's `task_index`, and, if it was recorded,
+        `is_intervention` of the takeovers' transitions, as LeRobot's actor marks them.
 
     Raises:
         ValueError: there is no such column.
@@ -60,12 +64,13 @@ def _transitions(streams: StreamDataset, state_keys: Sequence[str]) -> Iterator[
     names_task = (
         streams.origin.flags.get("env.task_observation", "none" if streams.origin.flags else None) != "none"
     )
+    info = INFO | ({EXPERT: IS_INTERVENTION} if EXPERT in streams.meta.features else {})
     segments = streams.segments
     following = [*segments[1:], None]
     states = _states(streams, segments[0], state_keys)
     for segment, after in zip(segments, following, strict=True):
         after_states = None if after is None else _states(streams, after, state_keys)
-        columns = streams.columns(segment, [ACTION, REWARD, TRUNCATED, *INFO])
+        columns = streams.columns(segment, [ACTION, REWARD, TRUNCATED, *info])
         for t in range(segment.length):
             is_last = t == segment.length - 1
             if not is_last:
@@ -81,7 +86,7 @@ def _transitions(streams: StreamDataset, state_keys: Sequence[str]) -> Iterator[
                 "next_state": {key: value[None] for key, value in successor.items()},
                 "done": False,
                 "truncated": bool(columns[TRUNCATED][t]),
-                "complementary_info": {name.removeprefix("cronos."): float(columns[name][t]) for name in INFO},
+                "complementary_info": {name: float(columns[column][t]) for column, name in info.items()},
             }
         states = after_states or {}
 

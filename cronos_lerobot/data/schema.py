@@ -31,6 +31,9 @@ TOTAL_INTERVENTIONS = "cronos.total_interventions"
 POLICY_VERSION = "cronos.policy_version"
 LOG_PROB = "cronos.log_prob"
 VALUE = "cronos.value"
+EXPERT = "intervention"
+"""Whether an expert chose the action (a takeover), as LeRobot's DAgger recordings call it. Streams recorded
+before there were takeovers lack it."""
 SUCCESS_FRAME = "cronos.success_frame"
 """Of an episode's row in `meta/episodes`: the first frame after which the task was complete, -1 if none."""
 
@@ -102,7 +105,7 @@ def stream_features(
     state_names: Sequence[str] | None = None,
     environment_state_names: Sequence[str] | None = None,
 ) -> Features:
-    """Features of a recorded training stream: those of `demonstration_features` and `STREAM_COLUMNS`.
+    """Features of a recorded training stream: those of `demonstration_features`, `STREAM_COLUMNS` and EXPERT.
 
     No frame is `next.done`: a stream never ends. The last frame of a finished segment is `next.truncated`; the
     observation that followed it is not recorded.
@@ -113,17 +116,19 @@ def stream_features(
     - `cronos.position`: task switches since the stream's last scene reset.
     - `cronos.intervention`: an `Intervention`, what happened between the frame before and this one.
     - `cronos.stream_interventions`, `cronos.total_interventions`: interventions that count (scene and
-      heuristic resets) so far, those right before this frame included, of this stream and of all together.
+      heuristic resets, takeovers at their price) so far, those right before this frame included, of this stream
+      and of all together.
     - `cronos.policy_version`: policy updates before this action.
     - `cronos.log_prob`: log-probability of the action under the policy that chose it, summed over the
-      action's dimensions [nats].
+      action's dimensions [nats]; 0 where an expert did.
     - `cronos.value`: that policy's value of the observation.
+    - `intervention`: an expert chose the action.
     """
     columns = {key: _scalar_feature(dtype) for key, dtype in _STREAM_COLUMNS.items()}
     observation_and_action = demonstration_features(
         observation_space, state_names=state_names, environment_state_names=environment_state_names
     )
-    return observation_and_action | columns
+    return observation_and_action | columns | {EXPERT: _scalar_feature("bool")}
 
 
 def with_cameras(space: gymnasium.Space, cameras: Mapping[str, tuple[int, int]]) -> gymnasium.spaces.Dict:

@@ -5,6 +5,7 @@ import pandas as pd
 from lerobot.utils.constants import DONE
 
 from cronos_lerobot.data.schema import (
+    EXPERT,
     INTERVENTION,
     POSITION,
     SEGMENT_INDEX,
@@ -21,7 +22,7 @@ COLUMNS = (
     "index", "episode_index", "frame_index", STREAM_ID, STEP, SEGMENT_INDEX, POSITION, INTERVENTION,
     STREAM_INTERVENTIONS, TOTAL_INTERVENTIONS, DONE, TRUNCATED,
 )  # fmt: skip
-"""What a check reads of every frame."""
+"""What a check reads of every frame, beside EXPERT where it was recorded."""
 
 
 SCENE_RESETS = (Intervention.INITIAL, Intervention.SCENE_RESET, Intervention.DIVERGENCE)
@@ -38,12 +39,14 @@ def check(frames: pd.DataFrame, total_frames: int, total_episodes: int) -> None:
     - LeRobot's indices count frames and episodes without a gap, and an episode is one segment of one stream.
     - The steps of each stream go from 0 up by 1, its segments too.
     - An intervention stands on the first frame of every segment and on no other, INITIAL on step 0 alone.
-    - The counts of interventions never fall, and rise where an intervention that counts stands.
+    - The counts of interventions never fall, and rise where one that counts stands or an expert takes over.
+    - An expert did all of a segment or nothing of it.
     - The last frame of a segment that another one follows is truncated, no other is, and none is done.
     - The position is 0 after a scene reset and rises by 1 at every other segment.
 
     Args:
-        frames: the columns `COLUMNS` of a whole recording, in LeRobot's order; a filtered one has gaps.
+        frames: the columns `COLUMNS` and perhaps EXPERT of a whole recording, in LeRobot's order; a filtered one
+            has gaps.
         total_frames: as `info.json` counts them.
         total_episodes: the same.
 
@@ -52,6 +55,8 @@ def check(frames: pd.DataFrame, total_frames: int, total_episodes: int) -> None:
     """
     if len(frames) != total_frames:
         raise StreamError(f"the data files hold {len(frames)} frames, info.json counts {total_frames}")
+    if EXPERT not in frames:
+        frames = frames.assign(**{EXPERT: False})
     _expect(frames, frames["index"] == np.arange(len(frames)), "its index is not its row, {index}")
     _check_episodes(frames, total_episodes)
     ids = frames[STREAM_ID].unique()
@@ -97,11 +102,15 @@ def _check_stream(frames: pd.DataFrame) -> None:
     rise = frames[POSITION].diff()
     holds = new & (frames[POSITION] == 0) | ~new & ((rise == 1) & first | (rise == 0) & ~first)
     _expect(frames, holds, "cronos.position is {cronos.position}")
+    expert = frames[EXPERT].astype(bool)
+    _expect(frames, first | (expert == expert.shift(fill_value=False)), "intervention is {intervention}")
+    # A scene that broke down inside a takeover begins another piece of it, not another takeover.
+    least = kind.isin(COUNTED_INTERVENTIONS).astype(int) + (first & expert & (kind != Intervention.DIVERGENCE))
     for name in (STREAM_INTERVENTIONS, TOTAL_INTERVENTIONS):
         rise = frames[name].diff().fillna(0)
         # Several kinds may come together; the frame carries the strongest. Other streams count at any time.
         may_rise = first | (name == TOTAL_INTERVENTIONS)
-        holds = (rise >= kind.isin(COUNTED_INTERVENTIONS)) & (may_rise | (rise == 0))
+        holds = (rise >= least) & (may_rise | (rise == 0))
         _expect(frames, holds, f"{name} is {{{name}}}, not what the interventions add up to")
 
 

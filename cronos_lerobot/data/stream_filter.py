@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from cronos_lerobot.data.origin import write_origin
 from cronos_lerobot.data.schema import (
+    EXPERT,
     INTERVENTION,
     POLICY_VERSION,
     POSITION,
@@ -34,7 +35,7 @@ from cronos_lerobot.data.stats import Stats, episode_stats
 from cronos_lerobot.data.storage import INCOMPLETE, Shard, stats_of_row
 from cronos_lerobot.data.streams import Segment, StreamDataset, to_array
 from cronos_lerobot.data.video import MAX_FILE_DURATION_S, Clip, CopiedVideoFile, read_frames
-from cronos_lerobot.protocol.interventions import Intervention
+from cronos_lerobot.protocol.interventions import BEFORE_SEGMENTS
 
 PROVENANCE = "meta/filter.json"
 """What a filtered dataset was made of, and how."""
@@ -56,6 +57,8 @@ class SegmentFilter:
     interventions: list[str] | None = None
     """Only segments that began after one of these: task_switch, end_effector_reset, heuristic_reset, scene_reset,
     divergence, initial."""
+    takeover: bool | None = None
+    """Only segments that an expert did (true), or leave them out (false)."""
     min_policy_version: int | None = None
     """Only segments that began with this policy update or a later one."""
     max_policy_version: int | None = None
@@ -66,7 +69,7 @@ class SegmentFilter:
     """Only segments with at most so many task switches since the last scene reset."""
 
     def __post_init__(self) -> None:
-        valid = [kind.name.lower() for kind in Intervention if kind is not Intervention.NONE]
+        valid = [kind.name.lower() for kind in BEFORE_SEGMENTS]
         if unknown := set(self.interventions or []) - set(valid):
             raise ValueError(f"unknown interventions {sorted(unknown)}; valid ones: {valid}")
 
@@ -82,6 +85,7 @@ class SegmentFilter:
         return (
             self.success in (None, segment.success)
             and self.found_complete in (None, segment.found_complete)
+            and self.takeover in (None, segment.taken_over)
             and among(segment.stream, self.streams)
             and among(segment.task, self.tasks)
             and among(segment.intervention.name.lower(), self.interventions)
@@ -241,6 +245,7 @@ def _metadata(segment: Segment) -> dict[str, Any]:
         STEP: segment.step,
         INTERVENTION: int(segment.intervention),
         POLICY_VERSION: segment.policy_version,
+        EXPERT: segment.taken_over,
         SUCCESS: segment.success,
         SUCCESS_FRAME: -1 if segment.success_frame is None else segment.success_frame,
     }

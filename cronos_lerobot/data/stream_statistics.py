@@ -10,7 +10,7 @@ from lerobot_env_cronos.statistics import wilson_interval
 from rich.table import Table
 
 from cronos_lerobot.data.streams import Segment, StreamDataset
-from cronos_lerobot.protocol.interventions import Intervention
+from cronos_lerobot.protocol.interventions import BEFORE_SEGMENTS
 
 NUM_PERIODS = 10
 """Parts of the recording that segments are counted in."""
@@ -23,9 +23,11 @@ def statistics(streams: StreamDataset) -> dict[str, Any]:
         `streams`, `segments`, `frames`; `success` and `success_by_{position,task,policy_version,stream}`:
         [successes, of these complete from the start, segments], by the number of task switches since the scene
         reset, and so on; `began_after`: segments by the intervention before them, the strongest where there were
-        several; `began_after_over_time`: the same for each tenth of the steps, by its first step.
+        several; `began_after_over_time`: the same for each tenth of the steps, by its first step. `takeovers`:
+        [successes, of these complete from the start, segments] of an expert; all other successes are the policy's.
     """
     segments = streams.segments
+    own = [s for s in segments if not s.taken_over]
     keys: dict[str, Callable[[Segment], Any]] = {
         "position": lambda s: s.position,
         "task": lambda s: s.task,
@@ -40,8 +42,9 @@ def statistics(streams: StreamDataset) -> dict[str, Any]:
         "streams": len(streams.streams),
         "segments": len(segments),
         "frames": sum(s.length for s in segments),
-        "success": _successes(segments),
-        **{f"success_by_{name}": _by(segments, key) for name, key in keys.items()},
+        "success": _successes(own),
+        "takeovers": _successes([s for s in segments if s.taken_over]),
+        **{f"success_by_{name}": _by(own, key) for name, key in keys.items()},
         "began_after": _kinds(segments),
         "began_after_over_time": over_time,
     }
@@ -58,11 +61,13 @@ def make_tables(result: dict[str, Any]) -> list[Table]:
     }
     for name, heading in headings.items():
         table = Table(heading, "success", "95 %", "complete from the start", "segments", title=title)
-        for key, counts in [*result[f"success_by_{name}"].items(), ("all", result["success"])]:
-            table.add_row(str(key), *_cells(*counts))
+        rows = [*result[f"success_by_{name}"].items(), ("all", result["success"])]
+        for key, counts in [*rows, ("takeovers by an expert", result["takeovers"])]:
+            if counts[-1]:
+                table.add_row(str(key), *_cells(*counts))
         tables.append(table)
         title = ""
-    kinds = [kind.name.lower() for kind in Intervention if kind is not Intervention.NONE]
+    kinds = [kind.name.lower() for kind in BEFORE_SEGMENTS]
     table = Table("segments that began after, from step", *kinds)
     for key, counts in [*result["began_after_over_time"].items(), ("all", result["began_after"])]:
         table.add_row(str(key), *(str(counts.get(kind, 0)) for kind in kinds))

@@ -28,6 +28,7 @@ from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
 from cronos_lerobot.data.origin import read_origin
 from cronos_lerobot.data.schema import (
+    EXPERT,
     INTERVENTION,
     POLICY_VERSION,
     POSITION,
@@ -71,6 +72,8 @@ class Segment:
     """LeRobot's episode index."""
     start: int
     """LeRobot's index of its first frame."""
+    taken_over: bool = False
+    """Whether an expert did it, not the policy."""
 
     @property
     def success(self) -> bool:
@@ -258,19 +261,22 @@ class StreamDataset:
         Raises:
             StreamError: a step is missing or there twice, or an annotation is wrong.
         """
-        check(self.annotations(COLUMNS), self.meta.total_frames, self.meta.total_episodes)
+        columns = [*COLUMNS, *({EXPERT} & self.meta.features.keys())]
+        check(self.annotations(columns), self.meta.total_frames, self.meta.total_episodes)
 
     def _episodes(self) -> pd.DataFrame:
         """One row per segment: LeRobot's columns and ours."""
         assert self.meta.episodes is not None
         names = ["episode_index", "dataset_from_index", "length", "tasks"]
         has_ours = all(name in self.meta.episodes.column_names for name in _SUMMARY)
-        wanted = self.meta.episodes.select_columns([*names, *(_SUMMARY if has_ours else ())])
+        ours = [*(_SUMMARY if has_ours else ()), *({EXPERT} & set(self.meta.episodes.column_names))]
+        wanted = self.meta.episodes.select_columns([*names, *ours])
         rows = cast(pd.DataFrame, wanted.to_pandas()).iloc[: self.meta.total_episodes]
         if has_ours:
             return rows
         # LeRobot's dataset tools drop columns they do not know from the episodes, but not from the frames.
-        frames = self.annotations(["episode_index", *(name for name in _SUMMARY if name != SUCCESS_FRAME)])
+        summary = {*_SUMMARY, *({EXPERT} & self.meta.features.keys())} - {SUCCESS_FRAME, *rows.columns}
+        frames = self.annotations(["episode_index", *sorted(summary)])
         first = frames.groupby("episode_index").first()
         number = frames.groupby("episode_index").cumcount()
         succeeded = number[frames[SUCCESS]].groupby(frames["episode_index"]).first()
@@ -299,4 +305,5 @@ def _segment(row: dict[str, Any]) -> Segment:
         policy_version=int(row[POLICY_VERSION]),
         episode=int(row["episode_index"]),
         start=int(row["dataset_from_index"]),
+        taken_over=bool(row.get(EXPERT, False)),
     )

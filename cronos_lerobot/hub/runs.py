@@ -12,6 +12,7 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETR
 
 from cronos_lerobot.hub.cards import command_line
 from cronos_lerobot.protocol.config import COUNTED_INTERVENTIONS
+from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.report.runs import TrainingRun, describe_protocol, read_training_run
 from cronos_lerobot.training.logging import MANIFEST, METRICS
 
@@ -81,7 +82,7 @@ def run_facts(run: TrainingRun) -> dict[str, Any]:
         "steps": last["interaction_steps"],
         "updates": last["updates"],
         "interventions": last["interventions"],
-        "by_kind": _by_kind(last["interventions_by_kind"]),
+        "by_kind": _by_kind(last["interventions_by_kind"], protocol.get("takeover_price", 1)),
         "evaluations": run.evaluations,
         "versions_then": run.starts[-1]["versions"],
         "commit_then": run.starts[-1]["git_commit"],
@@ -101,12 +102,15 @@ def _describe_configurations(benchmark: str | None, protocol: dict[str, Any]) ->
     return f"{protocol['num_configurations']} training configurations of {source}"
 
 
-def _by_kind(counts: dict[str, int]) -> list[tuple[str, int, str]]:
-    """(kind, number, whether it counts as an intervention)."""
-    counted = {kind.name.lower() for kind in COUNTED_INTERVENTIONS}
+def _by_kind(counts: dict[str, int], takeover_price: int) -> list[tuple[str, int, str]]:
+    """(kind, number, whether one counts and as how many); no takeovers where there were none."""
+    counted = {kind.name.lower(): "yes" for kind in COUNTED_INTERVENTIONS}
+    takeover = Intervention.TAKEOVER.name.lower()
+    counted[takeover] = f"yes, as {takeover_price}"
     return [
-        (name.lower().replace("_", " "), number, "yes" if name.lower() in counted else "no")
+        (name.lower().replace("_", " "), number, counted.get(name.lower(), "no"))
         for name, number in counts.items()
+        if number or name != takeover
     ]
 
 

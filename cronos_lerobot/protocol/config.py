@@ -10,7 +10,8 @@ from lerobot_env_cronos.vector_env import REWARDS
 from cronos_lerobot.protocol.interventions import Intervention
 
 COUNTED_INTERVENTIONS = (Intervention.SCENE_RESET, Intervention.HEURISTIC_RESET, Intervention.DIVERGENCE)
-"""What spends the budget B. Task switches, end-effector resets and the first placement are free."""
+"""What spends 1 of the budget B. Task switches, end-effector resets and the first placement are free; a takeover
+spends `ProtocolConfig.takeover_price`."""
 MAX_FAILURES = 16
 """Half of the segments that `LoopState` remembers: with learned resets every second one is no task."""
 
@@ -82,6 +83,16 @@ class ProtocolConfig:
     task_order: str = "heuristic"
     """How the next task is chosen: `heuristic` (the fixed cycle of Appendix E), `random` (uniform), `critic` (what
     the agent's values call neither hopeless nor certain) or the name of a registered order."""
+    takeover_after: int | None = None
+    """An expert does the next segment of a task that a stream has failed at so many times in a row, those that it
+    found complete left out of the count; null is never."""
+    takeover_budget: int | None = None
+    """What takeovers may add to the interventions in the whole run, paced evenly over its steps; null is no limit
+    but reset_budget."""
+    takeover_price: int = 1
+    """How many interventions a takeover counts as."""
+    takeover_expert: str = "scripted"
+    """Who takes over: `scripted` or the name of a registered expert."""
     num_configurations: int = NUM_CONFIGURATIONS
     """Scene resets draw from the first so many configurations of the training split, 1 to 64."""
     reward: str = "difference"
@@ -98,6 +109,11 @@ class ProtocolConfig:
         self._check_scene_reset()
         if self.reset_budget is not None and self.reset_budget < 1:
             raise ValueError(f"protocol.reset_budget must be >= 1 or null, got {self.reset_budget}.")
+        for name in ("takeover_after", "takeover_budget"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise ValueError(f"protocol.{name} must be >= 1 or null, got {value}.")
+        if self.takeover_price < 1:
+            raise ValueError(f"protocol.takeover_price must be >= 1, got {self.takeover_price}.")
         if self.reward not in REWARDS:
             raise ValueError(f"protocol.reward must be one of {REWARDS}, got {self.reward!r}.")
         if not 1 <= self.num_configurations <= NUM_CONFIGURATIONS:

@@ -1,4 +1,4 @@
-"""What can happen to a stream between two of its frames."""
+"""What can happen to a stream."""
 
 from enum import IntEnum
 
@@ -6,8 +6,11 @@ from enum import IntEnum
 class Intervention(IntEnum):
     """What happened to a stream right before a frame (column `cronos.intervention`).
 
-    Ordered by strength. Where several happen at one task switch, the frame carries the strongest:
+    Ordered by strength, up to INITIAL. Where several happen at one task switch, the frame carries the strongest:
     `max(kinds)`. Every value but NONE stands on the first frame of a segment, and only there.
+
+    TAKEOVER stands on none: it is no change of the scene but who acts after it, and a frame has to say both. It is
+    counted here; the frames of a takeover are marked in a column of their own, `intervention`.
     """
 
     NONE = 0
@@ -24,3 +27,9 @@ class Intervention(IntEnum):
     """A scene reset that the simulation forced, because its state was no longer finite."""
     INITIAL = 6
     """The stream's very first placement. Free."""
+    TAKEOVER = 7
+    """An expert does the segment that begins. Counts towards the budget, at a price of its own."""
+
+
+BEFORE_SEGMENTS = tuple(kind for kind in Intervention if kind not in (Intervention.NONE, Intervention.TAKEOVER))
+"""What the first frame of a segment may carry."""

@@ -52,20 +52,27 @@ class LoopState:
     """(N,) whether the simulation broke down in the last step and waits to be put back."""
     preceded_by: np.ndarray = field(init=False)
     """(N,) Intervention between the last step and the next one."""
+    taken_over: np.ndarray = field(init=False)
+    """(N,) whether an expert does the current segment."""
     attempts: np.ndarray = field(init=False)
-    """(N, tasks) finished segments of each task of the task set, reset tasks included."""
+    """(N, tasks) finished segments of each task of the task set, reset tasks included, takeovers not."""
     successes: np.ndarray = field(init=False)
-    """(N, tasks) finished segments of each task with a success."""
+    """(N, tasks) of these, those with a success."""
+    failures: np.ndarray = field(init=False)
+    """(N, tasks) failures in a row at each task, since its last success or takeover; segments that found it
+    complete do not count."""
     recent_task: np.ndarray = field(init=False)
     """(N, HISTORY) tasks of the latest segments, the last one at the end; -1 where there was none yet."""
     recent_success: np.ndarray = field(init=False)
-    """(N, HISTORY) whether they were a success: 1 or 0; -1 where there was none yet."""
+    """(N, HISTORY) whether they were a success, the policy's or an expert's: 1 or 0; -1 where there was none."""
     interventions: np.ndarray = field(init=False)
     """(N, len(Intervention)) events of each kind."""
     task_value: np.ndarray = field(init=False)
     """(N,) the agent's value of the current task when it was given, where the task order asked for it; else 0."""
     reset_value: np.ndarray = field(init=False)
     """(N,) its best value over the tasks when the stream's last scene reset was asked for, if by value; else 0."""
+    takeover_cost: np.ndarray = field(init=False)
+    """(N,) what takeovers have counted as, each at the price of its time."""
 
     def __post_init__(self) -> None:
         n = self.num_streams
@@ -77,13 +84,16 @@ class LoopState:
         self.found_complete = np.zeros(n, np.bool_)
         self.diverged = np.zeros(n, np.bool_)
         self.preceded_by = np.full(n, Intervention.NONE, np.int64)
+        self.taken_over = np.zeros(n, np.bool_)
         self.attempts = np.zeros((n, self.num_tasks + self.num_reset_tasks), np.int64)
         self.successes = np.zeros_like(self.attempts)
+        self.failures = np.zeros_like(self.attempts)
         self.recent_task = np.full((n, HISTORY), -1, np.int64)
         self.recent_success = np.full((n, HISTORY), -1, np.int64)
         self.interventions = np.zeros((n, len(Intervention)), np.int64)
         self.task_value = np.zeros(n)
         self.reset_value = np.zeros(n)
+        self.takeover_cost = np.zeros(n, np.int64)
 
     @property
     def n(self) -> int:
@@ -103,7 +113,7 @@ class LoopState:
     @property
     def stream_interventions(self) -> np.ndarray:
         """(N,) interventions of each stream that count against the budget."""
-        return self.interventions[:, COUNTED_INTERVENTIONS].sum(axis=1)
+        return self.interventions[:, COUNTED_INTERVENTIONS].sum(axis=1) + self.takeover_cost
 
     def interventions_by_kind(self) -> dict[str, int]:
         """Events of each kind summed over the streams, by lower-case name."""
@@ -116,6 +126,7 @@ class LoopState:
     def switch_task(self, task: np.ndarray) -> None:
         """Begin a segment of every stream; `task` is (N,) indices into the task set."""
         self.task = np.asarray(task, np.int64)
+        self.taken_over = np.zeros(self.num_streams, np.bool_)
         self.switches += 1
         self.interventions[:, Intervention.TASK_SWITCH] += 1
         self.preceded_by = np.maximum(self.preceded_by, Intervention.TASK_SWITCH)
@@ -146,6 +157,12 @@ class LoopState:
         if kind is Intervention.DIVERGENCE:
             self.diverged[ids] = False
 
+    def begin_takeover(self, ids: np.ndarray, price: int) -> None:
+        """Let an expert do the segment that begins in each stream of `ids`, for `price` interventions."""
+        self.interventions[ids, Intervention.TAKEOVER] += 1
+        self.takeover_cost[ids] += price
+        self.taken_over[ids] = True
+
     def end_segment(self) -> SegmentEnd:
         """Close the segment of every stream and return what it came to."""
         end = SegmentEnd(
@@ -154,10 +171,14 @@ class LoopState:
             success=self.succeeded,
             found_complete=self.found_complete,
             never_grasped=self.succeeded & ~self.found_complete & ~self.grasped,
+            taken_over=self.taken_over,
         )
-        streams = np.arange(self.num_streams)
-        self.attempts[streams, self.task] += 1
-        self.successes[streams, self.task] += self.succeeded
+        streams, own = np.arange(self.num_streams), ~self.taken_over
+        self.attempts[streams, self.task] += own
+        self.successes[streams, self.task] += self.succeeded & own
+        failures = self.failures[streams, self.task]
+        failures = np.where(self.succeeded & ~self.found_complete | self.taken_over, 0, failures)
+        self.failures[streams, self.task] = failures + (~self.succeeded & own)
         self.recent_task = np.column_stack([self.recent_task[:, 1:], self.task])
         self.recent_success = np.column_stack([self.recent_success[:, 1:], self.succeeded])
         self.succeeded = np.zeros(self.num_streams, np.bool_)
@@ -175,6 +196,9 @@ class LoopState:
         loop = cls(state["num_streams"], state["num_tasks"], state["num_reset_tasks"])
         for name, value in state.items():
             template = getattr(loop, name)
+            if name == "interventions":
+                # Checkpoints from before there were takeovers have fewer kinds.
+                value = [[*kinds, *[0] * (len(Intervention) - len(kinds))] for kinds in value]
             if isinstance(template, np.ndarray):
                 value = np.asarray(value, template.dtype).reshape(template.shape)
             setattr(loop, name, value)
@@ -209,6 +233,8 @@ class Step:
     """(N,) counted interventions of the stream before this step."""
     policy_version: int
     """Number of updates of the policy that acted."""
+    taken_over: np.ndarray | None = None
+    """(N,) bool, an expert does this segment; None where there are no experts."""
 
 
 @dataclass(frozen=True)
@@ -232,6 +258,8 @@ class SegmentEnd:
     """(N,) bool, a success for which nothing had to be done: an earlier task had left it complete."""
     never_grasped: np.ndarray
     """(N,) bool, another success whose object was grasped at no step of the segment: pushed or dropped."""
+    taken_over: np.ndarray
+    """(N,) bool, an expert did it, not the policy."""
 
 
 Event = Step | Update | SegmentEnd

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -45,8 +45,12 @@ class ResetStrategy(ABC):
         if len(ids) == 0:
             return False
         self.apply(env, ids)
-        loop.count_intervention(ids, self.kind)
+        self.count(loop, ids)
         return True
+
+    def count(self, loop: LoopState, ids: np.ndarray) -> None:
+        """Count one event for each stream of `ids`."""
+        loop.count_intervention(ids, self.kind)
 
 
 class NoReset(ResetStrategy):
@@ -226,6 +230,8 @@ class Resets:
     heuristic: ResetStrategy
     extra: tuple[ResetStrategy, ...]
     scene: ResetStrategy
+    takeover: ResetStrategy = field(default_factory=NoReset)
+    """Not in the paper: once the tasks are drawn, who is helped with them."""
 
     def bind(self, run: RunContext) -> None:
         """Tell every strategy what the run is made of; a ValueError refuses the run."""

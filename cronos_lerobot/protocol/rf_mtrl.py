@@ -42,6 +42,7 @@ def rf_mtrl(
         loop.switch_task(task_order.draw(loop))  # 8
         env.set_task(streams, [tasks[i] for i in loop.task])
         tau = [tasks[i].instruction for i in loop.task]
+        resets.takeover.apply_if_due(env, loop)
         o_t = env.observe()  # 10
         for k in range(1, K + 1):  # 9
             a_t = agent.act(o_t, tau)  # 11
@@ -87,4 +88,5 @@ def _describe(
         preceded_by=loop.preceded_by,
         interventions=loop.stream_interventions,
         policy_version=loop.updates,
+        taken_over=loop.taken_over,
     )

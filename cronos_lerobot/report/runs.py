@@ -31,6 +31,7 @@ DESCRIBED = tuple(
     for name in (
         "scene_reset_interval", "curriculum", "end_effector_reset", "learned_reset", "heuristic_reset",
         "extra_resets", "task_order", "num_configurations", "reset_phase", "scene_reset",
+        "takeover_after", "takeover_price",
     )
 )  # fmt: skip
 """Fields that `describe_protocol` puts into words."""
@@ -299,6 +300,9 @@ def describe_protocol(protocol: dict[str, Any]) -> str:
         words.append(f"{protocol['task_order']} order")
     if protocol.get("num_configurations", 64) != 64:
         words.append(f"{protocol['num_configurations']} configuration(s)")
+    if protocol.get("takeover_after") is not None:
+        price = f" at {protocol['takeover_price']} each" if protocol["takeover_price"] != 1 else ""
+        words.append(f"takeovers after {protocol['takeover_after']}{price}")
     return ", ".join(words)
 
 

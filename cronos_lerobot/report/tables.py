@@ -147,7 +147,10 @@ def intervention_rows(groups: Iterable[Group]) -> list[Row]:
             # Records of older runs do not have them.
             streams = last.get("interventions_by_stream") or []
             extremes = {"fewest of a stream": min(streams), "most of a stream": max(streams)} if streams else {}
-            rows.append(_identity(group, run) | counters | extremes | last["interventions_by_kind"])
+            by_kind = dict(last["interventions_by_kind"])
+            if by_kind.get("takeover"):
+                by_kind["takeover price"] = run.config["protocol"]["takeover_price"]
+            rows.append(_identity(group, run) | counters | extremes | by_kind)
     return rows
 
 

@@ -26,6 +26,7 @@ from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.registry import check_agent
 from cronos_lerobot.data.writer import FLUSH_INTERVAL_S
 from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.protocol.experts import check_expert
 from cronos_lerobot.protocol.resets import check_extra_resets
 from cronos_lerobot.protocol.task_orders import check_task_order
 from cronos_lerobot.training.resume import check_resumed, check_types
@@ -198,6 +199,7 @@ class CronosTrainConfig:
                 raise ValueError(f"{name} must be >= 1 or null, got {value}.")
         check_task_order(self.protocol.task_order)
         check_extra_resets(self.protocol.extra_resets)
+        check_expert(self.protocol.takeover_expert)
 
     @property
     def steps_per_update(self) -> int:

@@ -28,8 +28,9 @@ class CriticLog:
     def on_segment(self, segment: SegmentEnd, loop: LoopState) -> None:
         """Take in the end of a segment; its resets are done."""
         if self.chooses_tasks:
-            for task, success, value in zip(segment.task, segment.success, loop.task_value, strict=True):
-                if task < loop.num_tasks:
+            columns = (segment.task, segment.success, loop.task_value, segment.taken_over)
+            for task, success, value, taken_over in zip(*columns, strict=True):
+                if task < loop.num_tasks and not taken_over:
                     self._state["values"]["success" if success else "failure"].append(float(value))
         counts = loop.interventions[:, Intervention.SCENE_RESET]
         before, self._state["counted"] = self._state["counted"] or [0] * len(counts), counts.tolist()

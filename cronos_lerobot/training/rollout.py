@@ -43,10 +43,15 @@ class RolloutStatistics:
         """Take in a Step or the end of a segment."""
         state = self._state
         if isinstance(event, Step):
-            state["reward"] += float(event.reward.sum())
+            own = event.reward if event.taken_over is None else event.reward[~event.taken_over]
+            state["reward"] += float(own.sum())
             state["diverged"] += int(event.diverged.sum())
         elif isinstance(event, SegmentEnd):
             for stream, task in enumerate(event.task):
+                if event.taken_over[stream]:
+                    state["takeovers"][0] += int(event.success[stream])
+                    state["takeovers"][1] += 1
+                    continue
                 self._count(state["by_task"], self.instructions[task], event.success[stream])
                 if task < self.num_tasks:
                     segment = str(event.segments_since_reset[stream])
@@ -59,7 +64,8 @@ class RolloutStatistics:
         `success` is the rate in all `segments`, [k, n] those `found_complete` (successes for which nothing had to
         be done) and `never_grasped` (other successes whose object was never grasped). The three `..._by_segment`
         have one [k, n] for each number of segments since the scene reset, `success_by_task` one for each
-        instruction. Learned reset tasks are in the last one only.
+        instruction. Learned reset tasks are in the last one only. `takeovers`, [k, n], is what
+        an expert did, and in none of the others.
         """
         state = self._state
         total = {sort: _total(table.values()) for sort, table in state["by_segment"].items()}
@@ -78,6 +84,7 @@ class RolloutStatistics:
             },
             "reward_per_segment": state["reward"] / all_segments if all_segments else None,
             "diverged": state["diverged"],
+            "takeovers": Count(*state["takeovers"]),
         }
         self._state = self._empty()
         return statistics
@@ -88,11 +95,13 @@ class RolloutStatistics:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from `state_dict`."""
-        self._state = state
+        # One from before there were takeovers has none.
+        self._state = self._empty() | state
 
     @classmethod
     def _empty(cls) -> dict[str, Any]:
-        return {"reward": 0.0, "diverged": 0, "by_task": {}, "by_segment": {sort: {} for sort in cls.SORTS}}
+        by_segment: dict[str, Any] = {sort: {} for sort in cls.SORTS}
+        return {"reward": 0.0, "diverged": 0, "takeovers": [0, 0], "by_task": {}, "by_segment": by_segment}
 
     @staticmethod
     def _count(table: dict[str, list[int]], key: str, success: bool) -> None:

@@ -147,7 +147,8 @@ def whole_step(step: Step, processes: Processes, num_recorded: int) -> Step:
     step has that process's only. Films are always its own.
     """
     own = len(step.action.action)
-    action = ActionSample(**{name: processes.collect(array) for name, array in vars(step.action).items()})
+    arrays = {name: array for name, array in vars(step.action).items() if array is not None}
+    action = ActionSample(**{name: processes.collect(array) for name, array in arrays.items()})
     if num_recorded <= own:
         return replace(step, action=action)
     seen = {name: value for name, value in step.observation.items() if name != FILM}

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from lerobot.envs import EnvConfig
 
-from cronos_lerobot.agents.base import LearningAgent
+from cronos_lerobot.agents.base import Agent, LearningAgent
 from cronos_lerobot.agents.processing import make_processors
 from cronos_lerobot.agents.registry import AgentContext, make_agent
 from cronos_lerobot.evaluation.independent import evaluate_independent
@@ -17,6 +18,7 @@ from cronos_lerobot.processes import Processes, bit_sum
 from cronos_lerobot.protocol.loop_state import Event, SegmentEnd, Step, Update
 from cronos_lerobot.protocol.resets import make_resets
 from cronos_lerobot.protocol.rf_mtrl import rf_mtrl
+from cronos_lerobot.protocol.takeovers import AssistedAgent, Takeover, make_expert
 from cronos_lerobot.protocol.task_orders import TaskSet, bind_task_order, make_task_order
 from cronos_lerobot.protocol.task_values import RunContext
 from cronos_lerobot.stopwatch import Stopwatch
@@ -80,6 +82,10 @@ class Trainer:
         bind_task_order(self._task_order, run)
         self._resets.bind(run)
         self.loop = self.task_set.new_loop(config.num_envs)
+        self._expert = make_expert(config.protocol, env, self.agent, config.algorithm.type)
+        if self._expert is not None:
+            takeover = Takeover(config.protocol, config.total_steps, self._expert.capacity)
+            self._resets = replace(self._resets, takeover=takeover)
         self._last_evaluation = 0
         self._last_interventions = 0
         recorded = config.record.num_streams
@@ -189,10 +195,14 @@ class Trainer:
     def _events(self) -> Any:
         record = self.config.record
         filmed = record.filmed_streams if record.repo_id is not None and self.processes.is_main else 0
+        agent: Agent = self.agent
+        if self._expert is not None:
+            mine = self.processes.share_of(self.config.num_envs)
+            agent = AssistedAgent(self.agent, self._expert, self.loop, mine)
         return rf_mtrl(
             FilmedEnv(self.env, filmed) if filmed else self.env,
             self.task_set.all,
-            self.agent,
+            agent,
             self._task_order,
             self._resets,
             self.config.protocol,

@@ -6,7 +6,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from synthetic_segments import observation_space
 
 from cronos_lerobot.agents.processing import observation_columns
-from cronos_lerobot.data.schema import STREAM_COLUMNS, demonstration_features, stream_features
+from cronos_lerobot.data.schema import EXPERT, STREAM_COLUMNS, demonstration_features, stream_features
 from cronos_lerobot.protocol.interventions import Intervention
 
 
@@ -23,7 +23,7 @@ def test_annotations_are_no_policy_features():
 
 def test_a_stream_has_the_columns_of_a_demonstration_and_the_annotations():
     stream, demonstration = stream_features(observation_space()), demonstration_features(observation_space())
-    assert set(stream) - set(demonstration) == set(STREAM_COLUMNS)
+    assert set(stream) - set(demonstration) == {*STREAM_COLUMNS, EXPERT}
     assert all(stream[key] == demonstration[key] for key in demonstration)
 
 
@@ -42,6 +42,7 @@ def test_codes_of_interventions_are_frozen():
         ("SCENE_RESET", 4),
         ("DIVERGENCE", 5),
         ("INITIAL", 6),
+        ("TAKEOVER", 7),
     ]
 
 

@@ -5,6 +5,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import synthetic_streams
 from lerobot.datasets import LeRobotDataset, StreamingLeRobotDataset
 from lerobot.datasets.dataset_tools import delete_episodes
 from synthetic_segments import FPS, features, segment
@@ -141,6 +142,7 @@ def test_what_is_missing_is_named(tmp_path, skip, message):
         ("cronos.intervention", 12, 6, "stream 0, step 4: intervention 6"),
         ("cronos.segment_index", 5, 9, "stream 1, step 1: segment 9 begins inside episode 1"),
         ("cronos.stream_interventions", 48, 0, "stream 0, step 16: cronos.stream_interventions is 0, not what"),
+        ("intervention", 13, True, "stream 0, step 5: intervention is True"),
         ("next.done", 9, True, "stream 2, step 1: next.done is True, a stream never ends"),
         ("next.truncated", 10, True, "stream 2, step 2: next.truncated is True"),
         ("next.truncated", 11, False, "stream 2, step 3: next.truncated is False"),
@@ -159,6 +161,32 @@ def test_wrong_annotations_are_named(tmp_path, column, row, value, message):
     pq.write_table(table.set_column(place, field, pa.array(values, field.type)), path)
     with pytest.raises(StreamError, match=message):
         StreamDataset("me/stream", tmp_path / "d", streaming=True).check()
+
+
+def test_a_takeover_that_was_not_counted_is_named(tmp_path):
+    record(tmp_path / "d")
+    (path,) = (tmp_path / "d").glob("data/*/*.parquet")
+    table = pq.read_table(path)
+    # All of the second segment of stream 0, episode 3.
+    values = pa.array([12 <= row < 16 for row in range(len(table))])
+    pq.write_table(table.set_column(table.schema.get_field_index("intervention"), "intervention", values), path)
+    with pytest.raises(StreamError, match=r"stream 0, step 4: cronos.stream_interventions is 0, not what"):
+        StreamDataset("me/stream", tmp_path / "d", streaming=True).check()
+
+
+def test_streams_from_before_there_were_takeovers_are_whole(tmp_path, monkeypatch):
+    columns = synthetic_streams.stream_features
+
+    def without(space):
+        return {name: feature for name, feature in columns(space).items() if name != "intervention"}
+
+    monkeypatch.setattr(synthetic_streams, "stream_features", without)
+    record(tmp_path / "d")
+    old = StreamDataset("me/stream", tmp_path / "d")
+    assert "intervention" not in old.meta.features
+    old.check()
+    assert not any(segment.taken_over for segment in old.segments)
+    assert statistics(old)["takeovers"] == [0, 0, 0]
 
 
 def test_a_segment_that_is_there_twice_is_named(root, tmp_path):

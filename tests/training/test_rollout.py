@@ -15,7 +15,7 @@ TASKS = ["a", "b", "put a back"]
 
 def end(task, since_reset, success, found, ungrasped):
     flags = [np.array(flag, bool) for flag in (success, found, ungrasped)]
-    return SegmentEnd(np.array(task), np.array(since_reset), *flags)
+    return SegmentEnd(np.array(task), np.array(since_reset), *flags, np.zeros(len(task), bool))
 
 
 def statistics():

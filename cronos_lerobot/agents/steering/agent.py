@@ -39,6 +39,9 @@ class SteeringAgent(LearningAgent):
         ValueError: the policy's noise cannot be chosen, or it decides beyond a task switch.
     """
 
+    # It learns which noise to choose, and what an expert does was made of none.
+    learns_beside_expert = False
+
     def __init__(self, context: AgentContext) -> None:
         self.config: SteeringConfig = context.config
         self.policy = context.policy.eval().requires_grad_(False)

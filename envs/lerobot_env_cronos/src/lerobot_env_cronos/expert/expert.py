@@ -78,12 +78,14 @@ class ScriptedExpert:
     Args:
         env: whose state is read; it is never changed.
         seed: kept for interfaces that pass one; the expert is deterministic and draws nothing.
+        streams: act in these alone (k,); n is k then, and streams are numbered by their place in here.
     """
 
-    def __init__(self, env: CronosVectorEnv, seed: int = 0):
+    def __init__(self, env: CronosVectorEnv, seed: int = 0, streams: np.ndarray | None = None):
         self.env, self.seed = env, seed
         self.sim, self.scene = env.simulation, env.scene
-        n, bodies = env.num_envs, self.scene.bodies
+        n, bodies = env.num_envs if streams is None else len(streams), self.scene.bodies
+        self._mine = slice(None) if streams is None else streams
         self._boxes = SceneBoxes.from_model(self.sim.model, self.scene)
         self._candidates = {i: grasp_candidates(self._boxes, i) for i in range(len(self.scene.objects))}
         self._corners = {i: self._boxes.corners(i) for i in range(len(self.scene.objects))}
@@ -130,15 +132,16 @@ class ScriptedExpert:
     def _look(self) -> None:
         """Read what this step's decisions need from the simulation."""
         sim = self.sim
-        self._poses = sim.body_poses()
-        self._p, self._R, _ = forward_kinematics(sim.qpos[:, :NUM_ARM_JOINTS])
-        self._target_p, self._target_R, _ = forward_kinematics(sim.arm_target)
-        self._arm = sim.qpos[:, :NUM_ARM_JOINTS]
+        mine = self._mine
+        self._poses = sim.body_poses()[mine]
+        self._arm, self._arm_target = sim.qpos[mine, :NUM_ARM_JOINTS], sim.arm_target[mine]
+        self._p, self._R, _ = forward_kinematics(self._arm)
+        self._target_p, self._target_R, _ = forward_kinematics(self._arm_target)
         self._yaw = np.arctan2(self._R[:, 1, 1], self._R[:, 0, 1])
-        self._opening = sim.gripper_opening()
+        self._opening = sim.gripper_opening()[mine]
         # Fingers that cannot close press on a side too wide for them: that is not a grasp.
         closed = (self._opening < 0.95)[:, None]
-        self._held_objects = closed & np.stack([sim.is_grasped(name) for name in self.scene.objects], 1)
+        self._held_objects = closed & np.stack([sim.is_grasped(name)[mine] for name in self.scene.objects], 1)
 
     def _update_goals(self) -> None:
         """The body to move and where to, (n,) indices; an object held by mistake goes to the table first."""
@@ -146,11 +149,11 @@ class ScriptedExpert:
         tasks = [
             (bodies.index(t.object), bodies.index(t.receptacle) if t.receptacle else -1) for t in self.env.tasks
         ]
-        goal = np.array(tasks)
+        goal = np.array(tasks)[self._mine]
         self.reset(np.flatnonzero((goal != self._task).any(1)))
         self._task = goal.copy()
         i = np.arange(len(goal))
-        self._success = self.env.is_success & ~self._held_objects[i, goal[:, 0]]
+        self._success = self.env.is_success[self._mine] & ~self._held_objects[i, goal[:, 0]]
         other = self._held_objects.copy()
         other[i, goal[:, 0]] = False
         wrong = other.any(1)
@@ -375,7 +378,7 @@ class ScriptedExpert:
 
     def _away_from_wrist_limit(self, turn: np.ndarray) -> np.ndarray:
         """Turn (n,) the long way round where the short one would hit the wrist's limit."""
-        blocked = (self._target_R[:, 2, 0] < -0.7) & (np.abs(self.sim.arm_target[:, 5] - turn) > 3.1)
+        blocked = (self._target_R[:, 2, 0] < -0.7) & (np.abs(self._arm_target[:, 5] - turn) > 3.1)
         return np.where(blocked, turn - 2 * np.pi * np.sign(turn), turn)
 
 
