@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -50,6 +50,16 @@ class AgentContext:
         return self.processes.share_of(self.num_streams)
 
 
+@dataclass
+class AgentConfig(RLAlgorithmConfig):
+    """What `--algorithm.*` sets, to be derived from: a dataclass with a default for every flag."""
+
+    @classmethod
+    def from_policy_config(cls, policy_cfg: Any) -> Self:
+        """Return the defaults: what depends on the policy is asked of it when the agent is made."""
+        return cls()
+
+
 AgentFactory = Callable[[AgentContext], LearningAgent]
 
 AGENTS: dict[str, AgentFactory] = {}
@@ -60,7 +70,7 @@ def register_agent(name: str) -> Callable[[AgentFactory], AgentFactory]:
     """Make an agent selectable as `--algorithm.type=name`.
 
     It decorates a class whose constructor, or a function that, takes an AgentContext. The config of the same name
-    is registered with LeRobot: `@RLAlgorithmConfig.register_subclass(name)`. If the policy cannot be trained by
+    is registered with LeRobot: `@AgentConfig.register_subclass(name)`. If the policy cannot be trained by
     the agent, it raises a ValueError that says so.
 
     Raises:

@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 import logging
 import os
+from pathlib import Path
 from typing import Any
 
+from huggingface_hub import file_exists
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
+from huggingface_hub.errors import HfHubHTTPError
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import ACTION
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, SequentialVectorEnv, get_scene
 from safetensors import SafetensorError
 
+from cronos_lerobot.agents.steering.steered import STEERING
 from cronos_lerobot.agents.weights import wrap
 from cronos_lerobot.evaluation.policy_env import check_task_observation
 from cronos_lerobot.training.config import CronosTrainConfig
@@ -84,6 +88,8 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
         policy = wrap(make_policy(policy_config, env_cfg=env_config), config.peft)
         if path is None:
             return policy, *make_pre_post_processors(policy_config)
+        if not config.resume:
+            warn_of_actor(policy_config, config.algorithm.type)
         # Like lerobot-train: the checkpoint's processors, on the device of this run.
         device = {"device_processor": {"device": policy_config.device}}
         return policy, *make_pre_post_processors(policy_config, str(path), preprocessor_overrides=device)
@@ -91,6 +97,23 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
         raise ValueError(f"{path}/{SAFETENSORS_SINGLE_FILE} or a processor's file is damaged: {error}") from error
     except json.JSONDecodeError as error:
         raise ValueError(f"a configuration of a processor in {path} is damaged: {error}") from error
+
+
+def warn_of_actor(policy: PreTrainedConfig, algorithm: str) -> None:
+    """Say what becomes of the actor that lies in a steered checkpoint, a folder's or one of the Hub's."""
+    path = str(policy.pretrained_path)
+    if Path(path).is_dir():
+        has_actor = (Path(path) / STEERING).is_file()
+    else:
+        try:
+            has_actor = file_exists(path, STEERING, revision=getattr(policy, "pretrained_revision", None))
+        except (OSError, HfHubHTTPError):
+            return
+    if has_actor:
+        logging.warning(
+            f"{path} has an actor that steers the policy ({STEERING}): --algorithm.type={algorithm} begins with "
+            "the frozen policy, without that actor, which stays where it is and is in no checkpoint of this run."
+        )
 
 
 def check_features(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:

@@ -65,7 +65,7 @@ def test_smolvla_is_steered_saved_resumed_and_evaluated(tmp_path, monkeypatch, c
         assert len(asked) == (16 if steers else 0)
 
 
-def test_pocketvlas_flow_head_is_steered_from_the_state(tmp_path, monkeypatch):
+def test_pocketvlas_flow_head_is_steered_from_the_state(tmp_path, monkeypatch, capsys):
     flags = [flag for flag in (*SMALL, *OBSERVATIONS["state"]) if not flag.startswith("--algorithm.")]
     flags += ["--algorithm.type=steering", "--algorithm.batch_size=8", "--algorithm.warmup_decisions=8"]
     run = tmp_path / "run"
@@ -81,6 +81,19 @@ def test_pocketvlas_flow_head_is_steered_from_the_state(tmp_path, monkeypatch):
         # State, environment's state and words; the noise of six steps of seven dimensions, mean and deviation.
         assert (shape["observation"], shape["features"]) == ("state", 13 + 48 + 32)
         assert actor.get_slice("actor.head.bias").get_shape() == [2 * 6 * 7]
+
+    # Whoever learns on from here is told that it is from the policy alone.
+    steered = run / "checkpoints/last/pretrained_model"
+    others = [flag for flag in flags if not flag.startswith(("--policy.", "--algorithm."))]
+    others += ["--policy.device=cpu", "--algorithm.type=ppo", "--algorithm.minibatch_size=8", "--steps=16"]
+    assert "steers the policy" not in capsys.readouterr().err
+    cronos_train(monkeypatch, *others, f"--policy.path={steered}", f"--output_dir={tmp_path / 'on'}")
+    assert "--algorithm.type=ppo begins with the frozen policy, without that actor" in capsys.readouterr().err
+    learned = tmp_path / "on/checkpoints/last/pretrained_model"
+    assert not (learned / STEERING).exists()
+    resume = ("--resume=true", f"--config_path={steered}/train_config.json", "--steps=48")
+    cronos_train(monkeypatch, *resume)
+    assert "steers the policy" not in capsys.readouterr().err
 
 
 def test_a_diffusion_that_looks_back_is_steered(tmp_path, monkeypatch):

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
-
-from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
 from cronos_lerobot.agents.ppo.config import ABOVE_0, COUNT, SHARE, Interval
+from cronos_lerobot.agents.registry import AgentConfig
 
 OBSERVATIONS = ("auto", "policy", "state")
 RANGES = {
@@ -27,9 +25,9 @@ RANGES = {
 }
 
 
-@RLAlgorithmConfig.register_subclass("steering")
+@AgentConfig.register_subclass("steering")
 @dataclass
-class SteeringConfig(RLAlgorithmConfig):
+class SteeringConfig(AgentConfig):
     """Soft actor-critic over the initial noise of a frozen policy. Bad values are a ValueError."""
 
     observation: str = "auto"
@@ -79,8 +77,3 @@ class SteeringConfig(RLAlgorithmConfig):
                 f"algorithm.num_target_critics must be at most num_critics={self.num_critics}, got "
                 f"{self.num_target_critics}."
             )
-
-    @classmethod
-    def from_policy_config(cls, policy_cfg: Any) -> SteeringConfig:
-        """Return the defaults: what depends on the policy is asked of it when the agent is made."""
-        return cls()
