@@ -4,13 +4,16 @@ import csv
 import json
 import subprocess
 import sys
+from importlib.metadata import entry_points
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
+from forked_commands import run_forked
 from lerobot.datasets import LeRobotDataset
 
 from cronos_lerobot.report import page
-from cronos_lerobot.scripts import demo, probe
+from cronos_lerobot.scripts import demo, pipeline, probe
 from cronos_lerobot.scripts.demo import SCALES, make_steps
 from cronos_lerobot.scripts.pipeline import Step, StepFailedError, command_line, run_steps
 
@@ -132,24 +135,30 @@ def test_full_demo_evaluates_every_configuration_of_both_splits(tmp_path):
     assert full.train_steps % (full.streams * full.scene_reset_interval) == 0
 
 
-def test_demo_end_to_end(tmp_path):
-    command = [sys.executable, "-m", "cronos_lerobot.scripts.demo", "--scale=smoke"]
-    command += [f"--output_dir={tmp_path / 'demo'}"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
-    demo = tmp_path / "demo"
-    assert "$ cronos-train" in done.stdout
-    assert "independent_held_out" in done.stdout.split("$ cronos-report")[1]
-    assert LeRobotDataset("local/cronos_demos", root=demo / "demos").num_episodes == 8
-    stream = LeRobotDataset("local/cronos_demo_streams", root=demo / "finetune/streams")
+def test_demo_end_to_end(tmp_path, monkeypatch, capsys):
+    def run(command, check):
+        done = run_forked(command, check=check)
+        print(done.stdout, done.stderr[-3000:])
+        return done
+
+    monkeypatch.setattr(pipeline, "subprocess", SimpleNamespace(run=run))
+    output = tmp_path / "demo"
+    monkeypatch.setattr(sys, "argv", ["cronos-demo", "--scale=smoke", f"--output_dir={output}"])
+    (script,) = entry_points(group="console_scripts", name="cronos-demo")
+    script.load()()
+    said = capsys.readouterr().out
+    assert "$ cronos-train" in said
+    assert "independent_held_out" in said.split("$ cronos-report")[1]
+    assert LeRobotDataset("local/cronos_demos", root=output / "demos").num_episodes == 8
+    stream = LeRobotDataset("local/cronos_demo_streams", root=output / "finetune/streams")
     assert stream.num_frames == 160
-    with (demo / "report/gains.csv").open() as file:
+    with (output / "report/gains.csv").open() as file:
         gains = {row["suite"]: row for row in csv.DictReader(file) if row["task"] == "all tasks"}
-    evaluated = json.loads((demo / "eval/after_held_out/eval_info.json").read_text())
+    evaluated = json.loads((output / "eval/after_held_out/eval_info.json").read_text())
     successes = sum(sum(task["metrics"]["successes"]) for task in evaluated["per_task"])
     after = gains["independent_held_out"]
     assert (after["after_successes"], after["after_n"]) == (str(successes), "4")
-    page = (demo / "report/index.html").read_text()
+    page = (output / "report/index.html").read_text()
     # The stream, and each of four tasks before and after.
     assert page.count("data:video/mp4") == 1 + 8
-    assert pd.read_csv(demo / "report/updates.csv")["interaction_steps"].tolist() == [320, 640]
+    assert pd.read_csv(output / "report/updates.csv")["interaction_steps"].tolist() == [320, 640]

@@ -2,13 +2,13 @@
 
 import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from forked_commands import run_forked
 from tiny_vlas import (
     CHUNK,
     DIMS,
@@ -271,7 +271,7 @@ def trained(tmp_path_factory):
     tests = str(Path(__file__).parents[1])
     command = [sys.executable, "-c", LOAD, *(str(result[0]) for result in results.values())]
     environment = os.environ | {"PYTHONPATH": tests, "HF_HUB_OFFLINE": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    done = run_forked(command, env=environment)
     assert done.returncode == 0, done.stderr[-3000:]
     return results
 

@@ -1,10 +1,9 @@
 import logging
-import os
-import subprocess
 import sys
 
 import numpy as np
 import pytest
+from forked_commands import run_forked
 from lerobot.datasets import LeRobotDataset
 from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.config import CronosEnvConfig
@@ -310,7 +309,6 @@ def test_lerobot_train_reads_demonstrations_stored_as_images(tmp_path):
         *("--steps=2", "--log_freq=1", "--batch_size=4", "--num_workers=0", "--env_eval_freq=0"),
         "--wandb.enable=false",
     ]
-    environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(train, env=environment, capture_output=True, text=True, timeout=120)
+    done = run_forked(train)
     assert done.returncode == 0, done.stderr[-4000:]
     assert "step:2" in done.stdout + done.stderr

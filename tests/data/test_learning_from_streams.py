@@ -1,10 +1,9 @@
 """`lerobot-train` on recorded streams as they are, and on what a filter made of them."""
 
 import json
-import os
-import subprocess
 import sys
 
+from forked_commands import run_forked
 from synthetic_streams import record
 
 from cronos_lerobot.data.stream_filter import SegmentFilter, filter_streams
@@ -33,8 +32,7 @@ def test_lerobot_trains_on_streams_and_on_filtered_ones(tmp_path):
         *(sys.executable, "-c", TRAIN_TWICE, str(tmp_path), "--policy.type=pocketvla", "--policy.device=cpu"),
         *("--policy.push_to_hub=false", "--num_workers=0", "--batch_size=4", "--steps=2", "--wandb.enable=false"),
     ]
-    environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
+    done = run_forked(command)
     assert done.returncode == 0, done.stderr[-4000:]
     for name in ("streams", "successes"):
         config = json.loads((tmp_path / f"{name}_run/checkpoints/last/pretrained_model/config.json").read_text())

@@ -1,7 +1,6 @@
 import json
 import os
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -10,6 +9,7 @@ import gymnasium
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from forked_commands import run_forked
 from lerobot.datasets import LeRobotDataset
 from synthetic_segments import FPS, assert_same_pictures, features, segment
 
@@ -179,7 +179,7 @@ def killed(tmp_path_factory, video):
     """A dataset whose process was killed with segments written after the last flush."""
     root = tmp_path_factory.mktemp("killed") / "d"
     script = KILLED_WRITER.format(tests=str(Path(__file__).parent), root=str(root), video=video)
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    result = run_forked([sys.executable, "-c", script])
     assert result.returncode == -signal.SIGKILL, result.stderr
     return root
 

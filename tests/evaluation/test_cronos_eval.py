@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from forked_commands import run_forked
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import eval_policy, rollout
@@ -219,11 +219,10 @@ def test_lerobot_reads_the_chain_length_as_the_sum_of_rewards(pocketvla):
 
 
 def test_lerobot_eval_command(pocketvla, tmp_path):
-    program = Path(sys.executable).with_name("lerobot-eval")
-    command = [program, f"--policy.path={pocketvla}", "--policy.device=cpu", "--env.type=cronos"]
+    command = ["lerobot-eval", f"--policy.path={pocketvla}", "--policy.device=cpu", "--env.type=cronos"]
     command += ["--env.suite=sequential", "--env.split=held_out", "--env.obs_type=environment_state_agent_pos"]
     command += ["--eval.n_episodes=2", "--eval.batch_size=2", f"--output_dir={tmp_path / 'out'}"]
-    one = subprocess.run([*command, "--env.task=3"], capture_output=True, text=True)
+    one = run_forked([*command, "--env.task=3"])
     assert one.returncode == 0, one.stderr[-2000:]
     info = json.loads((tmp_path / "out/eval_info.json").read_text())
     (entry,) = info["per_task"]

@@ -2,13 +2,13 @@
 
 import csv
 import json
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.image
 import pytest
+from forked_commands import run_forked
 from synthetic_runs import INSTRUCTIONS, write_training_run
 
 from cronos_lerobot.experiments import plots, tables
@@ -380,7 +380,7 @@ def test_report_only_from_the_command_line(options, tmp_path):
     write_training_run(spec.train_folder, interval=80, successes=(2, 4, 6))
     command = [sys.executable, "-m", "cronos_lerobot.scripts.reproduce", "table1", "--report_only"]
     command += [f"--root={options.root}", f"--output_dir={tmp_path / 'out'}"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = run_forked(command)
     assert done.returncode == 0, done.stderr
     assert "t80_307k/seed1: 10,240 of 307,200 steps" in done.stdout
     assert Path(tmp_path / "out/table1.png").exists()

@@ -3,10 +3,10 @@
 import base64
 import json
 import re
-import subprocess
 import sys
 
 import pytest
+from forked_commands import run_forked
 from lerobot_env_cronos.scene.scenes import SCENES
 from synthetic_runs import INSTRUCTIONS, read_csv, write_evaluation, write_training_run
 
@@ -390,8 +390,8 @@ def test_large_videos_are_linked(tmp_path, monkeypatch):
 def test_command_line(tmp_path):
     write_training_run(tmp_path / "run")
     command = [sys.executable, "-m", "cronos_lerobot.scripts.report", str(tmp_path / "run")]
-    done = subprocess.run([*command, f"--output={tmp_path / 'out'}"], capture_output=True, text=True, check=True)
+    done = run_forked([*command, f"--output={tmp_path / 'out'}"], check=True)
     assert f"Report: {tmp_path / 'out' / 'index.html'}" in done.stdout
-    wrong = subprocess.run([*command[:-1], str(tmp_path / "no")], capture_output=True, text=True, check=False)
+    wrong = run_forked([*command[:-1], tmp_path / "no"])
     assert wrong.returncode != 0
     assert "metrics.jsonl" in wrong.stderr

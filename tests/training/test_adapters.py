@@ -2,13 +2,13 @@
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from forked_commands import run_forked
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
@@ -100,7 +100,7 @@ def test_diffusion_learns_by_its_chain_saves_resumes_and_is_a_lerobot_policy(tmp
     from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 
     last = whole / "checkpoints/last/pretrained_model"
-    acted = subprocess.run([sys.executable, "-c", ACT_ALONE, last], check=True, capture_output=True, text=True)
+    acted = run_forked([sys.executable, "-c", ACT_ALONE, last], check=True)
     adapter = make_trainable(DiffusionPolicy.from_pretrained(last), AdapterOptions())
     torch.manual_seed(0)
     shapes = {name: feature.shape for name, feature in adapter.config.input_features.items()}
@@ -179,7 +179,7 @@ def test_smolvla_learns_from_pixels_saves_resumes_and_is_a_lerobot_policy(clone,
         f"--output_dir={tmp_path / 'out'}",
     ]  # fmt: skip
     path = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True)
+    done = run_forked(command, env=os.environ | {"PYTHONPATH": path})
     assert done.returncode == 0, done.stderr[-3000:]
     info = json.loads((tmp_path / "out/eval_info.json").read_text())
     assert len(info["per_task"][0]["metrics"]["sum_rewards"]) == 1

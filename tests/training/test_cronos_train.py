@@ -3,12 +3,12 @@
 import json
 import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+from forked_commands import run_forked
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig
@@ -86,8 +86,7 @@ def test_strategy_and_order_of_the_docs(tmp_path):
         "--steps=48",
     ]  # fmt: skip
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-    script = str(Path(sys.executable).with_name(command[0]))
-    subprocess.run([script, *command[1:]], check=True, env=os.environ | {"PYTHONPATH": path})
+    run_forked(command, check=True, env=os.environ | {"PYTHONPATH": path})
     last = json.loads((output / "metrics.jsonl").read_text().splitlines()[-1])
     # Two streams of 24 steps: six segments, all failed, so that the fourth switch resets both.
     assert last["interventions_by_kind"]["scene_reset"] == 2
@@ -99,18 +98,18 @@ def test_agent_of_the_docs(tmp_path):
     """The example of docs/extending.md, word for word: it learns, and a resumed run is the unbroken one."""
     docs = (Path(__file__).parents[2] / "docs/extending.md").read_text()
     code = re.search(
-        r"```python\n(from dataclasses import dataclass\n\nimport numpy.*?register_agent.*?)```", docs, re.DOTALL
+        r"```python\n(from dataclasses import dataclass\n\nimport torch.*?register_agent.*?)```", docs, re.DOTALL
     )
     assert code is not None
+    assert len([line for line in code[1].splitlines() if line]) <= 40
     package = tmp_path / "my_agent"
     package.mkdir()
     (package / "__init__.py").write_text(code[1])
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-    script = str(Path(sys.executable).with_name("cronos-train"))
 
     def run(*flags):
-        command = [script, "--discover_packages_path=my_agent", *flags]
-        subprocess.run(command, check=True, env=os.environ | {"PYTHONPATH": path})
+        command = ["cronos-train", "--discover_packages_path=my_agent", *flags]
+        run_forked(command, check=True, env=os.environ | {"PYTHONPATH": path})
 
     small = [flag for flag in SMALL if not flag.startswith("--algorithm.")]
     # Every action is cloned: no task is complete so early.

@@ -1,10 +1,9 @@
 """A Diffusion policy from LeRobot's command to ours and back to LeRobot's."""
 
 import json
-import os
-import subprocess
 import sys
 
+from forked_commands import run_forked
 from lerobot_env_cronos import CronosEnvConfig
 from test_cronos_train import cronos_train
 
@@ -15,8 +14,7 @@ ENV = ("--env.type=cronos", "--env.obs_type=environment_state_agent_pos", "--env
 
 def lerobot(script, *flags):
     command = [sys.executable, "-m", f"lerobot.scripts.{script}", "--policy.device=cpu", *flags]
-    environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    done = run_forked(command)
     assert done.returncode == 0, done.stderr[-3000:]
 
 

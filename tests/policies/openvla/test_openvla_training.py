@@ -1,14 +1,13 @@
 """`lerobot-train`, `cronos-train` and `lerobot-eval` with a tiny OpenVLA, as a user would call them."""
 
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from forked_commands import run_forked
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot_env_cronos import CronosEnvConfig
@@ -60,8 +59,7 @@ def cloned(published, demonstrations, tmp_path_factory) -> Path:
         *("--policy.push_to_hub=false", "--num_workers=0", "--batch_size=4", "--steps=3", "--log_freq=1"),
         *("--save_checkpoint=true", "--wandb.enable=false", "--env_eval_freq=0"),
     ]
-    environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=180)
+    done = run_forked(command)
     assert done.returncode == 0, done.stderr[-4000:]
     assert "step:3" in done.stderr + done.stdout
     return output / "checkpoints" / "last" / "pretrained_model"

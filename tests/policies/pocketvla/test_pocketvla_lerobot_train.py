@@ -1,6 +1,5 @@
 """`lerobot-train` end to end, as a user would call it."""
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from forked_commands import run_forked
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot_policy_pocketvla import PocketVLAPolicy
@@ -21,8 +21,7 @@ def lerobot_train(dataset_root: Path, output: Path, *flags: str) -> subprocess.C
         *("--policy.push_to_hub=false", "--policy.device=cpu", "--num_workers=0", "--batch_size=4"),
         *("--save_checkpoint=true", "--wandb.enable=false", "--env_eval_freq=0", *flags),
     ]
-    environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    return run_forked(command)
 
 
 @pytest.fixture(scope="module")
