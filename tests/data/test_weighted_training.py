@@ -2,12 +2,12 @@
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from forked_commands import run_forked
 from weighted_streams import CHUNK, GAMMA, WEIGHTS, record_weighted
 
 from cronos_lerobot.data.stream_weights import Weighting, write_progress
@@ -31,16 +31,18 @@ def compute_and_note(self, batch):
     return weights, stats
 RABCWeights.compute_batch_weights = compute_and_note
 policies = {
-    "smolvla": [f"--policy.vlm_model_name={folder / 'vlm'}", f"--policy.chunk_size={chunk}",
-                f"--policy.n_action_steps={chunk}", "--policy.num_vlm_layers=2",
+    "smolvla": ["--policy.type=smolvla", f"--policy.vlm_model_name={folder / 'vlm'}", "--policy.num_vlm_layers=2",
+                f"--policy.chunk_size={chunk}", f"--policy.n_action_steps={chunk}",
                 "--policy.resize_imgs_with_padding=[32, 32]", "--policy.max_action_dim=7"],
-    "pocketvla": [],
-    "act": [f"--policy.chunk_size={chunk}", f"--policy.n_action_steps={chunk}",
+    "tokens": ["--policy.type=pocketvla"],
+    "flow": ["--policy.type=pocketvla", "--policy.head=flow", f"--policy.chunk_size={chunk}",
+             f"--policy.n_action_steps={chunk}"],
+    "act": ["--policy.type=act", f"--policy.chunk_size={chunk}", f"--policy.n_action_steps={chunk}",
             "--policy.pretrained_backbone_weights=null", "--policy.dim_model=16", "--policy.n_heads=2"],
 }
 for name, flags in policies.items():
     batches.append([])
-    sys.argv[1:] = [f"--policy.type={name}", f"--output_dir={folder / name}", *common, *flags]
+    sys.argv[1:] = [f"--output_dir={folder / name}", *common, *flags]
     refused = None
     try:
         main()
@@ -62,11 +64,10 @@ def results(tmp_path_factory) -> dict:
         *("--policy.push_to_hub=false", "--num_workers=0", "--batch_size=13", "--steps=2", "--wandb.enable=false"),
         *("--sample_weighting.type=rabc", f"--sample_weighting.progress_path={folder / 'progress.parquet'}"),
     ]
-    environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
     tests = Path(__file__).parents[1]
-    environment["PYTHONPATH"] = os.pathsep.join([str(tests), *filter(None, [os.environ.get("PYTHONPATH")])])
+    path = os.pathsep.join([str(tests), *filter(None, [os.environ.get("PYTHONPATH")])])
     command = [sys.executable, "-c", TRAIN, str(folder), str(CHUNK), *flags]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
+    done = run_forked(command, env=os.environ | {"PYTHONPATH": path})
     assert done.returncode == 0, done.stderr[-4000:]
     lines = [line.removeprefix("RESULT ") for line in done.stdout.splitlines() if line.startswith("RESULT ")]
     found = {name: (batches, refused) for name, batches, refused in map(json.loads, lines)}
@@ -74,8 +75,9 @@ def results(tmp_path_factory) -> dict:
     return found
 
 
-def test_smolvla_learns_with_the_weights_worked_out_by_hand(results):
-    batches, refused = results["smolvla"]
+@pytest.mark.parametrize("policy", ["smolvla", "flow"])
+def test_policies_with_chunks_learn_with_the_weights_worked_out_by_hand(results, policy):
+    batches, refused = results[policy]
     assert refused is None
     by_hand = np.concatenate(WEIGHTS)
     # Two batches of 13 are every frame of the stream once.
@@ -83,11 +85,11 @@ def test_smolvla_learns_with_the_weights_worked_out_by_hand(results):
     for indices, weights in batches:
         expected = by_hand[indices]
         np.testing.assert_allclose(weights, expected * 13 / expected.sum(), atol=1e-4)
-    assert (results["folder"] / "smolvla/checkpoints/last/pretrained_model/model.safetensors").is_file()
+    assert (results["folder"] / policy / "checkpoints/last/pretrained_model/model.safetensors").is_file()
 
 
 def test_a_policy_of_single_actions_looks_one_frame_ahead(results):
-    batches, refused = results["pocketvla"]
+    batches, refused = results["tokens"]
     assert refused is None
     weights = {index: weight for indices, found in batches for index, weight in zip(indices, found, strict=True)}
     assert len(weights) == 26

@@ -1,16 +1,16 @@
 """PocketVLA's flow head from demonstrations to an evaluation, by the commands."""
 
 import json
-import os
-import subprocess
 import sys
 
 import numpy as np
 import pytest
 import torch
+from forked_commands import run_forked
 from lerobot.policies import make_pre_post_processors
 from lerobot_env_cronos import CronosEnvConfig, SequentialVectorEnv, get_scene
 from lerobot_policy_pocketvla import PocketVLAFlowPolicy, PocketVLAPolicy
+from safetensors.torch import load_file
 from test_adapters import paid_for_moving  # noqa: F401
 from test_cronos_train import OBSERVATIONS, cronos_train
 from test_trainer import assert_same_run, metrics, weights
@@ -40,10 +40,7 @@ main()
 
 def lerobot(command, *flags):
     """One of LeRobot's commands, in a process that has the policy's and the scenes' packages, and not ours."""
-    done = subprocess.run(
-        [sys.executable, "-c", WITHOUT_US.format(command=command), *map(str, flags)],
-        env=os.environ | {"HF_HUB_OFFLINE": "1"}, capture_output=True, text=True,
-    )  # fmt: skip
+    done = run_forked([sys.executable, "-c", WITHOUT_US.format(command=command), *flags])
     assert done.returncode == 0, done.stderr[-3000:]
 
 
@@ -122,3 +119,36 @@ def test_a_frozen_encoder_is_asked_once_for_an_observation(tmp_path, monkeypatch
     assert [name for name in moved if name.startswith("head.")]
     assert [name for name in moved if name.startswith("actor.trunk.")]
     assert not [name for name in moved if name.startswith(("actor.encoder.", "actor.text."))]
+
+
+@pytest.mark.usefixtures("paid_for_moving")
+def test_lora_in_every_layer_as_lerobot_train_has_it(tmp_path, monkeypatch):
+    """Cloned by `lerobot-train --peft.*`, trained on from its adapters, and of a clone wrapped here."""
+    record_demos(
+        RecordDemosConfig(
+            env=CronosEnvConfig(**STATE), dataset=DemoDatasetConfig("me/demos", tmp_path / "demos", 2), num_envs=2
+        )
+    )
+    sizes = {"hidden_width": 16, "hidden_depth": 1, "flow_width": 16, "flow_depth": 1, "num_inference_steps": 3}
+    clone = save_policy(tmp_path / "clone", "pocketvla", STATE, head="flow", **sizes)
+    peft = ("--peft.r=2", "--peft.target_modules=all-linear")
+    lerobot(
+        "lerobot_train", f"--policy.path={clone}", "--policy.device=cpu", "--policy.push_to_hub=false", *peft,
+        "--dataset.repo_id=me/demos", f"--dataset.root={tmp_path / 'demos'}", "--batch_size=8", "--steps=2",
+        "--num_workers=0", f"--output_dir={tmp_path / 'adapted'}",
+    )  # fmt: skip
+    adapted = tmp_path / "adapted/checkpoints/last/pretrained_model"
+    for name, base, flags in (("on", adapted, ()), ("new", clone, peft)):
+        cronos_train(
+            monkeypatch, f"--policy.path={base}", "--policy.device=cpu", *OBSERVATIONS["state"], *TRAIN, *flags,
+            "--steps=40", f"--output_dir={tmp_path / name}",
+        )  # fmt: skip
+        updates = [line["agent"] for line in metrics(tmp_path / name) if line["kind"] == "update"]
+        assert all(update["policy_grad_norm"] > 0 and update["value_grad_norm"] > 0 for update in updates)
+        folders = [tmp_path / name / "checkpoints" / step / "pretrained_model" for step in ("000020", "last")]
+        before, after = (load_file(folder / "adapter_model.safetensors") for folder in folders)
+        moved = {name for name, tensor in after.items() if not torch.equal(tensor, before[name])}
+        assert all(".lora_" in name for name in after)
+        for part in (".head.", ".value_head.", ".critic."):
+            assert [name for name in moved if part in name], part
+        assert not (folders[1] / "model.safetensors").exists()
