@@ -6,6 +6,7 @@ is after `import lerobot...`. Each process of pytest has one, from when it first
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import json
 import os
@@ -63,6 +64,7 @@ def _server() -> subprocess.Popen[str]:
     )
     assert server.stdout is not None
     assert server.stdout.readline() == "ready\n"
+    atexit.register(server.communicate)
     return server
 
 
