@@ -161,7 +161,7 @@ def test_same_dataset_as_lerobots_own_writer(tmp_path, segments, video):
 
 KILLED_WRITER = """
 import os, signal, sys
-sys.path.insert(0, {tests!r})
+sys.path += {tests!r}
 from test_writer import LENGTHS, write
 from synthetic_segments import segment
 segments = [(segment(length, seed), f"task {{seed % 3}}") for seed, length in enumerate(LENGTHS)]
@@ -178,7 +178,9 @@ os.kill(os.getpid(), signal.SIGKILL)
 def killed(tmp_path_factory, video):
     """A dataset whose process was killed with segments written after the last flush."""
     root = tmp_path_factory.mktemp("killed") / "d"
-    script = KILLED_WRITER.format(tests=str(Path(__file__).parent), root=str(root), video=video)
+    script = KILLED_WRITER.format(
+        tests=[str(path) for path in Path(__file__).parents[:2]], root=str(root), video=video
+    )
     result = run_forked([sys.executable, "-c", script])
     assert result.returncode == -signal.SIGKILL, result.stderr
     return root
