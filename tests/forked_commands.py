@@ -16,6 +16,7 @@ import sys
 import tempfile
 import traceback
 import types
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.metadata import entry_points
@@ -115,6 +116,8 @@ def _serve() -> None:
     for module in PRELOADED:
         importlib.import_module(module)
     assert not [name for name in sys.modules if name.startswith(OURS)]
+    # The thread is PyArrow's allocator's, which is made for forks.
+    warnings.filterwarnings("ignore", ".*multi-threaded, use of fork", DeprecationWarning)
     print("ready", flush=True)
     for line in sys.stdin:
         request = json.loads(line)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -95,7 +95,7 @@ def _weigh(streams: Path, output: Path) -> Step:
     return Step("weigh", "What each frame of the stream is worth", [*command, f"--output={output}"], output)
 
 
-def _with(command: list[str], flags: dict[str, object]) -> list[str]:
+def _with(command: list[str], flags: Mapping[str, object]) -> list[str]:
     """A command with other values of some of its flags, or with more flags."""
     names = [part.split("=")[0] for part in command]
     changed = [
