@@ -53,7 +53,7 @@ def segment_batch(draws: Sequence[tuple[Segment, int]], config: PreTrainedConfig
 class Demonstrations:
     """A LeRobotDataset to draw frames from.
 
-    Of a policy that reads no pictures the columns lie in memory: a LeRobotDataset takes 3 ms to make a sample.
+    Of a policy that reads no pictures the columns lie in memory: a LeRobotDataset takes fifty times as long.
 
     Args:
         config: which one.
