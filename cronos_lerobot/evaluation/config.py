@@ -90,6 +90,11 @@ class CronosEvalConfig:
     same evaluation in it are kept."""
     rename_map: dict[str, str] = field(default_factory=dict)
     """Observations to rename for the policy, as in lerobot-eval."""
+    compare_with: Path | None = None
+    """Evaluation of another policy, its folder or results.json: compare with it, episode by episode."""
+    stop_at_error: float | None = None
+    """With --compare_with: stop each suite and split as soon as it is decided which of the two did better; the
+    probability of a decision between two that do alike, such as 0.05. Films nothing, writes comparison.json."""
     torch_threads: int | None = None
     """Threads of PyTorch on the CPU; null leaves PyTorch's default."""
     source: PolicySource | None = field(init=False, default=None)
@@ -105,6 +110,7 @@ class CronosEvalConfig:
             raise ValueError(f"cronos-eval evaluates --env.type=cronos, got {self.env.type!r}")
         if self.seed < 0:
             raise ValueError(f"seed must be at least 0, got {self.seed}")
+        self._check_comparison()
         given = {flag.split("=")[0] for flag in parser.get_cli_overrides("env") or []}
         for name, other in (("suite", "eval.suites"), ("split", "eval.splits"), ("task", "eval.orderings")):
             if f"--{name}" in given:
@@ -123,7 +129,17 @@ class CronosEvalConfig:
             raise ValueError(f"eval.n_episodes must be 1 to {most}, got {self.eval.n_episodes}")
         if self.output_dir is None:
             name = "expert" if self.policy is None else self.policy.type
+            name += "" if self.stop_at_error is None else "_compared"
             self.output_dir = Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_cronos_{name}"
+
+    def _check_comparison(self) -> None:
+        if self.stop_at_error is None:
+            return
+        if self.compare_with is None:
+            raise ValueError("--stop_at_error needs another policy's evaluation: --compare_with=<folder>")
+        if not 0 < self.stop_at_error < 1:
+            raise ValueError(f"stop_at_error must be between 0 and 1, got {self.stop_at_error}")
+        self.eval.videos = 0
 
     def _load_policy(self) -> None:
         path = parser.get_path_arg("policy")

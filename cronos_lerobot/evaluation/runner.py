@@ -56,6 +56,9 @@ class Evaluation:
             environments.
     """
 
+    file = RESULTS
+    """What came of it, in the output folder."""
+
     def __init__(self, config: CronosEvalConfig, make_actor: MakeActor | None = None) -> None:
         assert isinstance(config.env, CronosEnvConfig)
         assert config.output_dir is not None
@@ -63,12 +66,20 @@ class Evaluation:
         self.scene = get_scene(config.env.scene)
         self.benchmark = config.benchmark()
         self._make_actor = make_actor or self._configured_actor
-        self.parts = make_parts(
-            self.benchmark, config.suites, config.splits, config.num_configurations, config.num_orderings
-        )
-        self.store = ResultStore(config.output_dir, config.identity())
+        self.parts = self._make_parts()
+        self.store = ResultStore(config.output_dir, self._identity())
         self._maker = self._made_by()
         self._missing = [part for part in self.parts if not self._is_kept(part)]
+
+    def _make_parts(self) -> list[Part]:
+        config = self.config
+        return make_parts(
+            self.benchmark, config.suites, config.splits, config.num_configurations, config.num_orderings
+        )
+
+    def _identity(self) -> dict[str, Any]:
+        """Everything that decides what is in the folder."""
+        return self.config.identity()
 
     def run(self) -> dict[str, Any]:
         """Run the parts that are not there yet, write videos and results.json; returns the results.
@@ -85,12 +96,12 @@ class Evaluation:
         finally:
             self._close()
         results = self.results()
-        write_json(self.store.folder / RESULTS, results)
+        write_json(self.store.folder / self.file, results)
         if self.config.eval.videos:
             results["videos"] = film_best_and_worst(
                 self.store, self.parts, self.env_config, self.config.eval.videos
             )
-            write_json(self.store.folder / RESULTS, results)
+            write_json(self.store.folder / self.file, results)
         return results
 
     def _run(self, missing: Sequence[Part]) -> None:
@@ -257,7 +268,9 @@ class Evaluation:
         makers: dict[str, dict[str, Any]] = {}
         for part in self.parts:
             content = self.store.read(part.name)
-            assert content is not None
+            if content is None:
+                # Stopped before it.
+                continue
             maker = makers.setdefault(
                 json.dumps(content["made_by"], sort_keys=True), content["made_by"] | {"parts": []}
             )

@@ -10,6 +10,9 @@ examples:
       cronos-eval --policy.path=<checkpoint> --quick=true
   only chains, on held-out configurations, the next task as soon as one is complete
       cronos-eval --policy.path=<checkpoint> --eval.suites=sequential --eval.splits=held_out --advance=on_success
+  against another policy, only until it is decided which is better
+      cronos-eval --policy.path=<checkpoint> --eval.suites=independent --eval.splits=held_out \\
+          --compare_with=<output_dir of the other> --stop_at_error=0.05
   the ceiling
       cronos-eval --expert=true
 
@@ -27,9 +30,11 @@ from lerobot.utils.utils import init_logging
 from rich.console import Console
 
 from cronos_lerobot.evaluation.config import CronosEvalConfig
+from cronos_lerobot.evaluation.outcomes import read_outcomes
 from cronos_lerobot.evaluation.results import make_tables
 from cronos_lerobot.evaluation.runner import Evaluation
-from cronos_lerobot.evaluation.store import RESULTS
+from cronos_lerobot.evaluation.stopping import StoppingEvaluation, check_pairs, decision_text
+from cronos_lerobot.evaluation.store import COMPARISON, RESULTS
 from cronos_lerobot.locks import FolderInUseError
 from cronos_lerobot.scripts.errors import error_line, parse_command_line, stop
 
@@ -39,7 +44,12 @@ def evaluate(config: CronosEvalConfig) -> None:
     init_logging()
     with error_line():
         config.validate()
-        evaluation = Evaluation(config)
+        reference = None
+        if config.compare_with is not None:
+            reference = read_outcomes(config.compare_with)
+            check_pairs(reference, config)
+        stops = reference is not None and config.stop_at_error is not None
+        evaluation = StoppingEvaluation(config, reference) if stops else Evaluation(config)
     logging.getLogger("lerobot.configs.video").setLevel(logging.WARNING)
     if config.torch_threads is not None:
         torch.set_num_threads(config.torch_threads)
@@ -51,11 +61,23 @@ def evaluate(config: CronosEvalConfig) -> None:
         sys.exit(f"\ninterrupted: the same command with --output_dir={config.output_dir} goes on from here")
     except FolderInUseError as error:
         stop(error)
+    if stops:
+        print(decision_text(results))
+        print(f"{evaluation.store.folder / COMPARISON}: {results['seconds'] / 60:.1f} min")
+        return
     console = Console(width=None if sys.stdout.isatty() else 120)
     for table in make_tables(results):
         console.print(table)
     videos = f", {len(results['videos'])} videos" if results.get("videos") else ""
     print(f"{evaluation.store.folder / RESULTS}: {results['seconds'] / 60:.1f} min{videos}")
+    if reference is not None:
+        assert config.compare_with is not None
+        from cronos_lerobot.report.compared_sides import Side
+        from cronos_lerobot.report.paired_report import compare_sides, to_text
+
+        folder = evaluation.store.folder
+        sides = Side((config.compare_with,), [reference]), Side((folder,), [read_outcomes(folder)])
+        print(to_text(compare_sides(*sides, power=0.8), power=0.8))
 
 
 def main() -> None:

@@ -42,6 +42,9 @@ def test_every_task_from_every_configuration_and_not_a_step_more(num_envs):
     to_one, to_two = [7, 6, 5, 5, 4, 3], [12, 11, 10, 10, 9, 8]
     assert result["steps"] == sum(to_one) + sum(to_two) + 2 * 6 * 80
     assert policy.rows == env.moved == result["steps"]
+    assert result["episodes"] == [
+        [1000, task, configuration, int(task in (0, 2))] for task in range(4) for configuration in range(6)
+    ]
 
 
 def test_the_split_reaches_the_environment_and_only_configurations_that_are_asked_for():
@@ -67,6 +70,7 @@ def test_repetitions_are_as_many_episodes_with_random_numbers_of_their_own():
     draws = []
     result = evaluate(DummyEnv(4), Restless(), n_episodes=1, repetitions=3)
     assert (result["n"], {rate["n"] for rate in result["per_task"].values()}) == (12, {3})
+    assert [episode[0] for episode in result["episodes"]] == [1000] * 4 + [1001] * 4 + [1002] * 4
     # 80 decisions of all four tasks at once, three times over.
     assert len(draws) == 240
     assert len({tuple(draws[i : i + 80]) for i in (0, 80, 160)}) == 3
