@@ -1,7 +1,8 @@
-"""The repository of a benchmark: parquet files, a card with pictures, and `eval.yaml`."""
+"""The repository of a benchmark: parquet files, a card with pictures, `eval.yaml`, and `env.py`, which runs it."""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import datasets
@@ -16,12 +17,15 @@ from lerobot_env_cronos.benchmark.load import benchmark_scene
 from lerobot_env_cronos.config import DEFAULT_SCENE
 from lerobot_env_cronos.scene.scenes import BODIES, STEPS_PER_TASK
 
+from cronos_lerobot.hub import env_file
 from cronos_lerobot.hub.cards import render_card
 from cronos_lerobot.hub.config import BenchmarkConfig
 from cronos_lerobot.hub.pictures import configuration_pictures, configuration_sheet, task_sheet
 
 FRAMEWORK = "cronos-lerobot"
 """`evaluation_framework` of eval.yaml."""
+ENV_FILE = "env.py"
+"""What LeRobot's EnvHub runs."""
 REPLACES = [f"{config}/*" for config in CONFIGS] + ["pictures/*"]
 """What a new version of a benchmark removes of the old one."""
 
@@ -65,6 +69,7 @@ def write_benchmark_repository(config: BenchmarkConfig, folder: Path) -> str:
         (folder / "pictures" / "tasks.png").write_bytes(task_sheet(benchmark))
         (folder / "pictures" / "configurations.png").write_bytes(configuration_sheet(pictures))
     title = config.title or f"CRONOS {benchmark.scene.name}"
+    shutil.copyfile(env_file.__file__, folder / ENV_FILE)
     (folder / "eval.yaml").write_text(_eval_yaml(benchmark, title))
     (folder / "README.md").write_text(_card(benchmark, config, title))
     sizes = ", ".join(f"{benchmark.size(suite, 'held_out')} {suite}" for suite in SUITES)
@@ -119,6 +124,7 @@ def _card(benchmark: Benchmark, config: BenchmarkConfig, title: str) -> str:
         bodies=[BODIES[name] for name in scene.bodies],
         window_steps=STEPS_PER_TASK,
         has_pictures=config.pictures,
+        has_env_hub=config.env_hub,
         is_packaged=benchmark.fingerprint == load_benchmark(None, scene.name).fingerprint,
         column_prefix=scene.bodies[0].replace(" ", "_"),
         chain_length=len(benchmark.groups("sequential", "train")[0].tasks),

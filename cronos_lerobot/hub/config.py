@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import ClassVar
@@ -64,6 +64,11 @@ class PublishConfig:
         """The place on the Hub."""
         return Target(self.repo_id, self.repo_type, self.branch, self.revision, self.private)
 
+    @property
+    def targets(self) -> list[Target]:
+        """All places that are to hold the same files."""
+        return [self.target]
+
 
 @dataclass
 class BenchmarkConfig(PublishConfig):
@@ -86,8 +91,15 @@ class BenchmarkConfig(PublishConfig):
     """With --seed: tasks of a chain; null for all of the scene."""
     title: str = ""
     """Title of the card and the leaderboard; `CRONOS <scene>` by default."""
+    env_hub: bool = True
+    """Push the same files to the model repository of this name, too: there LeRobot's make_env looks for env.py."""
     pictures: bool = True
     """Pictures of the tasks and of every configuration; they need OpenGL."""
+
+    @property
+    def targets(self) -> list[Target]:
+        """The dataset, and the model repository of LeRobot's EnvHub."""
+        return [self.target, *([replace(self.target, repo_type="model")] if self.env_hub else [])]
 
 
 @dataclass

@@ -97,6 +97,24 @@ def push_folder(
     return target.url
 
 
+def check_holds(target: Target, file: str) -> None:
+    """Check that a repository is new, empty, or holds a file by which it is known to be what is pushed again.
+
+    Raises:
+        PublishError: it holds something else, which a push would overwrite, or the Hub refused.
+    """
+    api = HfApi()
+    with explained(target):
+        if not api.repo_exists(target.repo_id, repo_type=target.repo_type):
+            return
+        there = set(api.list_repo_files(target.repo_id, repo_type=target.repo_type)) - {".gitattributes"}
+    if there and file not in there:
+        raise PublishError(
+            f"{target.repo_type} {target.repo_id} holds something else ({', '.join(sorted(there)[:3])}, ...):"
+            " choose another --repo_id, or --env_hub=false"
+        )
+
+
 def _move_tag(api: HfApi, target: Target, tag: str) -> None:
     with suppress(RevisionNotFoundError):
         api.delete_tag(target.repo_id, repo_type=target.repo_type, tag=tag)

@@ -1,6 +1,7 @@
 """`cronos-publish`: benchmarks, streams, policies and results to the Hugging Face Hub.
 
-cronos-publish benchmark   configurations and chains of a scene, for `--env.benchmark` and `datasets.load_dataset`
+cronos-publish benchmark   configurations and chains of a scene, for `--env.benchmark`, `datasets.load_dataset` and
+                           LeRobot's `make_env`
 cronos-publish stream      recorded training streams, a LeRobotDataset
 cronos-publish policy      a policy with its training protocol, its interventions and its curves
 cronos-publish results     results of cronos-eval to a policy's repository, for the benchmark's leaderboard
@@ -31,15 +32,18 @@ from typing import Any
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from cronos_lerobot.hub.config import BenchmarkConfig, PolicyConfig, PublishConfig, ResultsConfig, StreamConfig
-from cronos_lerobot.hub.push import PublishError, push_folder
+from cronos_lerobot.hub.push import PublishError, check_holds, push_folder
 from cronos_lerobot.scripts.subcommands import run_subcommand
 
 
 def publish_benchmark(config: BenchmarkConfig) -> None:
     """`cronos-publish benchmark`."""
     config.validate()
-    from cronos_lerobot.hub.benchmark import REPLACES, write_benchmark_repository
+    from cronos_lerobot.hub.benchmark import ENV_FILE, REPLACES, write_benchmark_repository
 
+    if not config.dry_run:
+        for target in config.targets[1:]:
+            check_holds(target, ENV_FILE)
     _publish(config, write_benchmark_repository, replaces=REPLACES)
 
 
@@ -83,8 +87,8 @@ def _publish(
         return
     with tempfile.TemporaryDirectory(prefix="cronos_publish_") as folder:
         what = write(config, Path(folder))
-        url = push_folder(Path(folder), config.target, f"Publish {what}", **push)
-    print(f"published {what}\n{url}")
+        urls = [push_folder(Path(folder), target, f"Publish {what}", **push) for target in config.targets]
+    print("\n".join([f"published {what}", *urls]))
 
 
 COMMANDS: dict[str, tuple[type[PublishConfig], Callable[[Any], None]]] = {

@@ -1,0 +1,116 @@
+"""A benchmark on the Hub makes its own environments, by LeRobot's `make_env`."""
+
+import json
+
+import pytest
+
+SMALL = ("--scene=playroom_2x2", "--num_configurations=2", "--num_orderings=2", "--chain_length=2",
+         "--pictures=false")  # fmt: skip
+SAME = """
+import json
+from dataclasses import dataclass
+
+import numpy as np
+from lerobot.envs import make_env
+from lerobot.envs.configs import EnvConfig, HubEnvConfig
+from lerobot_env_cronos import CronosEnvConfig
+
+STATE = "environment_state_agent_pos"
+
+@EnvConfig.register_subclass("from_the_hub")
+@dataclass
+class FromTheHub(HubEnvConfig):
+    obs_type: str = STATE
+
+def starts(envs):
+    found = {}
+    for suite, some in envs.items():
+        for number, env in some.items():
+            observation, _ = env.reset(seed=[0, 1])
+            state = np.asarray(observation["environment_state"]).tolist()
+            found[f"{suite} {number}"] = [state, list(env.call("task_description"))]
+            env.close()
+    return found
+
+def of_the_data(name):
+    found = {}
+    for suite in ("independent", "sequential"):
+        for split in ("train", "held_out"):
+            config = CronosEnvConfig(benchmark=name, suite=suite, split=split, obs_type=STATE)
+            found |= starts(config.create_envs(2))
+    return found
+
+def of_the_hub(name):
+    return starts(make_env(FromTheHub(hub_path=name), n_envs=2, trust_remote_code=True))
+"""
+
+
+@pytest.fixture(scope="module")
+def commits(served, commands):
+    """Two benchmarks of one name, one after the other: commits of the dataset and of the model repository."""
+    found = []
+    for seed in (5, 6):
+        output = commands.run("cronos-publish", "benchmark", "--repo_id=me/bench", *SMALL, f"--seed={seed}")
+        assert f"{served.url}/datasets/me/bench\n{served.url}/me/bench\n" in output
+        found.append([served.repositories[kind, "me/bench"].branches["main"] for kind in ("datasets", "models")])
+    return found
+
+
+def test_it_gives_the_environments_of_the_repository_at_that_revision(commits, hub, commands):
+    (old_data, old), (data, _) = commits
+    assert hub.tree("models", "me/bench") == hub.tree("datasets", "me/bench")
+    commands.forget()
+    code = f"""{SAME}
+old, new = of_the_hub("me/bench@{old}"), of_the_hub("me/bench")
+are_same = old == of_the_data("me/bench@{old_data}"), new == of_the_data("me/bench@{data}"), old == new
+print(json.dumps([sorted(new), *are_same]))
+"""
+    names, old_is_old, new_is_new, is_same = json.loads(commands.run("python", code).splitlines()[-1])
+    assert names == sorted(
+        f"{suite}_{split} {number}"
+        for suite, numbers in (("independent", 4), ("sequential", 2))
+        for split in ("train", "held_out")
+        for number in range(numbers)
+    )
+    assert (old_is_old, new_is_new, is_same) == (True, True, False)
+
+
+def test_its_name_is_enough_but_for_trust(commits, hub, commands):
+    code = """
+from lerobot.envs import make_env
+envs = make_env("me/bench", n_envs=3, trust_remote_code=True)
+print([(suite, len(some)) for suite, some in sorted(envs.items())], envs["independent_train"][0].num_envs)
+"""
+    expected = "('independent_train', 4), ('sequential_held_out', 2), ('sequential_train', 2)] 3"
+    assert f"[('independent_held_out', 4), {expected}" in commands.run("python", code)
+    refused = commands.try_("python", code.replace(", trust_remote_code=True", ""))
+    assert refused.code == 1
+    assert "Refusing to execute remote code" in refused.output
+
+
+def test_without_the_plugin_a_sentence_says_what_to_install(commits, commands):
+    code = """
+import sys
+sys.modules["lerobot_env_cronos"] = None
+from lerobot.envs import make_env
+make_env("me/bench", trust_remote_code=True)
+"""
+    outcome = commands.try_("python", code)
+    assert outcome.code == 1
+    assert "need the package lerobot_env_cronos: `pip install ./envs/lerobot_env_cronos`" in outcome.output
+
+
+def test_a_model_of_the_same_name_is_not_overwritten(hub, commands):
+    commands.run("python", """
+from huggingface_hub import HfApi
+HfApi().create_repo("me/taken")
+HfApi().upload_file(path_or_fileobj=b"{}", path_in_repo="config.json", repo_id="me/taken")
+""")  # fmt: skip
+    publish = ("cronos-publish", "benchmark", "--repo_id=me/taken", *SMALL, "--seed=5")
+    outcome = commands.try_(*publish)
+    assert outcome.code == 1
+    assert "model me/taken holds something else (config.json, ...): choose another --repo_id" in outcome.output
+    assert ("datasets", "me/taken") not in hub.repositories
+    commands.run(*publish, "--env_hub=false")
+    assert "env.py" in hub.tree("datasets", "me/taken")
+    assert set(hub.tree("models", "me/taken")) == {"config.json"}
