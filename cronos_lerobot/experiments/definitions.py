@@ -1,10 +1,13 @@
-"""The paper's experiments as data: which runs make up each table and figure (Sections 6, B and G)."""
+"""Experiments as data, and the paper's: which runs make up each table and figure (Sections 6, B and G)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 INTERACTION_STEPS, INTERVENTIONS = "interaction_steps", "interventions"
+
+NARROW = "narrow"
+"""The base policy whose demonstrations begin in the scene's 64 training configurations, as the paper's do."""
 
 CURRICULUM_INTERVAL = 320
 """T of the paper's curriculum up to half of S: 0.65 M of 1.3 M interaction steps (Table 1, Section 6.3)."""
@@ -18,8 +21,8 @@ Sections 6.5 and 6.7."""
 class Row:
     """One way of training: a row of the table, a line of the figure."""
 
-    interval: int
-    """T: control steps of one stream between two scene resets."""
+    interval: int | None
+    """T: control steps of one stream between two scene resets; None: there are no periodic ones."""
     end_effector_reset: bool = False
     """EER: the arm goes home at every task switch."""
     curriculum: bool = False
@@ -36,28 +39,38 @@ class Row:
     """What else tells the row from the others, one word; needed with `flags`."""
     flags: tuple[str, ...] = ()
     """More flags of `cronos-train`."""
+    budgets: tuple[tuple[str, int], ...] = ()
+    """More flags whose values are numbers of interventions in a run of the paper's steps: scaled as the steps."""
+    base: str = NARROW
+    """Which base policy it begins with, by its demonstrations; see `scales.BASE_KINDS`."""
 
     @property
     def name(self) -> str:
         """How `--rows` and the run's folder call it, such as `t1280_eer_cl_hsr`."""
-        words = [f"t{self.interval}", *(word.lower() for word in self.aids)]
+        words = [f"t{self.interval}" if self.interval else "tnone", *(word.lower() for word in self.aids)]
         if self.task_order != "heuristic":
             words.append(self.task_order)
         if self.num_configurations != 64:
             words.append(f"{self.num_configurations}config")
         words += [self.tag] if self.tag else []
+        words += [self.base] if self.base != NARROW else []
         return "_".join(words)
 
     @property
     def label(self) -> str:
         """How figures call it, such as `T = 1280, EER, CL, HSR`."""
-        words = [f"T = {self.interval}", *self.aids]
+        words = [f"T = {self.interval}" if self.interval else "no T", *self.aids]
         if self.task_order != "heuristic":
             words.append(f"{self.task_order} order")
         if self.num_configurations != 64:
             words.append(f"{self.num_configurations} configuration{'s' * (self.num_configurations > 1)}")
-        words += [self.tag] if self.tag else []
+        words += [self.tag.replace("_", " + ")] if self.tag else []
+        words += [f"{self.base.replace('_', ' ')} base"] if self.base != NARROW else []
         return ", ".join(words)
+
+    def begins_with(self, scene: str) -> Base:
+        """The base policy of its runs in a scene."""
+        return Base(scene, self.num_configurations, self.base)
 
     @property
     def aids(self) -> list[str]:
@@ -69,6 +82,22 @@ class Row:
             "HSR": self.heuristic_reset,
         }
         return [name for name, ticked in ticks.items() if ticked]
+
+
+@dataclass(frozen=True)
+class Base:
+    """Which base policy runs begin with."""
+
+    scene: str
+    configurations: int = 64
+    """Rows that train on fewer have one that is cloned from those."""
+    kind: str = NARROW
+    """See `scales.BASE_KINDS`."""
+
+    @property
+    def recipe(self) -> str:
+        """Name of its recipe in `Options.recipes`."""
+        return self.scene if self.kind == NARROW else f"{self.scene}_{self.kind}"
 
 
 @dataclass(frozen=True)
@@ -85,7 +114,7 @@ class CheckpointEvaluation:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A table or figure of the paper."""
+    """A table or figure of the paper, or one's own."""
 
     name: str
     title: str
@@ -104,6 +133,11 @@ class Experiment:
     evaluations: tuple[CheckpointEvaluation, ...] = ()
     budgets: tuple[int, ...] = (1000, 2000, 4000, 8000)
     """Numbers of interventions, of a run with the paper's steps, at which success is given."""
+    by_base: bool = False
+    """Its first figure has success against interventions on a logarithmic axis, a line of panels for each kind of
+    base policy."""
+    joined: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    """Of that figure: what a line joins the ends of, as its label and the names of its rows."""
 
 
 EPISODIC = Row(80)

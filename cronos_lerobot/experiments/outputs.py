@@ -10,6 +10,7 @@ from typing import Any
 
 from cronos_lerobot.experiments import plots, tables
 from cronos_lerobot.experiments.definitions import Experiment, Row
+from cronos_lerobot.experiments.intervention_plots import interventions_figure
 from cronos_lerobot.experiments.jobs import this_commit
 from cronos_lerobot.experiments.results import (
     APART,
@@ -45,8 +46,9 @@ def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options,
     for file, table in data.items():
         if table:
             write_csv(folder / f"{file}.csv", table)
+    first = interventions_figure if experiment.by_base else plots.curves_figure
     drawings = {
-        name: plots.curves_figure(result),
+        name: first(result),
         f"{name}_bars": plots.bars_figure(result),
         f"{name}_segments": plots.segments_figure(result),
         f"{name}_sequential": plots.sequential_figure(result),
@@ -68,6 +70,7 @@ def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options,
 
 def _settings(result: ExperimentResult) -> dict[str, Any]:
     options, experiment = result.options, result.experiment
+    bases = [row.row.begins_with(experiment.scene) for row in result.rows]
     return {
         "experiment": experiment.name,
         "title": experiment.title,
@@ -79,7 +82,7 @@ def _settings(result: ExperimentResult) -> dict[str, Any]:
         "paper_steps": experiment.steps,
         "seeds": list(options.seeds),
         "temperature": options.temperature,
-        "base_policy": base_policy(experiment.scene, options),
+        "base_policies": list(dict.fromkeys(base_policy(base, options) for base in bases)),
         "extra_flags": list(options.extra),
         "runs": [
             {"run": seed.spec.name, "finished": seed.finished, "metrics": str(seed.spec.train_folder / METRICS)}
@@ -158,13 +161,14 @@ Columns = dict[str, list[str]]
 
 def _main_columns(result: ExperimentResult) -> Columns:
     rows = tables.main_rows(result)
-    columns: Columns = {"T": [str(row["T"]) for row in rows]}
+    columns: Columns = {"T": [str(row["T"] or MISSING) for row in rows]}
     for aid in ("EER", "CL", "LSR", "HSR"):
         if any(row[aid] for row in rows):
             columns[aid] = [tables.TICK[row[aid]] for row in rows]
-    for name, title in (("task_order", "order"), ("configurations", "configurations")):
+    titles = (("base", "demonstrations"), ("task_order", "order"), ("configurations", "configurations"))
+    for name, title in titles:
         if len({row[name] for row in rows}) > 1:
-            columns[title] = [str(row[name]) for row in rows]
+            columns[title] = [str(row[name]).replace("_", " ") for row in rows]
     if any(row.row.tag for row in result.rows):
         columns["row"] = [row.row.tag or MISSING for row in result.rows]
     for split in result.experiment.splits:

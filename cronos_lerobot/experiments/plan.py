@@ -13,6 +13,7 @@ from lerobot_env_cronos import gymnasium_id
 
 from cronos_lerobot.experiments.definitions import (
     CURRICULUM_INTERVAL,
+    Base,
     CheckpointEvaluation,
     Experiment,
     Row,
@@ -30,8 +31,6 @@ from cronos_lerobot.experiments.specs import (
     run_specs,
 )
 
-DIVERSE_DEMO_FLAGS = ("--noise.share=0.75", "--misses.share=0.25", "--steps_after_release=8")
-"""Noise and misses show how to recover, the frames after the release that a finished task is left alone."""
 PLUGIN_FLAG = "discover_packages_path"
 """Of LeRobot's commands: imports a module that registers policies or environments."""
 LAST_POLICY = Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR)
@@ -42,27 +41,25 @@ def make_jobs(experiments: Iterable[tuple[Experiment, tuple[Row, ...]]], options
     jobs: dict[str, Job] = {}
     for experiment, rows in experiments:
         for spec in run_specs(experiment, options, rows):
-            configurations = spec.row.num_configurations
-            base = [] if options.policy_path else base_jobs(experiment.scene, options, configurations)
+            base = [] if options.policy_path else base_jobs(spec.base, options)
             jobs |= {job.name: job for job in base}
             train = train_job(spec, base[-1].name if base else None)
             jobs |= {train.name: train}
             for evaluation in experiment.evaluations:
-                base_evaluations = base_evaluation_jobs(experiment.scene, options, evaluation, configurations)
-                jobs |= {job.name: job for job in base_evaluations}
+                jobs |= {job.name: job for job in base_evaluation_jobs(spec.base, options, evaluation)}
                 jobs |= {job.name: job for job in evaluation_jobs(spec, evaluation)}
     return list(jobs.values())
 
 
-def base_jobs(scene: str, options: Options, configurations: int = 64) -> list[Job]:
-    """Demonstrations of the expert in the first `configurations`, and their cloning: two jobs."""
-    folder, recipe = base_folder(scene, options, configurations), options.recipes[scene]
+def base_jobs(base: Base, options: Options) -> list[Job]:
+    """Demonstrations of the expert, and their cloning: two jobs."""
+    folder, recipe, scene = base_folder(base, options), options.recipes[base.recipe], base.scene
     pixels = OBS_NAMES[options.obs_type] == "pixels"
     dataset = (f"--dataset.repo_id=local/{folder.name}", f"--dataset.root={folder / 'demos'}")
     record = ["cronos-record-demos", "--env.type=cronos", f"--env.scene={scene}", *dataset]
     record += [f"--env.obs_type={options.obs_type}", f"--dataset.num_episodes={recipe.demos}", "--seed=1"]
-    record += [] if recipe.clean else DIVERSE_DEMO_FLAGS
-    record += [] if configurations == 64 else [f"--start.num_configurations={configurations}"]
+    record += recipe.demo_flags
+    record += [] if base.configurations == 64 else [f"--start.num_configurations={base.configurations}"]
     clone = ["lerobot-train", "--policy.type=pocketvla", "--policy.device=cpu", "--policy.push_to_hub=false"]
     clone += [*dataset, f"--batch_size={recipe.clone_batch}", f"--steps={recipe.clone_steps}"]
     clone += [f"--save_freq={recipe.save_freq}", "--log_freq=40", "--wandb.enable=false", "--seed=1"]
@@ -88,7 +85,7 @@ def train_flags(spec: RunSpec) -> list[str]:
         f"--steps={scale.steps[spec.paper_steps]}",
         f"--num_envs={scale.num_envs}",
         f"--protocol.update_interval={UPDATE_INTERVAL}",
-        f"--protocol.scene_reset_interval={row.interval}",
+        f"--protocol.scene_reset_interval={row.interval or 'null'}",
         f"--protocol.end_effector_reset={str(row.end_effector_reset).lower()}",
         f"--protocol.task_order={row.task_order}",
     ]
@@ -111,7 +108,7 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
     repetitions = options.scale.eval_episodes // episodes if options.temperature else 1
     command = [
         "cronos-train",
-        f"--policy.path={base_policy(spec.scene, options, spec.row.num_configurations)}",
+        f"--policy.path={base_policy(spec.base, options)}",
         *ALGORITHM_FLAGS[options.obs_type],
         "--env.type=cronos",
         f"--env.scene={spec.scene}",
@@ -128,7 +125,9 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
         "--tensorboard=false",
         f"--output_dir={spec.train_folder}",
     ]
-    command = _with_flags(command, spec.row.flags, options.extra)
+    # A smoke run's share of a budget may be none, which is no budget.
+    budgets = [f"{flag}={max(1, spec.scaled(number))}" for flag, number in spec.row.budgets]
+    command = _with_flags(command, spec.row.flags, budgets, options.extra)
 
     def resume() -> list[str] | None:
         config = spec.train_folder / LAST_POLICY / TRAIN_CONFIG_NAME
@@ -182,19 +181,17 @@ def checkpoint_evaluations(spec: RunSpec, evaluation: CheckpointEvaluation) -> l
     return jobs
 
 
-def base_evaluation_jobs(
-    scene: str, options: Options, evaluation: CheckpointEvaluation, configurations: int = 64
-) -> list[Job]:
+def base_evaluation_jobs(base: Base, options: Options, evaluation: CheckpointEvaluation) -> list[Job]:
     """`cronos-eval` of the base policy, where curves begin."""
     if not evaluation.every_checkpoint:
         return []
-    jobs, needed = [], None if options.policy_path else base_jobs(scene, options, configurations)[-1].name
+    jobs, needed = [], None if options.policy_path else base_jobs(base, options)[-1].name
     for split in evaluation.splits:
-        folder = base_evaluation_folder(scene, evaluation.suite, split, options, configurations)
-        policy = base_policy(scene, options, configurations)
-        command = eval_command(policy, scene, evaluation.suite, split, folder, options)
+        folder = base_evaluation_folder(base, evaluation.suite, split, options)
+        policy = base_policy(base, options)
+        command = eval_command(policy, base.scene, evaluation.suite, split, folder, options)
         command = _with_flags(command, _env_flags(options.extra))
-        jobs.append(_eval_job(f"base/{folder.parent.name}/{folder.name}", command, folder, needed, scene))
+        jobs.append(_eval_job(f"base/{folder.parent.name}/{folder.name}", command, folder, needed, base.scene))
     return jobs
 
 

@@ -71,7 +71,7 @@ def _grid(result: ExperimentResult, panels: list[list[Panel]]) -> Figure | None:
         line_axes[0].set_ylabel(f"success, {SPLIT_LABELS[split]}" if task else "success")
     if not any(ax.lines for ax in axes.flat):
         return None
-    _legend_below(figure, list(axes.flat))
+    legend_below(figure, list(axes.flat))
     return figure
 
 
@@ -89,7 +89,8 @@ def _spread_interventions(ax: Axes) -> None:
     ax.set_xlabel(f"{ax.get_xlabel()} (log scale)")
 
 
-def _legend_below(figure: Figure, axes: list[Axes]) -> None:
+def legend_below(figure: Figure, axes: list[Axes]) -> None:
+    """One legend for all axes, below them, each entry once."""
     entries: dict[str, Artist] = {}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
@@ -143,7 +144,7 @@ def segments_figure(result: ExperimentResult) -> Figure | None:
     ax.set(ylabel="success while training", ylim=(0, 1.02))
     if not ax.lines:
         return None
-    _legend_below(figure, [ax])
+    legend_below(figure, [ax])
     return figure
 
 
@@ -163,7 +164,7 @@ def sequential_figure(result: ExperimentResult) -> Figure | None:
         _sequential_panel(ax, rows)
         ax.set_title(SPLIT_LABELS[split], fontsize=9, color=INK, loc="left")
     axes[0].set_ylabel("success")
-    _legend_below(figure, list(axes))
+    legend_below(figure, list(axes))
     return figure
 
 

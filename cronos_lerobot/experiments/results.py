@@ -210,7 +210,7 @@ def _read_seed(spec: RunSpec, result: ExperimentResult) -> SeedResult | None:
         return None
     result.commits += [f"{spec.name}: {commit}" for commit in other_commits(job)]
     for evaluation in result.experiment.evaluations:
-        for job in base_evaluation_jobs(spec.scene, spec.options, evaluation, spec.row.num_configurations):
+        for job in base_evaluation_jobs(spec.base, spec.options, evaluation):
             _read_evaluation(job, 0, evaluation, seed, result)
         for job, checkpoint in checkpoint_evaluations(spec, evaluation):
             _read_evaluation(job, checkpoint, evaluation, seed, result)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from cronos_lerobot.experiments.definitions import LONG, SHORT
+from cronos_lerobot.experiments.definitions import LONG, NARROW, SHORT
 
 STATE, PIXELS = "environment_state_agent_pos", "pixels_agent_pos"
 OBS_NAMES = {STATE: "state", PIXELS: "pixels"}
@@ -47,6 +47,25 @@ SCALES: dict[str, Scale] = {
 }
 
 
+DIVERSE_DEMO_FLAGS = ("--noise.share=0.75", "--misses.share=0.25", "--steps_after_release=8")
+"""Noise and misses show how to recover, the frames after the release that a finished task is left alone."""
+WIDE, WIDE_RESETS = "wide", "wide_resets"
+_WIDE_FLAGS = (
+    "--start.layouts=reach",
+    "--start.arm_pose=after_task",
+    "--start.occupied_receptacles=true",
+    "--start.share=0.3",
+)
+BASE_KINDS: dict[str, tuple[str, ...]] = {
+    NARROW: (),
+    WIDE: _WIDE_FLAGS,
+    WIDE_RESETS: (*_WIDE_FLAGS, "--reset_tasks=true"),
+}
+"""Kinds of base policies by where their demonstrations begin, as flags of `cronos-record-demos`: in the training
+configurations; wherever the arm can do the tasks, three in ten where another task left arm and bodies; the same
+with reset tasks among them."""
+
+
 @dataclass(frozen=True)
 class BaseRecipe:
     """How the base policy is made; PPO learns from one that succeeds in .3 to .6 of the evaluation."""
@@ -62,11 +81,24 @@ class BaseRecipe:
     clean: bool = False
     """Whether the demonstrations have no noise, no missed grasps and no frames after the release: the arm always
     comes from home, which is the bias of the paper's base policy (Section 5)."""
+    kind: str = NARROW
+    """Where the demonstrations begin: one of `BASE_KINDS`."""
 
     def __post_init__(self) -> None:
         valid = [*range(self.save_freq, self.clone_steps, self.save_freq), self.clone_steps]
         if self.checkpoint not in valid:
             raise ValueError(f"base.checkpoint must be one of {valid}, got {self.checkpoint}")
+
+    @property
+    def demo_flags(self) -> tuple[str, ...]:
+        """Flags of `cronos-record-demos`."""
+        return BASE_KINDS[self.kind] + (() if self.clean else DIVERSE_DEMO_FLAGS)
+
+    @property
+    def made(self) -> str:
+        """What its folder is called after."""
+        words = ("" if self.kind == NARROW else self.kind, "clean" if self.clean else "", "demos")
+        return f"{self.demos}{''.join(words)}_{self.clone_steps}steps"
 
     @property
     def save_freq(self) -> int:
@@ -88,6 +120,13 @@ CLEAN_RECIPES: dict[tuple[str, str], BaseRecipe] = {
     ("kitchen_2x2", STATE): BaseRecipe(400, 640, checkpoint=480, clean=True),
 }
 """The same from clean demonstrations, where that is measured."""
+WIDE_RECIPES: dict[tuple[str, str], BaseRecipe] = {
+    ("kitchen_2x2", STATE): BaseRecipe(400, 640, checkpoint=480, kind=WIDE),
+    ("playroom_2x2", STATE): BaseRecipe(400, 960, checkpoint=720, kind=WIDE),
+    ("kitchen_3x3", STATE): BaseRecipe(900, 1080, checkpoint=1080, kind=WIDE),
+    ("kitchen_2x2", PIXELS): BaseRecipe(800, 2400, checkpoint=2400, kind=WIDE),
+}
+"""The same over the whole reach, with as many demonstrations."""
 SMOKE_RECIPE = BaseRecipe(8, 5, checkpoint=5, clone_batch=32)
 
 ALGORITHM_FLAGS = {
@@ -97,19 +136,20 @@ ALGORITHM_FLAGS = {
 """Flags of `cronos-train` that learn from each kind of observation."""
 
 
-def base_recipe(scale: Scale, scene: str, obs_type: str, *, clean: bool = False) -> BaseRecipe:
-    """The recipe of a scene's base policy, on request from clean demonstrations.
+def base_recipe(scale: Scale, scene: str, obs_type: str, *, clean: bool = False, kind: str = NARROW) -> BaseRecipe:
+    """The recipe of a scene's base policy of a kind, the narrow one on request from clean demonstrations.
 
     Raises:
         ValueError: there is none; one can be given with --policy.path.
     """
+    clean = clean and kind == NARROW
     if scale.smoke:
-        return replace(SMOKE_RECIPE, clean=clean)
-    recipes = CLEAN_RECIPES if clean else BASE_RECIPES
+        return replace(SMOKE_RECIPE, clean=clean, kind=kind)
+    recipes = WIDE_RECIPES if kind != NARROW else CLEAN_RECIPES if clean else BASE_RECIPES
     if (scene, obs_type) not in recipes:
         known = ", ".join(f"{s}/{OBS_NAMES[o]}" for s, o in recipes)
-        kind = "clean base policy" if clean else "base policy"
+        name = "clean base policy" if clean else "base policy" if kind == NARROW else f"{kind} base policy"
         raise ValueError(
-            f"no recipe for a {kind} of {scene}/{OBS_NAMES[obs_type]}; there are {known}: use --policy.path"
+            f"no recipe for a {name} of {scene}/{OBS_NAMES[obs_type]}; there are {known}: use --policy.path"
         )
-    return recipes[scene, obs_type]
+    return replace(recipes[scene, obs_type], kind=kind)

@@ -10,7 +10,7 @@ from pathlib import Path
 from lerobot.common.train_utils import get_step_identifier
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 
-from cronos_lerobot.experiments.definitions import PAPER_BUDGETS, Experiment, Row
+from cronos_lerobot.experiments.definitions import PAPER_BUDGETS, Base, Experiment, Row
 from cronos_lerobot.experiments.scales import OBS_NAMES, BaseRecipe, Scale
 
 UPDATE_INTERVAL = 160
@@ -35,7 +35,7 @@ class Options:
     extra: tuple[str, ...] = ()
     """More flags of `cronos-train`."""
     recipes: dict[str, BaseRecipe] = field(default_factory=dict)
-    """How to make the base policy of each scene."""
+    """How to make the base policies, by `Base.recipe`."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,17 @@ class RunSpec:
     @property
     def budgets(self) -> list[int]:
         """Numbers of interventions at which the run is evaluated: those of the tables, scaled as the steps."""
-        steps = self.options.scale.steps[self.paper_steps]
-        wanted = (budget * steps // self.paper_steps for budget in PAPER_BUDGETS.get(self.paper_steps, ()))
+        wanted = map(self.scaled, PAPER_BUDGETS.get(self.paper_steps, ()))
         return sorted({budget for budget in wanted if budget})
+
+    def scaled(self, interventions: int) -> int:
+        """A number of interventions in a run of the paper's steps, in this one."""
+        return interventions * self.options.scale.steps[self.paper_steps] // self.paper_steps
+
+    @property
+    def base(self) -> Base:
+        """What it begins with."""
+        return self.row.begins_with(self.scene)
 
     @property
     def group(self) -> str:
@@ -118,34 +126,30 @@ def run_specs(experiment: Experiment, options: Options, rows: Iterable[Row] | No
     ]
 
 
-def base_folder(scene: str, options: Options, configurations: int = 64) -> Path:
-    """Folder of the demonstrations and the clone that all experiments of a scene share.
-
-    Rows that train on fewer `configurations` have one that is cloned from those.
+def base_folder(base: Base, options: Options) -> Path:
+    """Folder of the demonstrations and the clone that all experiments share.
 
     The recipe is part of its name, and so of the runs' commands: another recipe makes other runs.
     """
-    recipe = options.recipes[scene]
-    made = f"{recipe.demos}{'clean' if recipe.clean else ''}demos_{recipe.clone_steps}steps"
-    own = "" if configurations == 64 else f"_{configurations}config"
-    return options.root / "base" / f"{scene}_{OBS_NAMES[options.obs_type]}_{made}{own}"
+    own = "" if base.configurations == 64 else f"_{base.configurations}config"
+    made = options.recipes[base.recipe].made
+    return options.root / "base" / f"{base.scene}_{OBS_NAMES[options.obs_type]}_{made}{own}"
 
 
-def base_policy(scene: str, options: Options, configurations: int = 64) -> str:
-    """Path of the policy that the runs of a scene begin with."""
+def base_policy(base: Base, options: Options) -> str:
+    """Path of the policy that runs begin with."""
     if options.policy_path:
         return options.policy_path
-    recipe = options.recipes[scene]
+    recipe = options.recipes[base.recipe]
     checkpoint = get_step_identifier(recipe.checkpoint, recipe.clone_steps)
-    folder = base_folder(scene, options, configurations)
-    return str(folder / "clone" / CHECKPOINTS_DIR / checkpoint / PRETRAINED_MODEL_DIR)
+    return str(base_folder(base, options) / "clone" / CHECKPOINTS_DIR / checkpoint / PRETRAINED_MODEL_DIR)
 
 
-def base_evaluation_folder(scene: str, suite: str, split: str, options: Options, configurations: int = 64) -> Path:
+def base_evaluation_folder(base: Base, suite: str, split: str, options: Options) -> Path:
     """`--output_dir` of an evaluation of the base policy."""
     if options.policy_path:
         given = hashlib.sha256(options.policy_path.encode()).hexdigest()[:8]
-        folder = options.root / "base" / f"{scene}_{OBS_NAMES[options.obs_type]}_{given}"
+        folder = options.root / "base" / f"{base.scene}_{OBS_NAMES[options.obs_type]}_{given}"
     else:
-        folder = base_folder(scene, options, configurations)
+        folder = base_folder(base, options)
     return folder / f"{suite}_{split}{'_smoke' if options.scale.smoke else ''}"

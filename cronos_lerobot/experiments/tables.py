@@ -44,6 +44,7 @@ def _main_row(result: ExperimentResult, row: RowResult, shared: float | None) ->
         "CL": setting.curriculum,
         "LSR": setting.learned_reset,
         "HSR": setting.heuristic_reset,
+        "base": setting.base,
         "task_order": setting.task_order,
         "configurations": setting.num_configurations,
         "seeds": len(row.finished),

@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cronos_lerobot.experiments.definitions import EXPERIMENTS, Experiment, Row, find_rows
+from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base, Experiment, Row, find_rows
 from cronos_lerobot.experiments.display import make_display
 from cronos_lerobot.experiments.jobs import RUNNING, Job, changes, is_done, other_commits, status
 from cronos_lerobot.experiments.runner import DONE, Runner
@@ -159,8 +159,8 @@ def parse_seeds(text: str | None, default: int) -> tuple[int, ...]:
     return found
 
 
-def make_options(args: argparse.Namespace, extra: list[str], scenes: Iterable[str]) -> Options:
-    """What the flags decide about every run; `scenes` are those that need a base policy.
+def make_options(args: argparse.Namespace, extra: list[str], bases: Iterable[Base]) -> Options:
+    """What the flags decide about every run; `bases` are the policies that runs begin with.
 
     Raises:
         ValueError: a flag makes no sense.
@@ -177,9 +177,18 @@ def make_options(args: argparse.Namespace, extra: list[str], scenes: Iterable[st
     }
     if "clone_steps" in changes:
         changes.setdefault("checkpoint", changes["clone_steps"])
-    needed = () if args.policy_path else scenes
-    made = {scene: base_recipe(scale, scene, obs_type, clean=args.base_clean) for scene in needed}
-    recipes = {scene: replace(recipe, **changes) for scene, recipe in made.items()}
+    bases = list(bases)
+    if args.policy_path and len(kinds := sorted({base.kind for base in bases})) > 1:
+        raise ValueError(
+            f"--policy.path is one base policy, and these rows begin with {len(kinds)} kinds ({', '.join(kinds)}):"
+            " choose with --rows"
+        )
+    needed = () if args.policy_path else bases
+    made = {
+        base.recipe: base_recipe(scale, base.scene, obs_type, clean=args.base_clean, kind=base.kind)
+        for base in needed
+    }
+    recipes = {name: replace(recipe, **changes) for name, recipe in made.items()}
     seeds = parse_seeds(args.seeds, scale.seeds)
     from cronos_lerobot.experiments.specs import Options
 
@@ -196,6 +205,10 @@ def make_options(args: argparse.Namespace, extra: list[str], scenes: Iterable[st
     )
 
 
+PACED = "--protocol.scene_reset=critic"
+"""With it a budget is paced over the whole run and does not end it."""
+
+
 def check_budget(chosen: list[tuple[Experiment, tuple[Row, ...]]], options: Options) -> None:
     """Refuse a reset budget where checkpoints are evaluated that it may keep a run from.
 
@@ -203,7 +216,7 @@ def check_budget(chosen: list[tuple[Experiment, tuple[Row, ...]]], options: Opti
         ValueError: there is one.
     """
     for experiment, rows in chosen:
-        flags = [*options.extra, *(flag for row in rows for flag in row.flags)]
+        flags = [*options.extra, *(flag for row in rows if PACED not in row.flags for flag in row.flags)]
         if experiment.evaluations and any(flag.startswith("--protocol.reset_budget") for flag in flags):
             raise ValueError(
                 f"--protocol.reset_budget ends runs early, and {experiment.name} evaluates their checkpoints at"
@@ -216,8 +229,9 @@ def print_list() -> None:
     for experiment in EXPERIMENTS.values():
         print(f"{experiment.name}: {experiment.title}{f' ({experiment.source})' if experiment.source else ''}")
         print(f"    {experiment.scene}, {experiment.steps:,} steps at --scale=paper")
+        width = max(24, *(len(row.name) for row in experiment.rows))
         for row in experiment.rows:
-            print(f"    {row.name:<24} {row.label}")
+            print(f"    {row.name:<{width}} {row.label}")
 
 
 def print_plan(jobs: list[Job]) -> None:
@@ -268,12 +282,14 @@ def main() -> None:
     if args.experiment == "list":
         print_list()
         return
-    names = list(EXPERIMENTS) if args.experiment == "all" else [args.experiment]
+    of_the_paper = [name for name, experiment in EXPERIMENTS.items() if experiment.source]
+    names = of_the_paper if args.experiment == "all" else [args.experiment]
     if args.experiment == "all" and (args.output_dir or args.rows):
         parser.error("--output_dir and --rows are for one experiment, not for all")
     try:
         chosen = [(EXPERIMENTS[name], find_rows(EXPERIMENTS[name], args.rows)) for name in names]
-        options = make_options(args, sys.argv[split + 1 :], {experiment.scene for experiment, _ in chosen})
+        bases = dict.fromkeys(row.begins_with(experiment.scene) for experiment, rows in chosen for row in rows)
+        options = make_options(args, sys.argv[split + 1 :], bases)
         check_budget(chosen, options)
     except ValueError as error:
         sys.exit(f"error: {error}")

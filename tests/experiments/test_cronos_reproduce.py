@@ -9,6 +9,7 @@ import textwrap
 import pytest
 
 from cronos_lerobot.experiments import definitions
+from cronos_lerobot.experiments.definitions import Base
 from cronos_lerobot.experiments.plan import base_jobs
 from cronos_lerobot.experiments.specs import base_policy
 from cronos_lerobot.scripts import reproduce as script
@@ -117,24 +118,24 @@ def test_seeds(text, seeds):
 
 def test_own_recipe_of_the_base_policy():
     args = script.make_parser().parse_args(["table1", "--base.demos=200", "--base.clone_steps=600"])
-    recipe = script.make_options(args, [], ["kitchen_2x2"]).recipes["kitchen_2x2"]
+    recipe = script.make_options(args, [], [Base("kitchen_2x2")]).recipes["kitchen_2x2"]
     assert (recipe.demos, recipe.clone_steps, recipe.checkpoint, recipe.save_freq) == (200, 600, 600, 150)
     args = script.make_parser().parse_args(["table1", "--base.checkpoint=160"])
-    recipe = script.make_options(args, [], ["kitchen_2x2"]).recipes["kitchen_2x2"]
+    recipe = script.make_options(args, [], [Base("kitchen_2x2")]).recipes["kitchen_2x2"]
     assert (recipe.demos, recipe.clone_steps, recipe.checkpoint, recipe.save_freq) == (400, 320, 160, 80)
 
 
 def test_a_clean_base_policy_has_a_recipe_and_a_folder_of_its_own(tmp_path):
     args = script.make_parser().parse_args(["table1", "--base.clean=true", f"--root={tmp_path}"])
-    options = script.make_options(args, [], ["kitchen_2x2"])
-    demos, clone = base_jobs("kitchen_2x2", options)
+    options = script.make_options(args, [], [Base("kitchen_2x2")])
+    demos, clone = base_jobs(Base("kitchen_2x2"), options)
     assert demos.output == tmp_path / "base/kitchen_2x2_state_400cleandemos_640steps/demos"
     assert not [flag for flag in demos.command if flag.startswith(("--noise", "--misses", "--steps_after"))]
     assert "--steps=640" in clone.command
-    assert base_policy("kitchen_2x2", options).endswith("checkpoints/000480/pretrained_model")
+    assert base_policy(Base("kitchen_2x2"), options).endswith("checkpoints/000480/pretrained_model")
     args = script.make_parser().parse_args(["figure7", "--base.clean"])
     with pytest.raises(ValueError, match="clean base policy of kitchen_3x3/state; there are kitchen_2x2/state"):
-        script.make_options(args, [], ["kitchen_3x3"])
+        script.make_options(args, [], [Base("kitchen_3x3")])
 
 
 def test_starting_to_explain_takes_no_pytorch():

@@ -54,7 +54,7 @@ def jobs_of(name, rows=(), **changes):
 
 def test_every_table_and_figure_with_results_is_there():
     # Figures 1, 6, 9 and 10 are pictures.
-    assert list(EXPERIMENTS) == list(PAPER)
+    assert [name for name, experiment in EXPERIMENTS.items() if experiment.source] == list(PAPER)
 
 
 @pytest.mark.parametrize("name", PAPER)
@@ -154,7 +154,7 @@ def test_curriculum_ends_at_half_of_every_run():
 
 
 def test_runs_are_shared_between_experiments():
-    everything = make_jobs([(e, e.rows) for e in EXPERIMENTS.values()], options())
+    everything = make_jobs([(e, e.rows) for e in EXPERIMENTS.values() if e.source], options())
     trains = [job for job in everything if job.command[0] == "cronos-train"]
     # 1.3 M: seven of Table 1, random order, T = 320, two with one configuration; 2.9 M: four, and two in each of
     # two other scenes.

@@ -12,7 +12,7 @@ from forked_commands import run_forked
 from synthetic_runs import INSTRUCTIONS, write_training_run
 
 from cronos_lerobot.experiments import plots, tables
-from cronos_lerobot.experiments.definitions import EXPERIMENTS, LONG, SHORT
+from cronos_lerobot.experiments.definitions import EXPERIMENTS, LONG, SHORT, Base
 from cronos_lerobot.experiments.jobs import made_by, write_record
 from cronos_lerobot.experiments.outputs import write_outputs
 from cronos_lerobot.experiments.plan import train_job
@@ -28,7 +28,8 @@ RESETS = {80: 128, 320: 32, 1280: 8}
 
 @pytest.fixture
 def options(tmp_path):
-    recipes = {e.scene: base_recipe(TINY, e.scene, STATE) for e in EXPERIMENTS.values()}
+    bases = {row.begins_with(e.scene) for e in EXPERIMENTS.values() for row in e.rows}
+    recipes = {base.recipe: base_recipe(TINY, base.scene, STATE, kind=base.kind) for base in bases}
     return Options(TINY, STATE, (1, 2), tmp_path / "root", recipes=recipes)
 
 
@@ -249,7 +250,7 @@ def test_held_out_curve_is_cronos_evals(options, tmp_path):
             spec.evaluation_folder("independent", "held_out", checkpoint),
             "independent", "held_out", evaluation(success),
         )  # fmt: skip
-    base = base_evaluation_folder("kitchen_2x2", "independent", "held_out", options)
+    base = base_evaluation_folder(Base("kitchen_2x2"), "independent", "held_out", options)
     write_results(base, "independent", "held_out", evaluation(0.125))
     result = results(options, "figure4")
     (seed,) = result.rows[1].seeds

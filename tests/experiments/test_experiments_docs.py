@@ -4,7 +4,8 @@ import re
 from pathlib import Path
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS
-from cronos_lerobot.experiments.scales import BASE_RECIPES, CLEAN_RECIPES, OBS_NAMES, SCALES
+from cronos_lerobot.experiments.few_resets import PLUGS, TOGETHER
+from cronos_lerobot.experiments.scales import BASE_RECIPES, CLEAN_RECIPES, OBS_NAMES, SCALES, WIDE_RECIPES
 from cronos_lerobot.scripts.reproduce import make_parser
 
 DOCS = (Path(__file__).parents[2] / "docs/experiments.md").read_text()
@@ -24,7 +25,8 @@ def test_numbers_of_runs():
         assert million == f"{experiment.steps / 1e6:.1f} M"
         for scale, number in (("paper", paper), ("small", small)):
             assert int(number) == len(experiment.rows) * SCALES[scale].seeds
-            distinct[scale] |= {(experiment.scene, experiment.steps, row) for row in experiment.rows}
+            if experiment.source:
+                distinct[scale] |= {(experiment.scene, experiment.steps, row) for row in experiment.rows}
     for scale, column in (("paper", 3), ("small", 5)):
         assert int(rows["all"][column]) == len(distinct[scale]) * SCALES[scale].seeds
     assert list(rows) == [*EXPERIMENTS, "all"]
@@ -41,8 +43,8 @@ def test_scales():
 
 def test_recipes():
     recipes = {
-        (scene, OBS_NAMES[obs], recipe.clean): recipe
-        for table in (BASE_RECIPES, CLEAN_RECIPES)
+        (scene, OBS_NAMES[obs], recipe.clean, recipe.kind): recipe
+        for table in (BASE_RECIPES, CLEAN_RECIPES, WIDE_RECIPES)
         for (scene, obs), recipe in table.items()
     }
     section = DOCS[DOCS.index("| | demonstrations") :].split("\n\n")[0].splitlines()[2:]
@@ -50,7 +52,7 @@ def test_recipes():
     for line in section:
         name, *numbers = (cell.strip() for cell in line.strip("|").split("|")[:4])
         scene, obs = re.findall(r"\w+", name)[:2]
-        recipe = recipes[scene, obs, "--base.clean=true" in name]
+        recipe = recipes[scene, obs, "--base.clean=true" in name, "wide" if "wide" in name else "narrow"]
         assert [int(number) for number in numbers] == [recipe.demos, recipe.clone_steps, recipe.checkpoint]
 
 
@@ -58,3 +60,8 @@ def test_every_flag_is_there():
     flags = {flag for action in make_parser()._actions for flag in action.option_strings} - {"-h", "--help"}
     documented = set(re.findall(r"`(--[\w.]+)`", DOCS[DOCS.index("## Flags") : DOCS.index("## Where")]))
     assert documented == flags
+
+
+def test_plugs():
+    words = [row[0] for row in table_rows("word in a row's name")]
+    assert words == [*PLUGS, "_".join(TOGETHER), "wide"]

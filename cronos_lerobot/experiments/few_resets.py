@@ -1,0 +1,139 @@
+"""Learning with few resets: the paper's aids and what this project adds, each alone, on two base policies.
+
+A plug is a few flags of `cronos-train` beside T = 1280 with end-effector resets. A new one is one line of `PLUGS`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from cronos_lerobot.experiments.definitions import (
+    BEST,
+    BOTH,
+    EPISODIC,
+    CheckpointEvaluation,
+    Experiment,
+    Row,
+    register_experiment,
+)
+from cronos_lerobot.experiments.scales import WIDE, WIDE_RESETS
+
+INTERVAL = 1280
+"""T of the rows with few resets: a sixteenth of the resets of T = 80."""
+BUDGET = 1016
+"""B, a sixteenth of those of T = 80 in 1.3 M steps; staggered resets every 1280 steps spend as many."""
+
+
+@dataclass(frozen=True)
+class Plug:
+    """One way of learning more from few resets."""
+
+    flags: tuple[str, ...]
+    """Of `cronos-train`."""
+    budgets: tuple[tuple[str, int], ...] = ()
+    """Flags that are numbers of interventions in a run of the paper's steps."""
+    interval: int | None = INTERVAL
+    """T beside it; None where it spends the budget itself."""
+
+
+PLUGS: dict[str, Plug] = {
+    "critic": Plug(("--protocol.task_order=critic",)),
+    "staggered": Plug(("--protocol.reset_phase=staggered",)),
+    "asked": Plug(("--protocol.scene_reset=critic",), (("--protocol.reset_budget", BUDGET),), interval=None),
+    "memory": Plug(("--algorithm.self_imitation.coef=0.05",)),
+    "takeover": Plug(("--protocol.takeover_after=2",), (("--protocol.takeover_budget", BUDGET),), interval=None),
+}
+"""By the names that rows have."""
+TOGETHER = ("critic", "staggered")
+"""The plugs of the row that has the best of them."""
+
+
+def plugged(*names: str, interval: int | None = INTERVAL) -> Row:
+    """The row with these plugs, end-effector resets and T = `interval`, or none where a plug spends the budget."""
+    plugs = [PLUGS[name] for name in names]
+    return Row(
+        interval if all(plug.interval for plug in plugs) else None,
+        end_effector_reset=True,
+        tag="_".join(names),
+        flags=tuple(flag for plug in plugs for flag in plug.flags),
+        budgets=tuple(budget for plug in plugs for budget in plug.budgets),
+    )
+
+
+def wide(row: Row) -> Row:
+    """The row from the base policy whose demonstrations began all over the reach of the arm.
+
+    Those of a row with learned resets have reset tasks among them.
+    """
+    return replace(row, base=WIDE_RESETS if row.learned_reset else WIDE)
+
+
+PLAIN = Row(INTERVAL, end_effector_reset=True)
+AIDS = (
+    EPISODIC,
+    PLAIN,
+    Row(INTERVAL, end_effector_reset=True, curriculum=True),
+    Row(INTERVAL, end_effector_reset=True, curriculum=True, learned_reset=True),
+    BEST,
+)
+"""The paper's: Table 1's rows with end-effector resets."""
+METHOD = plugged(*TOGETHER)
+SCREENED = (*AIDS, *(plugged(name) for name in PLUGS), METHOD)
+
+METHOD_BY_BUDGET = (
+    *(plugged(*TOGETHER, interval=interval) for interval in (1280, 5120, 20480)),
+    plugged("critic", interval=None),
+)
+"""Staggered in 1.3 M steps of 64 streams these are 1,016, 254 and 63 resets, and none."""
+PAPER_BY_BUDGET = tuple(
+    Row(interval, end_effector_reset=True, heuristic_reset=True) for interval in (1280, 5120, 10240, None)
+)
+"""All streams are reset 15 times, 3 times, once, never: 960, 192, 64 and 0, besides what HSR puts back."""
+
+_BUDGETS = (1000, 2000, 6000)
+
+
+def _names(rows: tuple[Row, ...]) -> tuple[str, ...]:
+    return tuple(row.name for row in rows)
+
+
+_BY_BUDGET = tuple(wide(row) for row in METHOD_BY_BUDGET), tuple(wide(row) for row in PAPER_BY_BUDGET)
+
+for _experiment in (
+    Experiment(
+        "few_resets",
+        "Learning with few resets",
+        (*SCREENED, *map(wide, SCREENED)),
+        budgets=_BUDGETS,
+        by_base=True,
+    ),
+    Experiment(
+        "few_resets_best",
+        "Learning with few resets, evaluated in full",
+        tuple(map(wide, (EPISODIC, PLAIN, BEST, METHOD))),
+        splits=BOTH,
+        evaluations=(CheckpointEvaluation("independent", ("held_out",)), CheckpointEvaluation("sequential", BOTH)),
+        budgets=_BUDGETS,
+        by_base=True,
+    ),
+    Experiment(
+        "few_resets_budgets",
+        "Success against the budget of interventions",
+        (wide(EPISODIC), wide(BEST), *_BY_BUDGET[0], *_BY_BUDGET[1]),
+        budgets=(64, 254, 1000),
+        by_base=True,
+        joined=(("critic + staggered", _names(_BY_BUDGET[0])), ("EER, HSR", _names(_BY_BUDGET[1]))),
+    ),
+    *(
+        Experiment(
+            f"few_resets_{scene}",
+            f"Learning with few resets in {scene}",
+            tuple(map(wide, (EPISODIC, PLAIN, METHOD))),
+            scene=scene,
+            budgets=_BUDGETS,
+            by_base=True,
+        )
+        for scene in ("kitchen_3x3", "playroom_2x2")
+    ),
+):
+    register_experiment(_experiment)

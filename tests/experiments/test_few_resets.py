@@ -1,0 +1,174 @@
+"""The experiments of few resets: what their rows do, and the figure of success against interventions."""
+
+import draccus
+import numpy as np
+import pytest
+from test_experiment_outputs import TINY, make_run
+
+from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base
+from cronos_lerobot.experiments.few_resets import PLUGS, plugged, wide
+from cronos_lerobot.experiments.intervention_plots import find_end, interventions_figure, row_styles, side_by_side
+from cronos_lerobot.experiments.outputs import write_outputs
+from cronos_lerobot.experiments.plan import make_jobs
+from cronos_lerobot.experiments.plots import AXIS_LABELS
+from cronos_lerobot.experiments.results import collect
+from cronos_lerobot.experiments.scales import SCALES, STATE, base_recipe
+from cronos_lerobot.experiments.specs import Options
+from cronos_lerobot.scripts import reproduce
+from cronos_lerobot.training.config import CronosTrainConfig
+
+NAMES = [name for name in EXPERIMENTS if name.startswith("few_resets")]
+
+
+def options_of(name, root, scale=TINY):
+    experiment = EXPERIMENTS[name]
+    bases = {row.begins_with(experiment.scene) for row in experiment.rows}
+    recipes = {base.recipe: base_recipe(scale, base.scene, STATE, kind=base.kind) for base in bases}
+    return Options(scale, STATE, (1, 2), root, recipes=recipes)
+
+
+def jobs_of(name, root, scale="small"):
+    experiment = EXPERIMENTS[name]
+    return {
+        job.name: job for job in make_jobs([(experiment, experiment.rows)], options_of(name, root, SCALES[scale]))
+    }
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_run_is_one_that_cronos_train_takes(name, tmp_path):
+    """Its flags are parsed and checked as the command does, the plugs' among them."""
+    jobs = jobs_of(name, tmp_path)
+    runs = [job for job in jobs.values() if job.command[0] == "cronos-train" and job.name.endswith("seed1")]
+    assert len(runs) == len(EXPERIMENTS[name].rows)
+    for job in runs:
+        flags = [flag for flag in job.command[1:] if not flag.startswith("--policy.path")]
+        draccus.parse(CronosTrainConfig, args=flags)
+
+
+def test_each_plug_stands_alone_and_together_on_both_bases():
+    names = [row.name for row in EXPERIMENTS["few_resets"].rows]
+    assert len(set(names)) == len(names)
+    narrow = [name for name in names if "wide" not in name]
+    assert narrow[:5] == ["t80", "t1280_eer", "t1280_eer_cl", "t1280_eer_cl_lsr", "t1280_eer_cl_hsr"]
+    assert [name.split("_")[-1] for name in narrow[5:-1]] == list(PLUGS)
+    assert narrow[-1] == "t1280_eer_critic_staggered"
+    wides = [f"{name}_wide_resets" if "lsr" in name else f"{name}_wide" for name in narrow]
+    assert names == narrow + wides
+    # The narrow rows of the paper are Table 1's own runs.
+    assert set(EXPERIMENTS["few_resets"].rows[:5]) < set(EXPERIMENTS["table1"].rows)
+
+
+def test_commands(tmp_path):
+    jobs = jobs_of("few_resets", tmp_path)
+    base = "base/kitchen_2x2_state_400widedemos_640steps"
+    wanted = {"--start.layouts=reach", "--start.arm_pose=after_task", "--start.share=0.3", "--noise.share=0.75"}
+    assert wanted < set(jobs[f"{base}/demos"].command)
+    assert "--reset_tasks=true" in jobs[f"{base.replace('widedemos', 'wide_resetsdemos')}/demos"].command
+    run = jobs["kitchen_2x2_state_small/t1280_eer_critic_staggered_wide_307k/seed1"]
+    assert run.needs == (f"{base}/clone",)
+    assert {"--protocol.task_order=critic", "--protocol.reset_phase=staggered"} < set(run.command)
+    assert sum(flag.startswith("--protocol.task_order") for flag in run.command) == 1
+    asked = jobs["kitchen_2x2_state_small/tnone_eer_asked_307k/seed1"].command
+    # 1,016 x 307,200 / 1,300,000
+    assert {"--protocol.scene_reset_interval=null", "--protocol.reset_budget=240"} < set(asked)
+    smoke = jobs_of("few_resets", tmp_path, "smoke")["kitchen_2x2_state_smoke/tnone_eer_asked_3k/seed1"].command
+    assert "--protocol.reset_budget=2" in smoke
+
+
+def test_budgets_of_a_plug_need_no_interval_and_one_cannot_have_one():
+    assert plugged("asked", interval=1280).interval is None
+    assert plugged("critic", interval=5120).interval == 5120
+    assert wide(plugged("critic")).name == "t1280_eer_critic_wide"
+
+
+def test_one_policy_cannot_stand_for_two_bases():
+    rows = EXPERIMENTS["few_resets"].rows
+    args = reproduce.make_parser().parse_args(["few_resets", "--policy.path=me/policy"])
+    with pytest.raises(ValueError, match="begin with 3 kinds \\(narrow, wide, wide_resets\\): choose with --rows"):
+        reproduce.make_options(args, [], [row.begins_with("kitchen_2x2") for row in rows])
+    assert reproduce.make_options(args, [], [Base("kitchen_2x2")]).recipes == {}
+
+
+@pytest.fixture
+def drawn(tmp_path):
+    """Made-up runs of 8 streams: two seeds of T = 80 and T = 1280 on one base, one seed on the other."""
+    options = options_of("few_resets", tmp_path / "root")
+    for seed, wins in ((1, 6), (2, 8)):
+        make_run(options, "few_resets", "t80", seed, (2, 4, wins))
+        make_run(options, "few_resets", "t1280_eer", seed, (2, 3, 4))
+    make_run(options, "few_resets", "t1280_eer_staggered_wide", 1, (2, 3, 6))
+    return options, collect(EXPERIMENTS["few_resets"], EXPERIMENTS["few_resets"].rows, options)
+
+
+def test_ends_of_the_rows(drawn):
+    rows = {row.row.name: find_end(row) for row in drawn[1].rows}
+    t80 = rows["t80"]
+    # 8 streams in 1280 steps: 16 resets of each; .75 and 1.0 of two seeds.
+    assert (t80.interventions, t80.steps, t80.success.mean) == (128, 10_240, 0.875)
+    assert t80.success.ci95[0] == pytest.approx(0.875 - 12.706 / 8, abs=1e-3)
+    wide_end = rows["t1280_eer_staggered_wide"]
+    # One seed: Wilson's interval of 24 of 32.
+    assert (wide_end.interventions, wide_end.success.mean) == (8, 0.75)
+    assert wide_end.success.ci95 == pytest.approx((0.579, 0.867), abs=1e-3)
+    assert rows["t1280_eer_cl"] is None
+
+
+def test_figure_has_a_line_of_panels_for_each_base_and_marks_at_the_ends(drawn):
+    figure = interventions_figure(drawn[1])
+    narrow, by_steps, reach, _ = figure.axes
+    assert [ax.get_title(loc="left") for ax in (narrow, reach)] == ["narrow base policy", "wide base policy"]
+    assert (narrow.get_xscale(), by_steps.get_xscale()) == ("symlog", "linear")
+    marks = sorted((box[0].get_xdata()[0], box[0].get_ydata()[0]) for box in narrow.containers)
+    assert marks == [(8, 0.5), (128, 0.875)]
+    assert narrow.get_xlim() == reach.get_xlim()
+    # The linear part ends at the decade below the fewest interventions, 8: at 1.
+    assert (narrow.get_xlabel(), reach.get_xlabel()) == (
+        "",
+        f"{AXIS_LABELS['interventions']} (logarithmic beyond 1)",
+    )
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["T = 80 (2 seeds)", "T = 1280, EER (2 seeds)", "T = 1280, EER, staggered (1 seed)"]
+
+
+def test_marks_at_one_place_stand_side_by_side():
+    assert side_by_side([960.0, 16_000.0, 1016.0, 960.0]) == [-7.0, 0.0, 7.0, 0.0]
+    assert side_by_side([0.0, 64.0, 0.0]) == [-3.5, 0.0, 3.5]
+
+
+def test_rows_of_the_paper_are_grey_and_the_same_on_both_bases(drawn):
+    styles = row_styles(drawn[1])
+    for name, style in styles.items():
+        if not name.endswith("wide") and "lsr" not in name:
+            assert styles[f"{name}_wide"] == style
+    red, green, blue = (int(styles["t1280_eer"].color[i : i + 2], 16) for i in (1, 3, 5))
+    assert red == green == blue
+    assert len({(style.color, style.marker) for style in styles.values()}) == len(styles) / 2
+
+
+def test_ends_are_joined_by_budget(tmp_path):
+    options = options_of("few_resets_budgets", tmp_path / "root")
+    for row, wins in (("t1280_eer_critic_staggered_wide", 7), ("t5120_eer_critic_staggered_wide", 5)):
+        make_run(options, "few_resets_budgets", row, 1, (2, 4, wins))
+    experiment = EXPERIMENTS["few_resets_budgets"]
+    (ax, _) = interventions_figure(collect(experiment, experiment.rows, options)).axes
+    (line,) = [line for line in ax.lines if line.get_label() == "critic + staggered, by budget"]
+    # Made-up runs of T = 5120 have no reset in 1280 steps of each stream.
+    np.testing.assert_allclose(line.get_xdata(), [0, 8])
+    np.testing.assert_allclose(line.get_ydata(), [5 / 8, 7 / 8])
+
+
+def test_page_names_the_demonstrations_and_has_the_figure_first(drawn, tmp_path):
+    options, _ = drawn
+    experiment = EXPERIMENTS["few_resets"]
+    page = write_outputs(experiment, experiment.rows, options, tmp_path / "out")
+    assert "| T | EER | CL | LSR | HSR | demonstrations |" in page
+    assert (tmp_path / "out/few_resets.png").stat().st_size > 10_000
+    assert page.index("![few_resets.png]") < page.index("![few_resets_segments.png]")
+
+
+def test_only_the_papers_experiments_are_all(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr("sys.argv", ["cronos-reproduce", "all", "--dry_run", "--seeds=1", f"--root={tmp_path}"])
+    reproduce.main()
+    out = capsys.readouterr().out
+    assert "t80_307k" in out
+    assert "wide" not in out
