@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from forked_commands import run_forked
 from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.config import CronosEnvConfig
 from lerobot_env_cronos.simulation import filament
@@ -71,7 +72,7 @@ def test_without_vulkan_the_error_names_the_package(monkeypatch):
 def test_without_a_driver_there_are_no_devices():
     nothing = {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json"}
     code = "from lerobot_env_cronos.simulation.filament import count_vulkan_devices; print(count_vulkan_devices())"
-    assert run(code, **nothing).stdout == "0\n"
+    assert run_forked([sys.executable, "-c", code], env=os.environ | nothing).stdout == "0\n"
 
 
 def test_the_flag():

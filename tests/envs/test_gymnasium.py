@@ -2,12 +2,12 @@
 
 import copy
 import pickle
-import subprocess
 import sys
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from forked_commands import run_forked
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from lerobot_env_cronos import CronosEnv, CronosVectorEnv, IndependentVectorEnv, SequentialVectorEnv, get_scene
@@ -198,6 +198,6 @@ except RuntimeError as error:
 
 def test_a_fork_after_the_first_frame_is_told_at_once():
     """Mesa's drawing threads are gone in the child, which would wait for them for ever."""
-    done = subprocess.run([sys.executable, "-c", FORK], capture_output=True, text=True, timeout=300)
+    done = run_forked([sys.executable, "-c", FORK])
     assert "forked from one that had drawn" in done.stdout, done.stderr[-2000:]
     assert "context='spawn'" in done.stdout
