@@ -117,11 +117,14 @@ class AssistedAgent(Agent):
             self._ids = np.flatnonzero(self._loop.taken_over[self._streams])
             if len(self._ids):
                 self._expert.begin(self._ids)
-        if not len(self._ids):
+        # The same in every process, for those who collect what all of them did.
+        if not self._loop.taken_over.any():
             return sample
+        expert = np.zeros(len(sample.action), np.bool_)
+        if not len(self._ids):
+            return replace(sample, expert=expert)
         theirs = np.asarray(self._expert.act(o_t, tau[self._streams]))
         action, log_prob = sample.action.copy(), sample.log_prob.copy()
-        expert = np.zeros(len(action), np.bool_)
         if theirs.shape != (wanted := (len(self._ids), *action.shape[1:])):
             raise ValueError(f"the expert {type(self._expert).__name__} returned {theirs.shape}, not {wanted}.")
         action[self._ids], log_prob[self._ids], expert[self._ids] = theirs, 0, True

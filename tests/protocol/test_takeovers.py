@@ -165,6 +165,16 @@ def test_actions_of_a_wrong_shape_are_refused():
         agent.act({}, ["go to 1.0"] * 2)
 
 
+@pytest.mark.parametrize(("mine", "expert"), [(slice(0, 1), [False]), (slice(1, 2), [True])])
+def test_every_process_says_who_played_where_any_stream_is_taken_over(mine, expert):
+    """A recording collects the field from all of them: one without it would leave the others waiting."""
+    loop = LoopState(2, 1)
+    loop.switch_task(np.zeros(2, np.int64))
+    loop.begin_takeover(np.array([1]), 1)
+    agent = AssistedAgent(DummyAgent(1, []), Idle(None), loop, mine)
+    assert agent.act({}, ["go to 1.0"] * 2).expert.tolist() == expert
+
+
 def test_the_state_survives_json_and_older_checkpoints_have_no_takeovers():
     loop, _, _ = run(10)
     state = json.loads(json.dumps(loop.state_dict()))
