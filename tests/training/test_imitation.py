@@ -9,7 +9,7 @@ import torch
 from dummies import DummyEnv, DummyPolicy, DummyPolicyConfig, identity_processors
 from forked_processes import together
 from lerobot.configs import PreTrainedConfig
-from lerobot.optim import AdamWConfig
+from lerobot.optim import AdamWConfig, MultiAdamConfig
 from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosEnvConfig
 from test_cronos_train import cronos_train
@@ -233,3 +233,26 @@ def test_an_evaluation_keeps_the_environments_apart():
     assert act([5], [1]) == [4]
     assert act([6, 7], [0, 1]) == [1, 4]
     assert act([8, 9], [0, 1]) == [8, 9]
+
+
+class TwoOptimizersConfig(ClonedConfig):
+    """As LeRobot's gaussian_actor: an optimizer for each part."""
+
+    def get_optimizer_preset(self):
+        return MultiAdamConfig(lr=1e-2, optimizer_groups={"bias": {"lr": 1e-3}})
+
+
+class TwoOptimizersPolicy(ClonedPolicy):
+    config_class = TwoOptimizersConfig
+
+    def get_optim_params(self):
+        named = dict(self.actor.named_parameters())
+        return {part: [p for name, p in named.items() if part in name] for part in ("weight", "bias")}
+
+
+def test_every_optimizer_of_a_policy_learns_at_its_own_share_of_the_rate(tmp_path):
+    policy = TwoOptimizersPolicy()
+    policy.config = TwoOptimizersConfig()
+    trainer = Trainer(settings(tmp_path), DummyEnv(4), DummyEnv, policy, *identity_processors())
+    rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in trainer.agent.optimizer.items()}
+    assert rates == pytest.approx({"weight": 1e-3, "bias": 1e-4})

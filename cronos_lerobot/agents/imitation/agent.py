@@ -149,10 +149,16 @@ class ImitationAgent(LearningAgent):
             ) from error
         self.optimizer = preset.build(params)
         factor = FINE_TUNING if self.config.lr is None else self.config.lr / preset.lr
-        for group in self.optimizer.param_groups:
-            group["lr"] *= factor
+        for optimizer in self._optimizers:
+            for group in optimizer.param_groups:
+                group["lr"] *= factor
         self._max_grad_norm = preset.grad_clip_norm
         self._trained = [param for param in self.policy.parameters() if param.requires_grad]
+
+    @property
+    def _optimizers(self) -> list[torch.optim.Optimizer]:
+        assert self.optimizer is not None
+        return [*self.optimizer.values()] if isinstance(self.optimizer, dict) else [self.optimizer]
 
     def _inputs(self, observation: dict[str, Any]) -> Columns:
         """The columns that the policy reads."""
@@ -193,11 +199,10 @@ class ImitationAgent(LearningAgent):
         loss, _ = self.policy.forward(self._processors.preprocessor(self._batch()))
         if not torch.isfinite(loss):
             raise FloatingPointError(f"The loss is {loss.item()}.")
-        optimizers = list(self.optimizer.values()) if isinstance(self.optimizer, dict) else [self.optimizer]
         loss.backward()
         self._processes.average_gradients(self._trained)
         norm = torch.nn.utils.clip_grad_norm_(self._trained, self._max_grad_norm or float("inf"))
-        for optimizer in optimizers:
+        for optimizer in self._optimizers:
             optimizer.step()
             optimizer.zero_grad()
         # TD-MPC moves its target networks here.
