@@ -17,7 +17,7 @@ from cronos_lerobot.agents.base import (
     plain_sample,
 )
 from cronos_lerobot.agents.chunk_player import ChunkPlayer, Player, make_player
-from cronos_lerobot.agents.imitation.batches import Demonstrations, join_batches, segment_batch
+from cronos_lerobot.agents.imitation.batches import Demonstrations, draw_batch
 from cronos_lerobot.agents.imitation.config import ImitationConfig
 from cronos_lerobot.agents.imitation.memory import OpenSegments, SegmentMemory, own_share
 from cronos_lerobot.agents.imitation.weights import by_advantage, by_return, effective_share
@@ -184,15 +184,13 @@ class ImitationAgent(LearningAgent):
         return {"failed_segments": float(found[:, 0].sum()), "effective_share": float(found[:, 1].mean())}
 
     def _batch(self) -> Batch:
-        size = self.config.batch_size
-        num_demos = round(self.config.demos_share * size) if len(self.memory) else size
-        if self._demos is None or num_demos == 0:
-            return segment_batch(self.memory.draw(size, self._rng, self._weights), self.policy.config)
-        demos = self._demos.batch(num_demos, self._rng)
-        if num_demos == size:
-            return demos
-        own = segment_batch(self.memory.draw(size - num_demos, self._rng, self._weights), self.policy.config)
-        return join_batches(own, demos)
+        config = self.config
+        batch = draw_batch(
+            self.memory, self._demos, config.demos_share, config.batch_size, self._rng, self.policy.config,
+            self._weights,
+        )  # fmt: skip
+        assert batch is not None
+        return batch
 
     def _step(self) -> tuple[float, float]:
         """One optimizer step, as `lerobot-train` takes it; returns the loss and the gradient's norm."""

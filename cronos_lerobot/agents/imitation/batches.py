@@ -15,7 +15,7 @@ from torch.utils.data import default_collate
 
 from cronos_lerobot.agents.base import Batch
 from cronos_lerobot.agents.imitation.config import DemosConfig
-from cronos_lerobot.agents.imitation.memory import Segment
+from cronos_lerobot.agents.imitation.memory import Segment, SegmentMemory
 
 
 def segment_batch(draws: Sequence[tuple[Segment, int]], config: PreTrainedConfig) -> Batch:
@@ -110,6 +110,37 @@ def _read_episodes(dataset: LeRobotDataset, names: list[str], bounds: list[tuple
         )
         for begin, end in bounds
     ]
+
+
+def draw_batch(
+    memory: SegmentMemory,
+    demos: Demonstrations | None,
+    demos_share: float,
+    size: int,
+    rng: np.random.Generator,
+    config: PreTrainedConfig,
+    weights: np.ndarray | None = None,
+) -> Batch | None:
+    """Return `size` frames of a memory and, by a share, of demonstrations; None if there is nothing to draw.
+
+    As long as nothing is remembered, all of them are of the demonstrations.
+
+    Args:
+        memory: own segments.
+        demos: demonstrations, if there are any.
+        demos_share: of the batch.
+        size: frames.
+        rng: draws them.
+        config: of the policy.
+        weights: see `SegmentMemory.draw`.
+    """
+    num_demos = 0 if demos is None else round(demos_share * size) if len(memory) else size
+    parts = []
+    if demos is not None and num_demos:
+        parts.append(demos.batch(num_demos, rng))
+    if num_demos < size and len(memory):
+        parts.append(segment_batch(memory.draw(size - num_demos, rng, weights), config))
+    return join_batches(*parts) if len(parts) == 2 else parts[0] if parts else None
 
 
 def join_batches(first: Batch, second: Batch) -> Batch:

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cronos_lerobot.agents.base import Batch, Columns
-from cronos_lerobot.agents.imitation.batches import Demonstrations, join_batches, segment_batch
+from cronos_lerobot.agents.base import Columns
+from cronos_lerobot.agents.imitation.batches import Demonstrations, draw_batch
 from cronos_lerobot.agents.imitation.memory import OpenSegments, Segment, SegmentMemory, own_share
 from cronos_lerobot.agents.imitation.weights import by_task
 from cronos_lerobot.agents.ppo.config import PPOConfig
@@ -104,7 +104,10 @@ class SelfImitation:
         Returns:
             The loss and its gradient's norm, without the weight; {} if there is nothing to clone.
         """
-        batch = self._batch()
+        batch = draw_batch(
+            self.memory, self._demos, self._demos_share, self.config.batch_size, self._rng, self._policy.config,
+            self._weights,
+        )  # fmt: skip
         if batch is None:
             return {}
         loss, _ = self._policy.forward(self._processors.preprocessor(batch))
@@ -129,18 +132,6 @@ class SelfImitation:
     def load_state_dict(self, state: list[Any]) -> None:
         """Go on with the segments of this process, or its share if there are more or fewer processes now."""
         self.memory.load_state_dict(own_share(state, self._processes.rank, self._processes.count))
-
-    def _batch(self) -> Batch | None:
-        """What is cloned next; None if there is nothing."""
-        size = self.config.batch_size
-        num_demos = 0 if self._demos is None else round(self._demos_share * size) if len(self.memory) else size
-        parts = []
-        if num_demos and self._demos is not None:
-            parts.append(self._demos.batch(num_demos, self._rng))
-        if num_demos < size and len(self.memory):
-            draws = self.memory.draw(size - num_demos, self._rng, self._weights)
-            parts.append(segment_batch(draws, self._policy.config))
-        return join_batches(*parts) if len(parts) == 2 else parts[0] if parts else None
 
 
 def _parameters_of_forward(policy: Any) -> set[int]:
