@@ -29,7 +29,7 @@ demo: setup ## Record, clone, fine-tune without resets, evaluate, report: 10 min
 	$(RUN) cronos-demo
 
 test: setup ## Run the whole test suite, one worker a core
-	@sh .ci/system-packages vulkan
+	@sh .ci/system-packages tests
 	OMP_NUM_THREADS=1 $(RUN) pytest -n auto --dist loadfile
 
 check: lint type ## What CI checks besides the tests

@@ -15,6 +15,7 @@ from typing import Any
 from cronos_lerobot.provenance import git_commit, package_versions
 
 RUNNING, STOPPED = "running", "stopped"
+BASE, RUN, EVALUATION = "base", "run", "evaluation"
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,8 @@ class Job:
     progress: Callable[[], Progress | None] = lambda: None
     environment: str = ""
     """Id of the environment that the command works in, with its version."""
+    stage: str = RUN
+    """BASE, RUN or EVALUATION: of each a cluster has an array."""
     work: int = 0
     """Interaction steps, for the time that all jobs together may still take."""
 

@@ -18,7 +18,7 @@ from cronos_lerobot.experiments.definitions import (
     Experiment,
     Row,
 )
-from cronos_lerobot.experiments.jobs import Job
+from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job
 from cronos_lerobot.experiments.progress import train_progress
 from cronos_lerobot.experiments.scales import ALGORITHM_FLAGS, OBS_NAMES
 from cronos_lerobot.experiments.specs import (
@@ -72,8 +72,8 @@ def base_jobs(base: Base, options: Options) -> list[Job]:
     else:
         clone += ["--num_workers=0"]
     name = f"base/{folder.name}"
-    demos = Job(f"{name}/demos", tuple(record), folder / "demos", environment=gymnasium_id(scene))
-    clone_job = Job(f"{name}/clone", tuple(clone), folder / "clone", needs=(demos.name,))
+    demos = Job(f"{name}/demos", tuple(record), folder / "demos", environment=gymnasium_id(scene), stage=BASE)
+    clone_job = Job(f"{name}/clone", tuple(clone), folder / "clone", needs=(demos.name,), stage=BASE)
     return [demos, replace(clone_job, environment=demos.environment)]
 
 
@@ -218,4 +218,12 @@ def eval_command(
 def _eval_job(name: str, command: list[str], folder: Path, needed: str | None, scene: str) -> Job:
     # cronos-eval goes on with what it finds in its folder.
     needs = (needed,) if needed else ()
-    return Job(name, tuple(command), folder, needs=needs, resume=lambda: command, environment=gymnasium_id(scene))
+    return Job(
+        name,
+        tuple(command),
+        folder,
+        needs=needs,
+        resume=lambda: command,
+        environment=gymnasium_id(scene),
+        stage=EVALUATION,
+    )

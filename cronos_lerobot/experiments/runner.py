@@ -8,7 +8,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -35,6 +36,9 @@ ELSEWHERE = "is being run by another process: waiting for it"
 DONE, FAILED, CHANGED, BLOCKED = "done", "failed", "changed", "blocked"
 ENDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 """Those that end the runner as Ctrl-C does; the second is a closed terminal's."""
+TIME_LIMIT_SIGNAL = signal.SIGUSR2
+"""A cluster sends it to all processes of a job before its time ends. It is the runner's process that knows what to
+do; the commands it would kill."""
 
 
 class Display(Protocol):
@@ -100,7 +104,7 @@ class Runner:
                 self.display.update(self.states, [child.job for child in self._children])
                 time.sleep(POLL_S)
         finally:
-            self._stop()
+            self.stop()
             for number, handler in previous.items():
                 signal.signal(number, handler)
         self.display.update(self.states, [])
@@ -148,7 +152,7 @@ class Runner:
         write_record(job, record)
         command = resumed or list(job.command)
         # A session of its own: Ctrl-C reaches us alone, and we stop it and whatever it has started.
-        with job.log.open("ab") as log:
+        with job.log.open("ab") as log, _blocked(TIME_LIMIT_SIGNAL):
             log.write(f"$ {' '.join(command)}\n".encode())
             log.flush()
             process = subprocess.Popen(
@@ -181,8 +185,9 @@ class Runner:
         self.states[job.name] = state
         self.display.event(job, state)
 
-    def _stop(self) -> None:
-        """End the children that still run. Not by SIGINT: whoever starts us in the background has it ignored."""
+    def stop(self) -> None:
+        """End the commands that still run: they can be resumed."""
+        # Not by SIGINT: whoever starts us in the background has it ignored.
         for sent in (signal.SIGTERM, signal.SIGKILL):
             _signal_groups(self._children, sent)
             deadline = time.monotonic() + GRACE_S
@@ -194,6 +199,16 @@ class Runner:
         # A terminal that is gone cannot be written to: the notes come first.
         for child in stopped:
             self.display.event(child.job, STOPPED)
+
+
+@contextmanager
+def _blocked(number: signal.Signals) -> Generator[None]:
+    """What is started within does not see this signal."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {number})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _signal_groups(children: Sequence[_Child], number: int) -> None:

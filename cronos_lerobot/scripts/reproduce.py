@@ -16,13 +16,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base, Experiment, Row, find_rows
-from cronos_lerobot.experiments.display import make_display
 from cronos_lerobot.experiments.jobs import RUNNING, Job, changes, is_done, other_commits, status
-from cronos_lerobot.experiments.runner import DONE, Runner
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
+from cronos_lerobot.scripts.launchers import (
+    add_launcher_flags,
+    finish,
+    make_slurm_options,
+    run_here,
+    run_on_slurm,
+)
 from cronos_lerobot.scripts.pipeline import command_line
 
 if TYPE_CHECKING:
+    from cronos_lerobot.experiments.slurm import SlurmOptions
     from cronos_lerobot.experiments.specs import Options
 
 # Modules that bring PyTorch are imported where they are needed: they take seconds, and mistakes are told before.
@@ -57,7 +63,11 @@ examples:
   from pixels, with a base policy and a setting of one's own
       cronos-reproduce table1 --obs_type=pixels_agent_pos --policy.path=me/policy -- --algorithm.target_kl=0.02
 
-Ctrl-C stops the runs; the same command goes on from their last checkpoints.
+  on a cluster, 24 runs at a time, and what has become of them
+      cronos-reproduce table1 --scale=paper --launcher=slurm --slurm.partition=cpu --slurm.time=4:00:00 --jobs=24
+      cronos-reproduce status
+
+Ctrl-C stops the runs; the same command goes on from their last checkpoints. On a cluster they go on without it.
 """
 
 
@@ -71,7 +81,7 @@ def make_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    names = [*EXPERIMENTS, "all", "list"]
+    names = [*EXPERIMENTS, "all", "list", "status"]
     parser.add_argument("experiment", choices=names, metavar="EXPERIMENT", help=", ".join(names))
     parser.add_argument(
         "--scale",
@@ -120,6 +130,7 @@ def make_parser() -> argparse.ArgumentParser:
         parser.add_argument(
             f"--{name}", nargs="?", const=True, default=False, type=parse_bool, metavar="true|false", help=text
         )
+    add_launcher_flags(parser)
     return parser
 
 
@@ -254,13 +265,35 @@ def print_plan(jobs: list[Job]) -> None:
         print(command_line(resumed or list(job.command)), end="\n\n")
 
 
-def run_jobs(jobs: list[Job], parallel: int, threads: int) -> bool:
-    """Run what is not done; returns whether all is done in the end."""
-    with make_display(jobs) as display:
-        states = Runner(jobs, parallel, display, {"OMP_NUM_THREADS": str(threads)}).run()
-    counts = {state: list(states.values()).count(state) for state in dict.fromkeys(states.values())}
-    print("jobs: " + ", ".join(f"{number} {state}" for state, number in counts.items()))
-    return all(state == DONE for state in states.values())
+def run_jobs(jobs: list[Job], args: argparse.Namespace, slurm: SlurmOptions | None) -> dict[str, str]:
+    """Run what is not done, here or on a cluster; returns the state of every job by name."""
+    try:
+        if slurm is None:
+            parallel = args.jobs or max(1, (os.cpu_count() or 1) // args.threads)
+            return run_here(jobs, parallel, args.threads)
+        from cronos_lerobot.experiments.slurm import SlurmError
+
+        try:
+            return run_on_slurm(jobs, slurm, args.root, args.threads, args.jobs)
+        except SlurmError as error:
+            sys.exit(f"error: {error}")
+    except KeyboardInterrupt as end:
+        sys.exit(f"\n{end}")
+
+
+def print_status(root: Path) -> None:
+    """Print what has become of every job of a root."""
+    from rich.console import Console
+
+    from cronos_lerobot.experiments.status import make_status_table
+
+    table = make_status_table(root)
+    if not table.row_count:
+        sys.exit(f"error: nothing was started in {root} yet")
+    # Into a file or a narrow terminal whole lines are better than columns cut short.
+    console = Console()
+    console.width = max(console.width, 160)
+    console.print(table)
 
 
 def write_reports(chosen: list[tuple[Experiment, tuple[Row, ...]]], options: Options, output: Path | None) -> None:
@@ -282,6 +315,9 @@ def main() -> None:
     if args.experiment == "list":
         print_list()
         return
+    if args.experiment == "status":
+        print_status(args.root)
+        return
     of_the_paper = [name for name, experiment in EXPERIMENTS.items() if experiment.source]
     names = of_the_paper if args.experiment == "all" else [args.experiment]
     if args.experiment == "all" and (args.output_dir or args.rows):
@@ -291,6 +327,7 @@ def main() -> None:
         bases = dict.fromkeys(row.begins_with(experiment.scene) for experiment, rows in chosen for row in rows)
         options = make_options(args, sys.argv[split + 1 :], bases)
         check_budget(chosen, options)
+        slurm = make_slurm_options(args)
     except ValueError as error:
         sys.exit(f"error: {error}")
     from cronos_lerobot.experiments.plan import make_jobs
@@ -301,11 +338,7 @@ def main() -> None:
         return
     done = True
     if not args.report_only:
-        parallel = args.jobs or max(1, (os.cpu_count() or 1) // args.threads)
-        try:
-            done = run_jobs(jobs, parallel, args.threads)
-        except KeyboardInterrupt:
-            sys.exit("\ninterrupted: the same command goes on from here")
+        done = finish(run_jobs(jobs, args, slurm))
     write_reports(chosen, options, args.output_dir)
     if not done:
         sys.exit(1)

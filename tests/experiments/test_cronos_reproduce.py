@@ -22,7 +22,7 @@ def reproduce(*flags):
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def test_two_rows_of_table1_end_to_end(tmp_path):
+def test_two_rows_of_table1_end_to_end(tmp_path, monkeypatch, capsys):
     flags = ["table1", "--scale=smoke", f"--root={tmp_path}", "--rows", *ROWS, "--jobs=2"]
     done = reproduce(*flags)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
@@ -42,6 +42,12 @@ def test_two_rows_of_table1_end_to_end(tmp_path):
     text = (tmp_path / "table1_smoke_state/table1.md").read_text()
     assert "0.897 ± 0.027" in text
     assert "0.649 ± 0.090" in text
+
+    call(monkeypatch, "status", f"--root={tmp_path}")
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    base, run = "base/kitchen_2x2_state_8demos_5steps/clone", "kitchen_2x2_state_smoke/t80_3k/seed1"
+    assert [line[:2] for line in lines if line[0] == base] == [[base, "done"]]
+    assert [line[:5] for line in lines if line[0] == run] == [[run, "done", "2,560", "/", "2,560"]]
 
     # As a kill after the first checkpoint leaves it.
     train = tmp_path / "runs/kitchen_2x2_state_smoke/t80_3k/seed1/train"
@@ -98,6 +104,10 @@ def test_list_names_every_row(monkeypatch, capsys):
         (["table1", "--", "--steps=3"], "--steps=3 is set by the experiment"),
         (["table1", "--", "--save_freq=3"], "--save_freq=3 is set by the experiment"),
         (["figure5", "--", "--protocol.reset_budget=100"], "figure5 evaluates their checkpoints at fixed steps"),
+        (["table1", "--slurm.time=60"], "--slurm.time needs --launcher=slurm"),
+        (["table1", "--launcher=slurm", "--slurm.time=2h"], "--slurm.time must be minutes, H:MM:SS or D-HH:MM:SS"),
+        (["table1", "--launcher=slurm", "--slurm.cpus=0"], "--slurm.cpus must be at least 1, got 0"),
+        (["status", "--root=nowhere"], "nothing was started in nowhere yet"),
         (["table2"], "invalid choice: 'table2'"),
         (["all", "--rows", "t80"], "for one experiment"),
     ],

@@ -1,0 +1,96 @@
+"""Follows jobs in a cluster's queue until all of them are over."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+from cronos_lerobot.experiments.jobs import RUNNING, Job, changes, is_done, read_record
+from cronos_lerobot.experiments.runner import CHANGED, DONE, FAILED, Display
+from cronos_lerobot.experiments.slurm import Cluster, SlurmError, squeue
+
+POLL_S = 5.0
+"""How often the queue is asked [s]."""
+MISSES = 3
+"""A job that so many looks in a row found neither queued nor done is over: shared disks are late with notes."""
+
+
+class Follower:
+    """Tells a display what becomes of jobs that were submitted.
+
+    Args:
+        jobs: each name once.
+        submitted: the element of an array that has each job, by name.
+        cluster: where they were submitted.
+        display: shows what happens.
+    """
+
+    def __init__(self, jobs: Sequence[Job], submitted: dict[str, str], cluster: Cluster, display: Display) -> None:
+        self.jobs, self.submitted, self.cluster, self.display = list(jobs), submitted, cluster, display
+        self.states: dict[str, str] = {}
+        self._missed: dict[str, int] = {}
+        self._seen: dict[str, tuple[str | None, int]] = {}
+
+    def run(self) -> dict[str, str]:
+        """Follow to the end; returns the state of every job by name.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C; the jobs go on.
+        """
+        for job in self.jobs:
+            if changes(job):
+                self._finish(job, CHANGED)
+            elif is_done(job):
+                self.states[job.name] = DONE
+            elif job.name in self.submitted:
+                self.display.event(job, f"is in the queue, {self.submitted[job.name]}")
+        while True:
+            running = self.look()
+            self.display.update(self.states, running)
+            if len(self.states) == len(self.jobs):
+                return self.states
+            time.sleep(POLL_S)
+
+    def look(self) -> list[Job]:
+        """Look once; returns the jobs that run."""
+        try:
+            queue = squeue()
+        except SlurmError:
+            # A busy controller answers later.
+            return []
+        running = []
+        for job in self.jobs:
+            if job.name in self.states:
+                continue
+            if is_done(job):
+                self._finish(job, DONE)
+                continue
+            record = read_record(job)
+            if self.submitted.get(job.name) in queue:
+                self._missed.pop(job.name, None)
+                if record.get("status") == RUNNING:
+                    running.append(job)
+                self._tell(job, record)
+                continue
+            self._missed[job.name] = self._missed.get(job.name, 0) + 1
+            if self._missed[job.name] >= MISSES:
+                self._lost(job)
+        return running
+
+    def _tell(self, job: Job, record: dict) -> None:
+        """Of a start, a stop and a new start, once each."""
+        now = record.get("status"), record.get("starts", 0)
+        if record and self._seen.get(job.name) != now:
+            again = "goes on" if now[1] > 1 and now[0] == RUNNING else now[0]
+            self.display.event(job, f"{again} (start {now[1]})" if now[1] > 1 else str(again))
+            self._seen[job.name] = now
+
+    def _lost(self, job: Job) -> None:
+        number = self.submitted.get(job.name)
+        log = "" if number is None else f", see {self.cluster.log(number)}"
+        self.display.event(job, f"left the queue and is not done{log}")
+        self._finish(job, FAILED)
+
+    def _finish(self, job: Job, state: str) -> None:
+        self.states[job.name] = state
+        self.display.event(job, state)

@@ -1,0 +1,300 @@
+"""Runs jobs on a Slurm cluster through submitit: arrays that wait for each other, requeued at their time limit.
+
+Base policies are one array, the training runs another, their evaluations a third whose elements wait each for its
+own run. An element is what the local runner is for these jobs, on a node: same folders, locks and notes, so that
+both may work on one root.
+"""
+
+from __future__ import annotations
+
+import getpass
+import json
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from cronos_lerobot.experiments.display import LineDisplay
+from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job, changes, is_done
+from cronos_lerobot.experiments.runner import DONE, Runner
+from cronos_lerobot.locks import FolderLock
+
+INSTALL = "--launcher=slurm needs submitit: pip install 'cronos-lerobot[slurm]'"
+
+
+class SlurmError(Exception):
+    """Slurm, or what is needed to talk to it, is not there or refuses."""
+
+
+@dataclass(frozen=True)
+class SlurmOptions:
+    """What an array asks of the cluster; None leaves it to the cluster."""
+
+    partition: str | None = None
+    account: str | None = None
+    qos: str | None = None
+    constraint: str | None = None
+    gres: str | None = None
+    """Such as gpu:1."""
+    mem: str | None = None
+    """Memory of an element, such as 8G."""
+    time: str = "24:00:00"
+    """Time limit of an element: minutes, H:MM:SS or D-HH:MM:SS."""
+    cpus: int | None = None
+    """Cores of an element; None is a run's threads."""
+    setup: tuple[str, ...] = ()
+    """Lines of shell before the command, such as `module load python`."""
+    requeues: int = 50
+    """How often an element may come to its time limit."""
+    warning_s: int = 120
+    """Seconds before the time limit at which an element stops its command and asks for the next start."""
+
+    def __post_init__(self) -> None:
+        if self.minutes < 1:
+            raise ValueError(f"--slurm.time={self.time} is no time to run")
+        for name, low in (("requeues", 0), ("warning_s", 1), ("cpus", 1)):
+            if (value := getattr(self, name)) is not None and value < low:
+                raise ValueError(f"--slurm.{name} must be at least {low}, got {value}")
+
+    @property
+    def minutes(self) -> int:
+        """The time limit [min].
+
+        Raises:
+            ValueError: it cannot be read.
+        """
+        found = re.fullmatch(r"(\d+)|(?:(\d+)-)?(\d+):(\d\d):(\d\d)", self.time)
+        if not found:
+            raise ValueError(f"--slurm.time must be minutes, H:MM:SS or D-HH:MM:SS, got {self.time!r}")
+        minutes, *rest = (int(number or 0) for number in found.groups())
+        days, hours, more, seconds = rest
+        return minutes + 1440 * days + 60 * hours + more + -(-seconds // 60)
+
+    def parameters(self, threads: int, parallel: int | None) -> dict[str, Any]:
+        """The parameters of submitit's SlurmExecutor.
+
+        Args:
+            threads: of each command.
+            parallel: elements of an array at a time; None leaves it to the cluster.
+        """
+        cpus = self.cpus or threads
+        names = ("partition", "account", "qos", "constraint", "gres", "mem")
+        return {name: value for name in names if (value := getattr(self, name)) is not None} | {
+            "time": self.minutes,
+            "cpus_per_task": cpus,
+            "signal_delay_s": self.warning_s,
+            "array_parallelism": parallel or 10_000,
+            "stderr_to_stdout": True,
+            # Since Slurm 22.05 srun does not ask for what sbatch was given.
+            "srun_args": [f"--cpus-per-task={cpus}"],
+            "setup": list(self.setup) or None,
+            # Requeued where a node fails; gone where what it waits for failed.
+            "additional_parameters": {"requeue": True, "kill-on-invalid-dep": "yes"},
+        }
+
+
+Elements = list[list[Job]]
+"""Of an array: the jobs of each, needs before those who need them."""
+
+
+class Task:
+    """An element of an array: its jobs, run as the local runner does; pickled, and run on a node by submitit.
+
+    Args:
+        jobs: needs come before those who need them.
+        needs: those of them that other elements run.
+        threads: of each command.
+    """
+
+    def __init__(self, jobs: Sequence[Job], needs: Sequence[Job], threads: int) -> None:
+        self.jobs, self.needs, self.threads = tuple(jobs), tuple(needs), threads
+        self._runner: Runner | None = None
+
+    def __call__(self) -> dict[str, str]:
+        """Run what is not done.
+
+        Returns:
+            The state of every job by name.
+
+        Raises:
+            RuntimeError: something needed is not done, or a job failed.
+        """
+        if missing := [job.name for job in self.needs if not is_done(job)]:
+            raise RuntimeError(f"blocked: {', '.join(missing)} is not done")
+        own = {job.name for job in self.jobs}
+        jobs = [replace(job, needs=tuple(need for need in job.needs if need in own)) for job in self.jobs]
+        self._runner = Runner(jobs, 1, LineDisplay(jobs), {"OMP_NUM_THREADS": str(self.threads)})
+        states = self._runner.run()
+        if bad := {name: state for name, state in states.items() if state != DONE}:
+            raise RuntimeError(f"not done: {bad}")
+        return states
+
+    def checkpoint(self) -> Any:
+        """Stop: submitit calls this shortly before the time limit, and then requeues what is returned."""
+        from submitit.helpers import DelayedSubmission
+
+        if self._runner is not None:
+            self._runner.stop()
+        return DelayedSubmission(Task(self.jobs, self.needs, self.threads))
+
+
+def plan_arrays(jobs: Sequence[Job], waiting: Iterable[Job]) -> tuple[Elements, Elements, Elements]:
+    """Return what each element of the three arrays runs.
+
+    Args:
+        jobs: all of them.
+        waiting: those that are to be run.
+
+    Returns:
+        Base policies, each with its demonstrations; runs, and after them what waits for no run of these; and the
+        evaluations of the first of these runs, element by element.
+    """
+    names = {job.name for job in waiting}
+    jobs = [job for job in jobs if job.name in names]
+    bases: dict[str, list[Job]] = {}
+    evaluations: dict[str, list[Job]] = {}
+    runs: list[Job] = []
+    for job in jobs:
+        if job.stage == BASE:
+            bases.setdefault(job.name.rpartition("/")[0], []).append(job)
+        elif job.stage == EVALUATION:
+            evaluations.setdefault(job.needs[0] if job.needs else job.name, []).append(job)
+        else:
+            runs.append(job)
+    runs.sort(key=lambda job: job.name not in evaluations)
+    behind = [evaluations.pop(job.name) for job in runs if job.name in evaluations]
+    return list(bases.values()), [*([job] for job in runs), *evaluations.values()], behind
+
+
+class Cluster:
+    """Submits jobs, and remembers in `folder` which element of which array has each.
+
+    Args:
+        folder: on a disk that all nodes share; holds logs and the notes.
+        options: see there.
+
+    Raises:
+        SlurmError: there is no Slurm, or no submitit.
+    """
+
+    def __init__(self, folder: Path, options: SlurmOptions) -> None:
+        try:
+            import submitit
+        except ImportError:
+            raise SlurmError(INSTALL) from None
+        for program in ("sbatch", "srun", "squeue"):
+            if not shutil.which(program):
+                raise SlurmError(f"--launcher=slurm: there is no {program} here; start it on a login node")
+        self.folder, self.options = folder.resolve(), options
+        self.logs = self.folder / "logs"
+        self._submitit = submitit
+
+    def submit(self, jobs: Sequence[Job], threads: int, parallel: int | None) -> dict[str, str]:
+        """Submit what is neither done nor in the queue.
+
+        Args:
+            jobs: each name once; needs come before those who need them.
+            threads: of each command.
+            parallel: elements of an array at a time; None leaves it to the cluster.
+
+        Returns:
+            The id of the element that has each job, by name.
+        """
+        with FolderLock(self.folder):
+            known, queue = self.read(), squeue()
+            queued = {name: number for name, number in known.items() if number in queue}
+            waiting = [job for job in jobs if job.name not in queued and not changes(job) and not is_done(job)]
+            bases, runs, evaluations = plan_arrays(jobs, waiting)
+            made = {job.name: job for job in jobs}
+            submitted: dict[str, str] = {}
+
+            def array(name: str, elements: Elements, dependency: str | None) -> list[str]:
+                tasks = [Task(element, _needs(element, made), threads) for element in elements]
+                parameters = self.options.parameters(threads, parallel) | {"dependency": dependency}
+                numbers = self._submit_array(f"cronos-{name}", tasks, parameters)
+                for element, number in zip(elements, numbers, strict=True):
+                    submitted.update({job.name: number for job in element})
+                return numbers
+
+            try:
+                array("base", bases, None)
+                # `any`: what an element needs it looks for itself, and others may have theirs.
+                needed = {need for element in runs for job in element for need in job.needs}
+                first = sorted({number for name, number in (queued | submitted).items() if name in needed})
+                numbers = array("run", runs, f"afterany:{':'.join(first)}" if first else None)
+                array("evaluation", evaluations, _after_each(numbers, len(evaluations)))
+            finally:
+                # What the cluster has taken is remembered, also where it refused the rest.
+                self._write(known | submitted)
+        return {name: number for name, number in (queued | submitted).items() if name in made}
+
+    def _submit_array(self, name: str, tasks: list[Task], parameters: dict[str, Any]) -> list[str]:
+        """Submit an array; returns its elements' ids.
+
+        Raises:
+            SlurmError: the cluster refuses it.
+        """
+        if not tasks:
+            return []
+        from submitit.core.utils import FailedJobError
+
+        executor = self._submitit.SlurmExecutor(self.logs, max_num_timeout=self.options.requeues)
+        executor.update_parameters(job_name=name, **parameters)
+        try:
+            with executor.batch():
+                jobs = [executor.submit(task) for task in tasks]
+        except FailedJobError as error:
+            raise SlurmError(f"sbatch: {error}") from None
+        return [job.job_id for job in jobs]
+
+    def read(self) -> dict[str, str]:
+        """The id of the element that had each job last, by name."""
+        return read_submitted(self.folder)
+
+    def _write(self, submitted: dict[str, str]) -> None:
+        partial = self.folder / ".submitted.json"
+        partial.write_text(json.dumps(submitted, indent=2))
+        os.replace(partial, self.folder / "submitted.json")
+
+    def log(self, number: str) -> Path:
+        """What an element printed."""
+        return self.logs / f"{number}_0_log.out"
+
+
+def read_submitted(folder: Path) -> dict[str, str]:
+    """See `Cluster.read`; {} if nothing was ever submitted from there."""
+    path = folder / "submitted.json"
+    return json.loads(path.read_text()) if path.is_file() else {}
+
+
+def _needs(element: list[Job], made: dict[str, Job]) -> list[Job]:
+    """The jobs that an element needs and others make."""
+    own = {job.name for job in element}
+    return [made[name] for name in dict.fromkeys(need for job in element for need in job.needs) if name not in own]
+
+
+def _after_each(ids: list[str], number: int) -> str | None:
+    """The dependency of an array of `number` elements on the first ones of another, one by one."""
+    if not number:
+        return None
+    if number == 1:
+        return f"afterok:{ids[0]}"
+    return f"aftercorr:{ids[0].split('_')[0]}"
+
+
+def squeue() -> dict[str, tuple[str, str]]:
+    """State (PENDING, RUNNING ...) and reason of all elements of one's own arrays that are in the queue, by id.
+
+    Raises:
+        SlurmError: squeue does not answer.
+    """
+    command = ["squeue", "--noheader", "--array", "--format=%i|%T|%r", f"--user={getpass.getuser()}"]
+    answer = subprocess.run(command, capture_output=True, text=True)
+    if answer.returncode:
+        raise SlurmError(f"squeue: {answer.stderr.strip() or 'no answer'}")
+    rows = [line.split("|") for line in answer.stdout.splitlines() if line]
+    return {number: (state, reason) for number, state, reason in rows}

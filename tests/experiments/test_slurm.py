@@ -1,0 +1,158 @@
+"""Jobs on a real Slurm of one node, where Debian's slurm-wlm and munge can be had."""
+
+import json
+import shutil
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from slurm_cluster import SlurmCluster, missing
+
+from cronos_lerobot.experiments.follow import Follower
+from cronos_lerobot.experiments.jobs import BASE, EVALUATION, RUN, Job, read_record
+from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, plan_arrays, squeue
+
+needs_slurm = pytest.mark.skipif(
+    bool(missing()), reason=f"no Slurm here ({', '.join(missing())}): Debian has it in slurm-wlm and munge"
+)
+
+
+class Tape:
+    """A display that remembers."""
+
+    def __init__(self):
+        self.events = []
+
+    def event(self, job, what):
+        self.events.append((job.name, what))
+
+    def update(self, states, running):
+        pass
+
+
+def job(folder, name, code="", **options):
+    """`code` runs with `out`, the job's folder, which it finds made."""
+    out = f"out = pathlib.Path({str(folder / name)!r})"
+    lines = ("import pathlib, time, sys", out, "out.mkdir(parents=True, exist_ok=True)", code)
+    return Job(name, ("python", "-c", "\n".join(lines)), folder / name, **options)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    # Sockets want a short path.
+    folder = Path(tempfile.mkdtemp(prefix="slurm-"))
+    with SlurmCluster(folder) as made:
+        yield made
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(autouse=True)
+def fast(monkeypatch):
+    monkeypatch.setattr("cronos_lerobot.experiments.follow.POLL_S", 0.2)
+    monkeypatch.setattr("cronos_lerobot.experiments.runner.POLL_S", 0.05)
+
+
+def follow(jobs, folder, **options):
+    cluster, tape = Cluster(folder / "slurm", SlurmOptions(**options)), Tape()
+    submitted = cluster.submit(jobs, threads=1, parallel=None)
+    return Follower(jobs, submitted, cluster, tape).run(), submitted, tape
+
+
+@pytest.mark.parametrize(
+    ("text", "minutes"), [("90", 90), ("1:00:00", 60), ("0:00:30", 1), ("2-03:10:00", 2 * 1440 + 190)]
+)
+def test_a_time_limit_is_read_as_slurm_does(text, minutes):
+    assert SlurmOptions(time=text).minutes == minutes
+
+
+@pytest.mark.parametrize("text", ["", "1h", "1:2", "-3", "0"])
+def test_no_time_limit(text):
+    with pytest.raises(ValueError, match=r"slurm\.time"):
+        SlurmOptions(time=text)
+
+
+def test_arrays_have_bases_then_runs_then_their_evaluations(tmp_path):
+    names = ("base/a/demos", "base/a/clone", "base/b/demos")
+    bases = [job(tmp_path, name, stage=BASE) for name in names]
+    base_eval = job(tmp_path, "base/a/eval", stage=EVALUATION, needs=("base/a/clone",))
+    r1, r2, r3 = (job(tmp_path, f"r{n}", stage=RUN, needs=("base/a/clone",)) for n in (1, 2, 3))
+    of = {"e2": "r2", "f2": "r2", "e3": "r3"}
+    e2, f2, e3 = (job(tmp_path, name, stage=EVALUATION, needs=(run,)) for name, run in of.items())
+    jobs = [*bases, base_eval, r1, r2, e2, f2, r3, e3]
+    made = plan_arrays(jobs, jobs)
+    assert [[[job.name for job in element] for element in array] for array in made] == [
+        [["base/a/demos", "base/a/clone"], ["base/b/demos"]],
+        [["r2"], ["r3"], ["r1"], ["base/a/eval"]],
+        [["e2", "f2"], ["e3"]],
+    ]
+    # r3 is done: its evaluation waits for nothing of these.
+    made = plan_arrays(jobs, [r1, r2, e2, f2, e3])
+    assert [[[job.name for job in element] for element in array] for array in made] == [
+        [], [["r2"], ["r1"], ["e3"]], [["e2", "f2"]],
+    ]  # fmt: skip
+
+
+@needs_slurm
+def test_arrays_wait_for_each_other_and_a_failure_blocks_only_its_own(cluster, tmp_path):
+    base = job(tmp_path, "base/a/demos", "time.sleep(1); (out / 'x').write_text('2')", stage=BASE)
+    read = f"x = int(pathlib.Path({str(tmp_path)!r}, 'base/a/demos/x').read_text())\n"
+    good = job(tmp_path, "good", read + "(out / 'x').write_text(str(3 * x))", needs=(base.name,))
+    bad = job(tmp_path, "bad", read + "sys.exit('wrong')", needs=(base.name,))
+    after = [
+        job(tmp_path, f"after_{run.name}", "(out / 'x').write_text('seen')", needs=(run.name,), stage=EVALUATION)
+        for run in (good, bad)
+    ]
+    jobs = [base, good, bad, *after]
+    states, submitted, tape = follow(jobs, tmp_path)
+    assert [states[made.name] for made in jobs] == ["done", "done", "failed", "done", "failed"]
+    assert (tmp_path / "good/x").read_text() == "6"
+    assert (tmp_path / "after_good/x").read_text() == "seen"
+    assert not (tmp_path / "after_bad").exists()
+    arrays = [int(submitted[made.name].split("_")[0]) for made in jobs]
+    assert [array - arrays[0] for array in arrays] == [0, 1, 1, 2, 2]
+    assert ("good", "done") in tape.events
+    # Once more: what is done is not submitted again.
+    _, again, _ = follow([base, good], tmp_path)
+    assert again == {}
+
+
+COUNT = """
+state = out / 'state'
+done = int(state.read_text()) if state.exists() else 0
+for n in range(done + 1, 121):
+    time.sleep(0.15)
+    state.with_suffix('.new').write_text(str(n))
+    state.with_suffix('.new').replace(state)
+    (out / 'tape').open('a').write(f'{n} ')
+"""
+
+
+@needs_slurm
+def test_a_job_that_its_time_limit_stops_goes_on_and_ends_as_an_unbroken_one(cluster, tmp_path):
+    counting = job(tmp_path, "count", COUNT)
+    resumable = Job(counting.name, counting.command, counting.output, resume=lambda: list(counting.command))
+    ended = threading.Event()
+
+    def hurry():
+        """Slurm holds a requeued job back for two minutes, unless it is told not to."""
+        while not ended.is_set():
+            for number, (state, reason) in squeue().items():
+                if state == "PENDING" and reason == "BeginTime":
+                    cluster.ask("scontrol", "update", f"JobId={number}", "StartTime=now")
+            time.sleep(0.5)
+
+    thread = threading.Thread(target=hurry)
+    thread.start()
+    try:
+        # The limit is a minute, the word that it nears comes 50 s before, give or take what Slurm rounds.
+        states, _, tape = follow([resumable], tmp_path, time="1", warning_s=50)
+    finally:
+        ended.set()
+        thread.join()
+    assert states == {"count": "done"}
+    record = read_record(resumable)
+    assert record["starts"] == 2, json.dumps(record)
+    assert (tmp_path / "count/tape").read_text().split() == [str(n) for n in range(1, 121)]
+    assert [what for _, what in tape.events if "start 2" in what]
