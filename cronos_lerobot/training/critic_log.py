@@ -23,7 +23,7 @@ class CriticLog:
     def __init__(self, protocol: ProtocolConfig) -> None:
         self.chooses_tasks = protocol.task_order == "critic"
         self.asks_for_resets = protocol.scene_reset == "critic"
-        self._state: dict[str, Any] = {"values": _no_values(), "recent": [], "resets": [], "counted": None}
+        self._state: dict[str, Any] = {"values": _no_values(), "resets": [], "popped": 0, "counted": None}
 
     def on_segment(self, segment: SegmentEnd, loop: LoopState) -> None:
         """Take in the end of a segment; its resets are done."""
@@ -45,7 +45,6 @@ class CriticLog:
                 for stream in np.flatnonzero(counts > before).tolist()
             ]
             self._state["resets"] += resets
-            self._state["recent"] += resets
 
     def pop(self) -> dict[str, Any]:
         """What was chosen since the last `pop`, under `critic`; {} if nothing goes by values.
@@ -60,8 +59,8 @@ class CriticLog:
             record["task_value"] = _mean(values["success"] + values["failure"])
             record |= {f"task_value_of_{name}": _mean(values[name]) for name in ("success", "failure")}
         if self.asks_for_resets:
-            record["resets"] = self._state["recent"]
-        self._state |= {"values": _no_values(), "recent": []}
+            record["resets"] = self._state["resets"][self._state["popped"] :]
+        self._state |= {"values": _no_values(), "popped": len(self._state["resets"])}
         return {"critic": record} if record else {}
 
     def summary(self) -> dict[str, Any] | None:

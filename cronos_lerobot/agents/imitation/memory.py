@@ -105,6 +105,7 @@ class SegmentMemory:
         self.drop_last = drop_last
         self.segments: deque[Segment] = deque()
         self._bytes = 0
+        self._lengths: np.ndarray | None = None
 
     def __len__(self) -> int:
         """Segments."""
@@ -118,7 +119,9 @@ class SegmentMemory:
     @property
     def lengths(self) -> np.ndarray:
         """Frames of each segment that can be drawn, int64."""
-        return np.array([len(segment) - self.drop_last for segment in self.segments], np.int64)
+        if self._lengths is None:
+            self._lengths = np.array([len(segment) - self.drop_last for segment in self.segments], np.int64)
+        return self._lengths
 
     def add(self, segment: Segment) -> None:
         """Keep a segment, unless no frame of it could be drawn."""
@@ -126,12 +129,14 @@ class SegmentMemory:
             return
         self.segments.append(segment)
         self._bytes += segment.nbytes
+        self._lengths = None
         while self._bytes > self.max_bytes and len(self.segments) > 1:
             self._bytes -= self.segments.popleft().nbytes
 
     def forget(self, before: int) -> None:
         """Let the segments go that were over before so many updates."""
         self.segments = deque(segment for segment in self.segments if segment.update >= before)
+        self._lengths = None
         self._bytes = sum(segment.nbytes for segment in self.segments)
 
     def draw(
@@ -163,7 +168,7 @@ class SegmentMemory:
     def load_state_dict(self, state: list[dict[str, Any]]) -> None:
         """Go on from `state_dict`."""
         self.segments.clear()
-        self._bytes = 0
+        self._bytes, self._lengths = 0, None
         for segment in state:
             self.add(Segment(**segment))
 
