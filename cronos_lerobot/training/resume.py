@@ -42,7 +42,7 @@ _TABLE = {
         "self_imitation.coef self_imitation.batch_size self_imitation.max_age self_imitation.tail_steps "
         "self_imitation.memory_gib "
         "weighting_beta max_weight "
-        "steps_per_update batch_size warmup_segments tail_steps memory_gib "
+        "steps_per_update batch_size ema_decay warmup_segments tail_steps memory_gib "
         "utd warmup_decisions target_update target_entropy backup_entropy "
         "value_max_grad_norm beta1 "
         "beta2 weight_decay",

@@ -23,6 +23,7 @@ from test_trainer import (
     weights,
 )
 
+from cronos_lerobot.agents.imitation.agent import ImitationAgent
 from cronos_lerobot.agents.imitation.config import ImitationConfig
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.evaluation.actors import SelectingPolicy
@@ -132,6 +133,29 @@ def test_a_weighted_run_keeps_what_failed_and_resumes(tmp_path, weighting):
     resumed = settings(broken, algorithm=algorithm)
     resumed.checkpoint_path = (broken / "checkpoints/last").resolve()
     torch.manual_seed(999)
+    train(resumed, policy_seed=8)
+    assert_same_run(unbroken, broken)
+
+
+def test_the_policy_may_be_an_average_of_what_is_trained_and_resumes(tmp_path, monkeypatch):
+    trained, average = [], ImitationAgent._average
+
+    def spy(agent):
+        trained.append(agent._learner.actor.weight.detach().clone())
+        average(agent)
+
+    monkeypatch.setattr(ImitationAgent, "_average", spy)
+    algorithm = ImitationConfig(steps_per_update=2, batch_size=8, warmup_segments=3, ema_decay=0.75)
+    unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
+    train(settings(unbroken, algorithm=algorithm))
+    expected = ClonedPolicy().actor.weight.detach()
+    for weight in trained:
+        expected = 0.75 * expected + 0.25 * weight
+    assert len(trained) >= 4
+    torch.testing.assert_close(weights(unbroken)["actor.weight"], expected)
+    assert train(settings(broken, algorithm=algorithm), MortalEnv) is None
+    resumed = settings(broken, algorithm=algorithm)
+    resumed.checkpoint_path = (broken / "checkpoints/last").resolve()
     train(resumed, policy_seed=8)
     assert_same_run(unbroken, broken)
 

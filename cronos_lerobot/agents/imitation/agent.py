@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,8 @@ class ImitationAgent(LearningAgent):
     def __init__(self, context: AgentContext) -> None:
         self.config: ImitationConfig = context.config
         self.policy = context.policy.eval()
+        # What the optimizer trains: the policy itself, or where the policy is an average over its steps, a copy.
+        self._learner = copy.deepcopy(self.policy) if self.config.ema_decay else self.policy
         self._processors, self._processes = context.processors, context.processes
         self._stopwatch, self._streams = context.stopwatch, context.streams
         self._rng = context.rng("imitation")
@@ -110,21 +113,24 @@ class ImitationAgent(LearningAgent):
         if found[:, 0].sum() < self.config.warmup_segments or not has_batch:
             return metrics | {"optimizer_steps": 0.0}
         with self._stopwatch("update"):
-            self.policy.train()
+            self._learner.train()
             steps = [self._step() for _ in range(self.config.steps_per_update)]
-            self.policy.eval()
+            self._learner.eval()
         means = self._processes.concatenate(np.array([steps])).mean(axis=(0, 1))
         metrics |= {"loss": float(means[0]), "grad_norm": float(means[1])}
         return metrics | {"optimizer_steps": float(len(steps))}
 
     def state_dict(self) -> dict[str, Any]:
-        """The segments that each process remembers; see `LearningAgent`."""
-        return {"memory": to_tensors(self._processes.gather(self.memory.state_dict()))}
+        """The segments that each process remembers, and what an average is of; see `LearningAgent`."""
+        learner = self._learner.state_dict() if self.config.ema_decay else {}
+        return {"memory": to_tensors(self._processes.gather(self.memory.state_dict())), "learner": learner}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on with the segments of this process, or with its share if there are more or fewer processes now."""
         processes = self._processes
         self.memory.load_state_dict(own_share(to_arrays(state["memory"]), processes.rank, processes.count))
+        if self.config.ema_decay:
+            self._learner.load_state_dict(state.get("learner") or self.policy.state_dict())
 
     def _make_player(self, generator: torch.Generator) -> Player:
         if not isinstance(self.policy, TrainablePolicy):
@@ -141,7 +147,7 @@ class ImitationAgent(LearningAgent):
     def _make_optimizer(self) -> None:
         try:
             preset = self.policy.config.get_optimizer_preset()
-            params = self.policy.get_optim_params()
+            params = self._learner.get_optim_params()
         except NotImplementedError as error:
             raise ValueError(
                 f"--policy.type={self.policy.config.type} has no optimizer preset or parameters to optimise: "
@@ -153,7 +159,7 @@ class ImitationAgent(LearningAgent):
             for group in optimizer.param_groups:
                 group["lr"] *= factor
         self._max_grad_norm = preset.grad_clip_norm
-        self._trained = [param for param in self.policy.parameters() if param.requires_grad]
+        self._trained = [param for param in self._learner.parameters() if param.requires_grad]
 
     @property
     def _optimizers(self) -> list[torch.optim.Optimizer]:
@@ -192,9 +198,19 @@ class ImitationAgent(LearningAgent):
         assert batch is not None
         return batch
 
+    @torch.no_grad()
+    def _average(self) -> None:
+        """Move the policy a little towards what is trained; what is not a weight is taken over."""
+        new = self._learner.state_dict()
+        for name, value in self.policy.state_dict().items():
+            if value.is_floating_point():
+                value.lerp_(new[name], 1 - self.config.ema_decay)
+            else:
+                value.copy_(new[name])
+
     def _step(self) -> tuple[float, float]:
         """One optimizer step, as `lerobot-train` takes it; returns the loss and the gradient's norm."""
-        loss, _ = self.policy.forward(self._processors.preprocessor(self._batch()))
+        loss, _ = self._learner.forward(self._processors.preprocessor(self._batch()))
         if not torch.isfinite(loss):
             raise FloatingPointError(f"The loss is {loss.item()}.")
         loss.backward()
@@ -204,6 +220,8 @@ class ImitationAgent(LearningAgent):
             optimizer.step()
             optimizer.zero_grad()
         # TD-MPC moves its target networks here.
-        if callable(after_step := getattr(self.policy, "update", None)):
+        if callable(after_step := getattr(self._learner, "update", None)):
             after_step()
+        if self.config.ema_decay:
+            self._average()
         return loss.item(), float(norm)

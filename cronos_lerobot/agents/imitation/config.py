@@ -37,6 +37,9 @@ class ImitationConfig(RLAlgorithmConfig):
     lr: float | None = None
     """Learning rate; null takes a tenth of the one that the policy has in lerobot-train. It stays as it is, and
     groups of parameters that have their own there are scaled alike."""
+    ema_decay: float = 0.0
+    """The policy that acts, is evaluated and saved is an average of the trained weights over about
+    1 / (1 - ema_decay) optimizer steps; 0 is the trained weights themselves."""
     warmup_segments: int = 32
     """Successful segments, of all processes together, before the first optimizer step."""
     tail_steps: int = 4
@@ -71,6 +74,8 @@ class ImitationConfig(RLAlgorithmConfig):
         for name in ("lr", "memory_gib", "temperature", "weighting_beta"):
             if (value := getattr(self, name)) is not None and not value > 0:
                 raise ValueError(f"algorithm.{name} must be > 0, got {value}.")
+        if not 0 <= self.ema_decay < 1:
+            raise ValueError(f"algorithm.ema_decay must be >= 0 and < 1, got {self.ema_decay}.")
         for name in ("demos_share", "gamma"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"algorithm.{name} must be >= 0 and <= 1, got {getattr(self, name)}.")

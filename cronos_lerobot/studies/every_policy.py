@@ -1,0 +1,287 @@
+"""Does every kind of policy learn without resets? Clones four with `lerobot-train`, trains each with each agent.
+
+    python -m cronos_lerobot.studies.every_policy --output_dir=outputs/every_policy
+
+From the privileged state of kitchen_2x2: one set of demonstrations, a base policy of each kind, and for each agent,
+reset interval and seed a `cronos-train`, evaluated on the same 256 episodes before and after. The table has the
+success of both, and the gain's 95 % interval over the seeds (Student's t). All commands lie beside what they made;
+the same command again goes on where this one was stopped, and `--report_only` makes the table of what there is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from lerobot_env_cronos import gymnasium_id
+
+from cronos_lerobot.experiments.display import make_display
+from cronos_lerobot.experiments.jobs import Job
+from cronos_lerobot.experiments.plan import LAST_POLICY
+from cronos_lerobot.experiments.progress import train_progress
+from cronos_lerobot.experiments.runner import DONE, Runner
+from cronos_lerobot.protocol.metrics import Summary, summarise
+from cronos_lerobot.training.logging import METRICS
+
+OBSERVATION = (
+    "--env.type=cronos",
+    "--env.obs_type=environment_state_agent_pos",
+    "--env.task_observation=one_hot",
+)
+RESETS = {
+    80: ("--protocol.scene_reset_interval=80",),
+    320: ("--protocol.scene_reset_interval=320", "--protocol.end_effector_reset=true"),
+}
+"""T, the second with end-effector resets, as flags of `cronos-train`."""
+MIN_MAX = {"VISUAL": "MEAN_STD", "STATE": "MIN_MAX", "ENV": "MIN_MAX"}
+IMITATION = ("--algorithm.type=imitation", "--algorithm.batch_size=256", "--algorithm.ema_decay=0.998")
+STEERING = ("--algorithm.type=steering",)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of policy, how its base is cloned, and how each agent trains it."""
+
+    clone: tuple[str, ...]
+    """Flags of `lerobot-train`."""
+    clone_steps: int
+    agents: dict[str, tuple[str, ...]]
+    """Flags of `cronos-train`."""
+    steps: dict[str, int] = field(default_factory=dict)
+    """Interaction steps of an agent, where they are not `STEPS`."""
+
+
+STEPS = 102_400
+KINDS = {
+    "tokens": Kind(
+        ("--policy.type=pocketvla",),
+        320,
+        {"ppo": (), "imitation": IMITATION},
+        {"ppo": 204_800},
+    ),
+    "flow": Kind(
+        ("--policy.type=pocketvla", "--policy.head=flow"),
+        300,
+        {
+            "ppo": ("--algorithm.noise_level=0.3", "--algorithm.ratio=factor"),
+            "imitation": IMITATION,
+            "steering": STEERING,
+        },
+        {"ppo": 204_800},
+    ),
+    "act": Kind(
+        (
+            "--policy.type=act", "--policy.chunk_size=8", "--policy.n_action_steps=2", "--policy.dim_model=128",
+            "--policy.n_heads=4", "--policy.dim_feedforward=512", "--policy.n_encoder_layers=1",
+            "--policy.use_vae=false", "--policy.dropout=0", "--policy.optimizer_lr=1e-3",
+            f"--policy.normalization_mapping={json.dumps(MIN_MAX | {'ACTION': 'MEAN_STD'})}",
+        ),
+        4000,
+        {"ppo": ("--algorithm.noise_std=0.2", "--algorithm.ratio=factor"), "imitation": IMITATION},
+    ),
+    "diffusion": Kind(
+        (
+            "--policy.type=diffusion", "--policy.n_obs_steps=1", "--policy.horizon=8", "--policy.n_action_steps=4",
+            "--policy.drop_n_last_frames=4", "--policy.down_dims=[64,128]", "--policy.kernel_size=3",
+            "--policy.n_groups=8", "--policy.diffusion_step_embed_dim=64", "--policy.noise_scheduler_type=DDIM",
+            "--policy.num_inference_steps=5", "--policy.prediction_type=sample", "--policy.optimizer_lr=1e-3",
+            "--policy.scheduler_warmup_steps=50",
+            f"--policy.normalization_mapping={json.dumps(MIN_MAX | {'ACTION': 'MIN_MAX'})}",
+            "--dataset.streaming=true", "--num_workers=1",
+        ),
+        3000,
+        {
+            "ppo": (
+                "--policy.n_action_steps=2", "--algorithm.noise_level=1", "--algorithm.noise_std=0.1",
+                "--algorithm.ratio=factor", "--algorithm.value_epochs=10", "--algorithm.minibatch_size=512",
+            ),
+            "imitation": ("--policy.n_action_steps=2", *IMITATION),
+            "steering": ("--policy.n_action_steps=2", *STEERING),
+        },
+        {"ppo": 204_800},
+    ),
+}  # fmt: skip
+"""Sizes for two cores. Agents have the settings that a look at one seed found, none is tuned further."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A training run of the study."""
+
+    kind: str
+    agent: str
+    interval: int
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        return f"{self.kind}_{self.agent}_{self.interval}_{self.seed}"
+
+    @property
+    def steps(self) -> int:
+        """S [interaction steps]."""
+        return KINDS[self.kind].steps.get(self.agent, STEPS)
+
+
+def make_runs(
+    kinds: Sequence[str], agents: Sequence[str], intervals: Sequence[int], seeds: Sequence[int]
+) -> list[Run]:
+    """The runs, first one seed of all of them, then the next; an agent that cannot train a kind is left out."""
+    return [
+        Run(kind, agent, interval, seed)
+        for seed in seeds
+        for kind in kinds
+        for agent in agents
+        if agent in KINDS[kind].agents
+        for interval in intervals
+    ]
+
+
+def make_jobs(runs: Sequence[Run], folder: Path) -> list[Job]:
+    """Demonstrations, base policies and runs, in an order that goes."""
+    environment = gymnasium_id("kitchen_2x2")
+    dataset = ("--dataset.repo_id=local/demos", f"--dataset.root={folder / 'demos'}")
+    record = (
+        "cronos-record-demos", *OBSERVATION, *dataset, "--dataset.num_episodes=400", "--seed=1",
+        "--noise.share=0.75", "--misses.share=0.25", "--steps_after_release=8",
+    )  # fmt: skip
+    jobs = [Job("demos", record, folder / "demos", environment=environment)]
+    for name in dict.fromkeys(run.kind for run in runs):
+        kind, output = KINDS[name], folder / "bases" / name
+        workers = () if any(flag.startswith("--num_workers") for flag in kind.clone) else ("--num_workers=0",)
+        clone = (
+            "lerobot-train", *dataset, *kind.clone, *workers, "--policy.device=cpu", "--policy.push_to_hub=false",
+            "--batch_size=256", f"--steps={kind.clone_steps}", f"--save_freq={kind.clone_steps}", "--seed=1",
+            f"--output_dir={output}",
+        )  # fmt: skip
+        jobs.append(Job(f"base {name}", clone, output, needs=("demos",), environment=environment))
+    return [*jobs, *(_run_job(run, folder, environment) for run in runs)]
+
+
+def _run_job(run: Run, folder: Path, environment: str) -> Job:
+    output, base = run_folder(run, folder), folder / "bases" / run.kind / LAST_POLICY
+    command = (
+        "cronos-train", f"--policy.path={base}", "--policy.device=cpu", *OBSERVATION, "--num_envs=64",
+        "--torch_threads=1", "--env.num_threads=1", "--protocol.update_interval=160", *RESETS[run.interval],
+        *KINDS[run.kind].agents[run.agent], "--eval.n_episodes=64", f"--steps={run.steps}",
+        f"--eval_freq={run.steps}", f"--save_freq={STEPS // 2}", f"--seed={run.seed}", "--tensorboard=false",
+        f"--output_dir={output}",
+    )  # fmt: skip
+
+    def resume() -> list[str] | None:
+        config = output / LAST_POLICY / "train_config.json"
+        return ["cronos-train", "--resume=true", f"--config_path={config}"] if config.is_file() else None
+
+    return Job(
+        run.name,
+        command,
+        output,
+        needs=(f"base {run.kind}",),
+        resume=resume,
+        progress=lambda: train_progress(output, run.steps),
+        environment=environment,
+        work=run.steps,
+    )
+
+
+def run_folder(run: Run, folder: Path) -> Path:
+    """`--output_dir` of a run."""
+    return folder / "runs" / run.name
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What an agent made of a base policy."""
+
+    before: float
+    after: tuple[float, ...]
+    """By seed."""
+    interventions: int
+    """Of a run, in the mean."""
+    n: int
+    """Episodes of each evaluation."""
+
+    @property
+    def gain(self) -> Summary:
+        """After minus before, over the seeds; the base's success is taken as it was measured."""
+        summary = summarise([after - self.before for after in self.after])
+        assert summary is not None
+        return summary
+
+
+def read_gain(runs: Sequence[Run], folder: Path) -> Gain | None:
+    """Read the finished ones of some runs that differ in their seed; None if there is none."""
+    ends = []
+    for run in runs:
+        path = run_folder(run, folder) / METRICS
+        lines = path.read_text().splitlines() if path.is_file() else []
+        evaluations = [record for record in map(json.loads, lines) if record["kind"] == "evaluation"]
+        if evaluations and evaluations[-1]["interaction_steps"] >= run.steps:
+            ends.append((evaluations[0], evaluations[-1]))
+    if not ends:
+        return None
+    return Gain(
+        float(np.mean([first["success"] for first, _ in ends])),
+        tuple(last["success"] for _, last in ends),
+        round(np.mean([last["interventions"] for _, last in ends])),
+        ends[0][1]["n"],
+    )
+
+
+def make_table(runs: Sequence[Run], folder: Path) -> str:
+    """A table in Markdown, a line for each kind, agent and interval that has a finished run."""
+    lines = [
+        "| policy | agent | T | steps | interventions | before | after, by seed | gain [95 %] |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    groups: dict[tuple[str, str, int], list[Run]] = {}
+    for run in runs:
+        groups.setdefault((run.kind, run.agent, run.interval), []).append(run)
+    for (kind, agent, interval), group in groups.items():
+        if gain := read_gain(group, folder):
+            after = " ".join(f"{value:.3f}"[1:] if value < 1 else "1" for value in gain.after)
+            summary = gain.gain
+            bounds = "" if summary.ci95 is None else " [{:+.3f}, {:+.3f}]".format(*summary.ci95)
+            resets = f"{interval}{' + EER' if len(RESETS[interval]) > 1 else ''}"
+            lines.append(
+                f"| {kind} | {agent} | {resets} | {group[0].steps:,} | {gain.interventions:,} "
+                f"| {gain.before:.3f} | {after} | {summary.mean:+.3f}{bounds} |"
+            )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output_dir", type=Path, default=Path("outputs/every_policy"))
+    parser.add_argument("--policies", nargs="+", choices=KINDS, default=list(KINDS))
+    agents = list(dict.fromkeys(agent for kind in KINDS.values() for agent in kind.agents))
+    parser.add_argument("--agents", nargs="+", choices=agents, default=agents)
+    parser.add_argument("--intervals", nargs="+", type=int, choices=RESETS, default=list(RESETS), help="T")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="commands at a time")
+    parser.add_argument("--report_only", action="store_true", help="run nothing")
+    args = parser.parse_args()
+    runs = make_runs(args.policies, args.agents, args.intervals, args.seeds)
+    jobs, done = make_jobs(runs, args.output_dir), True
+    if not args.report_only:
+        try:
+            with make_display(jobs) as display:
+                states = Runner(jobs, args.jobs, display, {"OMP_NUM_THREADS": "1"}).run()
+        except KeyboardInterrupt:
+            sys.exit("\ninterrupted: the same command goes on from here")
+        done = all(state == DONE for state in states.values())
+    print(make_table(runs, args.output_dir))
+    if not done:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()
