@@ -2,9 +2,9 @@
 
     python -m cronos_lerobot.studies.every_policy --output_dir=outputs/every_policy
 
-From the privileged state of kitchen_2x2: one set of demonstrations, a base policy of each kind, and for each agent,
-reset interval and seed a `cronos-train`, evaluated on the same 256 episodes before and after. The table has the
-success of both, and the gain's 95 % interval over the seeds (Student's t). All commands lie beside what they made;
+From the privileged state of kitchen_2x2: one set of demonstrations, a base policy of each kind, and a run of
+`cronos-train` for each agent, interval and seed, evaluated on the same 256 episodes before and after. The table has
+both successes, and the gain's 95 % interval over the seeds (Student's t). All commands lie beside what they made;
 the same command again goes on where this one was stopped, and `--report_only` makes the table of what there is.
 """
 
@@ -84,6 +84,7 @@ KINDS = {
         ),
         4000,
         {"ppo": ("--algorithm.noise_std=0.2", "--algorithm.ratio=factor"), "imitation": IMITATION},
+        {"ppo": 204_800},
     ),
     "diffusion": Kind(
         (

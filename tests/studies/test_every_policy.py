@@ -46,6 +46,6 @@ def test_the_table_has_the_gain_over_the_seeds(tmp_path):
     # 0.2 +- 4.303 * 0.1 / sqrt(3), t of two degrees of freedom.
     half = 4.302653 * 0.1 / 3**0.5
     gain = f"+0.200 [{0.2 - half:+.3f}, {0.2 + half:+.3f}]"
-    assert lines[2] == f"| act | ppo | 80 | 102,400 | 1,280 | 0.500 | .600 .700 .800 | {gain} |"
+    assert lines[2] == f"| act | ppo | 80 | 204,800 | 2,560 | 0.500 | .600 .700 .800 | {gain} |"
     write_run(tmp_path, imitation[1], 0.5, 0.55)
     assert make_table(runs, tmp_path).splitlines()[3].endswith("| .550 | +0.050 |")
