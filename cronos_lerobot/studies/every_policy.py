@@ -3,7 +3,7 @@
     python -m cronos_lerobot.studies.every_policy --output_dir=outputs/every_policy
 
 From the privileged state of kitchen_2x2: one set of demonstrations, a base policy of each kind, and a run of
-`cronos-train` for each agent, interval and seed, evaluated on the same 256 episodes before and after. The table has
+`cronos-train` for each agent, interval and seed, evaluated on the same 256 episodes before and after. It prints
 both successes, and the gain's 95 % interval over the seeds (Student's t). All commands lie beside what they made;
 the same command again goes on where this one was stopped, and `--report_only` makes the table of what there is.
 """
