@@ -12,14 +12,16 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from cronos_lerobot.experiments.display import LineDisplay
-from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job, changes, is_done
+from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job, changes, is_done, read_record
 from cronos_lerobot.experiments.runner import DONE, Runner
 from cronos_lerobot.locks import FolderLock
 
@@ -128,10 +130,22 @@ class Task:
         own = {job.name for job in self.jobs}
         jobs = [replace(job, needs=tuple(need for need in job.needs if need in own)) for job in self.jobs]
         self._runner = Runner(jobs, 1, LineDisplay(jobs), {"OMP_NUM_THREADS": str(self.threads)})
-        states = self._runner.run()
+        try:
+            states = self._runner.run()
+        except KeyboardInterrupt:
+            states = self._await_end()
+        # The signal reaches all processes of an element, and the command may have ended before the runner knew.
+        if any(read_record(job).get("returncode") == -signal.SIGTERM for job in jobs):
+            self._await_end()
         if bad := {name: state for name, state in states.items() if state != DONE}:
             raise RuntimeError(f"not done: {bad}")
         return states
+
+    def _await_end(self) -> NoReturn:
+        """Wait for what follows SIGTERM: what ends by itself in the grace time of a preemption is not requeued."""
+        print("cancelled or preempted: waiting for Slurm to end or requeue this job", flush=True)
+        while True:
+            time.sleep(60)
 
     def checkpoint(self) -> Any:
         """Stop: submitit calls this shortly before the time limit, and then requeues what is returned."""

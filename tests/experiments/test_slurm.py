@@ -4,7 +4,7 @@ import json
 import shutil
 import tempfile
 import threading
-import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -12,7 +12,7 @@ from slurm_cluster import SlurmCluster, missing
 
 from cronos_lerobot.experiments.follow import Follower
 from cronos_lerobot.experiments.jobs import BASE, EVALUATION, RUN, Job, read_record
-from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, plan_arrays, squeue
+from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, plan_arrays, read_submitted, squeue
 
 needs_slurm = pytest.mark.skipif(
     bool(missing()), reason=f"no Slurm here ({', '.join(missing())}): Debian has it in slurm-wlm and munge"
@@ -121,7 +121,7 @@ def test_arrays_wait_for_each_other_and_a_failure_blocks_only_its_own(cluster, t
 COUNT = """
 state = out / 'state'
 done = int(state.read_text()) if state.exists() else 0
-for n in range(done + 1, 121):
+for n in range(done + 1, int(sys.argv[1]) + 1):
     time.sleep(0.15)
     state.with_suffix('.new').write_text(str(n))
     state.with_suffix('.new').replace(state)
@@ -129,30 +129,64 @@ for n in range(done + 1, 121):
 """
 
 
-@needs_slurm
-def test_a_job_that_its_time_limit_stops_goes_on_and_ends_as_an_unbroken_one(cluster, tmp_path):
-    counting = job(tmp_path, "count", COUNT)
-    resumable = Job(counting.name, counting.command, counting.output, resume=lambda: list(counting.command))
+def counting_job(folder, number):
+    """Counts to `number`, 7 a second, and goes on from where it was stopped."""
+    counting = job(folder, "count", COUNT)
+    command = (*counting.command, str(number))
+    return Job(counting.name, command, counting.output, resume=lambda: list(command))
+
+
+@contextmanager
+def hurrying(cluster, also=lambda: None):
+    """Slurm holds a requeued job back for two minutes, unless it is told not to."""
     ended = threading.Event()
 
     def hurry():
-        """Slurm holds a requeued job back for two minutes, unless it is told not to."""
-        while not ended.is_set():
+        while not ended.wait(0.5):
+            also()
             for number, (state, reason) in squeue().items():
                 if state == "PENDING" and reason == "BeginTime":
                     cluster.ask("scontrol", "update", f"JobId={number}", "StartTime=now")
-            time.sleep(0.5)
 
     thread = threading.Thread(target=hurry)
     thread.start()
     try:
-        # The limit is a minute, the word that it nears comes 50 s before, give or take what Slurm rounds.
-        states, _, tape = follow([resumable], tmp_path, time="1", warning_s=50)
+        yield
     finally:
         ended.set()
         thread.join()
+
+
+@needs_slurm
+def test_a_job_that_its_time_limit_stops_goes_on_and_ends_as_an_unbroken_one(cluster, tmp_path):
+    counting = counting_job(tmp_path, 120)
+    with hurrying(cluster):
+        # The limit is a minute, the word that it nears comes 50 s before, give or take what Slurm rounds.
+        states, _, tape = follow([counting], tmp_path, time="1", warning_s=50)
     assert states == {"count": "done"}
-    record = read_record(resumable)
+    record = read_record(counting)
     assert record["starts"] == 2, json.dumps(record)
     assert (tmp_path / "count/tape").read_text().split() == [str(n) for n in range(1, 121)]
     assert [what for _, what in tape.events if "start 2" in what]
+
+
+@needs_slurm
+def test_a_preempted_job_waits_to_be_requeued_and_goes_on(cluster, tmp_path):
+    """As Slurm does it: first SIGTERM, and at the end of the grace time it requeues what has not ended itself."""
+    counting, sent = counting_job(tmp_path, 30), []
+
+    def preempt():
+        state = tmp_path / "count/state"
+        number = read_submitted(tmp_path / "slurm").get("count")
+        if number and not sent and state.exists() and int(state.read_text()) > 5:
+            sent.append(number)
+            cluster.ask("scancel", "--signal=TERM", number)
+        elif sent == [number] and read_record(counting)["status"] != "running":
+            sent.append("requeued")
+            cluster.ask("scontrol", "requeue", number)
+
+    with hurrying(cluster, preempt):
+        states, _, _ = follow([counting], tmp_path, time="10")
+    assert (states, sent[1:]) == ({"count": "done"}, ["requeued"])
+    assert read_record(counting)["starts"] == 2
+    assert (tmp_path / "count/tape").read_text().split() == [str(n) for n in range(1, 31)]
