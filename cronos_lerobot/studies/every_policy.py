@@ -40,7 +40,7 @@ RESETS = {
 }
 """T, the second with end-effector resets, as flags of `cronos-train`."""
 MIN_MAX = {"VISUAL": "MEAN_STD", "STATE": "MIN_MAX", "ENV": "MIN_MAX"}
-IMITATION = ("--algorithm.type=imitation", "--algorithm.batch_size=256", "--algorithm.ema_decay=0.998")
+IMITATION = ("--algorithm.type=imitation",)
 STEERING = ("--algorithm.type=steering",)
 
 

@@ -32,14 +32,14 @@ class ImitationConfig(RLAlgorithmConfig):
 
     steps_per_update: int = 100
     """Optimizer steps between two looks at the streams (protocol.update_interval)."""
-    batch_size: int = 64
+    batch_size: int = 256
     """Frames in one optimizer step of one process."""
     lr: float | None = None
     """Learning rate; null takes a tenth of the one that the policy has in lerobot-train. It stays as it is, and
     groups of parameters that have their own there are scaled alike."""
-    ema_decay: float = 0.0
+    ema_decay: float = 0.998
     """The policy that acts, is evaluated and saved is an average of the trained weights over about
-    1 / (1 - ema_decay) optimizer steps; 0 is the trained weights themselves."""
+    1 / (1 - ema_decay) optimizer steps; 0 is the trained weights themselves, and saves the memory of a copy."""
     warmup_segments: int = 32
     """Successful segments, of all processes together, before the first optimizer step."""
     tail_steps: int = 4
