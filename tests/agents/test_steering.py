@@ -44,11 +44,14 @@ class Noises(torch.nn.Module):
         return self.weight * noise[:, :4, :2]
 
 
+PAIR = {"num_critics": 2, "num_target_critics": 2}
+
+
 def make_agent(policy=None, streams=2, **options):
     generators = np.random.default_rng(0), torch.Generator().manual_seed(0)
     context = AgentContext(
         config=SteeringConfig(
-            **{"gamma": 0.5, "hidden_width": 16, "warmup_decisions": 1, "batch_size": 8} | options
+            **{"gamma": 0.5, "hidden_width": 16, "warmup_decisions": 1, "batch_size": 8, "utd": 1} | PAIR | options
         ),
         policy=policy or Noises(),
         processors=PolicyProcessors(lambda batch: batch, lambda action: action),
@@ -160,7 +163,7 @@ def test_its_values_are_the_critics_of_the_likeliest_choice():
 
 
 def make_sac(**options):
-    config = SteeringConfig(**{"hidden_width": 8, "initial_alpha": 0.5} | options)
+    config = SteeringConfig(**{"gamma": 0.99, "hidden_width": 8, "initial_alpha": 0.5} | PAIR | options)
     torch.manual_seed(0)
     actor, whitening = NoiseActor(3, 2, 8), Whitening(3)
     return SAC(config, actor, whitening, 3, 2, generator=torch.Generator().manual_seed(0))
@@ -339,7 +342,7 @@ def test_settings_out_of_range_are_refused():
     with pytest.raises(ValueError, match=r"observation must be one of .*'state'\), got 'pixels'"):
         SteeringConfig(observation="pixels")
     with pytest.raises(ValueError, match="num_target_critics must be at most num_critics=1, got 2"):
-        SteeringConfig(num_critics=1)
+        SteeringConfig(num_critics=1, num_target_critics=2)
     policy = Noises()
     policy.config.input_features = {}
     with pytest.raises(ValueError, match=r"observation=state needs a policy that observes observation\.state"):

@@ -22,7 +22,7 @@ from cronos_lerobot.scripts import eval as eval_script
 STEERED = (
     *(flag for flag in VLA_FLAGS if not flag.startswith("--algorithm.")), "--algorithm.type=steering",
     "--algorithm.hidden_width=16", "--algorithm.batch_size=8", "--algorithm.warmup_decisions=4",
-    "--algorithm.noise_repeat=true",
+    "--algorithm.noise_repeat=true", "--algorithm.utd=1",
 )  # fmt: skip
 
 
@@ -67,7 +67,12 @@ def test_smolvla_is_steered_saved_resumed_and_evaluated(tmp_path, monkeypatch, c
 
 def test_pocketvlas_flow_head_is_steered_from_the_state(tmp_path, monkeypatch, capsys):
     flags = [flag for flag in (*SMALL, *OBSERVATIONS["state"]) if not flag.startswith("--algorithm.")]
-    flags += ["--algorithm.type=steering", "--algorithm.batch_size=8", "--algorithm.warmup_decisions=8"]
+    flags += [
+        "--algorithm.type=steering",
+        "--algorithm.utd=1",
+        "--algorithm.batch_size=8",
+        "--algorithm.warmup_decisions=8",
+    ]
     run = tmp_path / "run"
     with pytest.raises(SystemExit, match=r"--policy\.head=gaussian makes no actions of noise.*head=flow"):
         cronos_train(monkeypatch, *flags, f"--output_dir={run}")
@@ -98,7 +103,12 @@ def test_pocketvlas_flow_head_is_steered_from_the_state(tmp_path, monkeypatch, c
 
 def test_a_diffusion_that_looks_back_is_steered(tmp_path, monkeypatch):
     flags = [flag for flag in DIFFUSION if not flag.startswith("--algorithm.")]
-    flags += ["--policy.noise_scheduler_type=DDIM", "--algorithm.type=steering", "--algorithm.batch_size=8"]
+    flags += [
+        "--policy.noise_scheduler_type=DDIM",
+        "--algorithm.type=steering",
+        "--algorithm.utd=1",
+        "--algorithm.batch_size=8",
+    ]
     flags += ["--algorithm.warmup_decisions=8", "--algorithm.observation=policy", "--algorithm.hidden_width=16"]
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     cronos_train(monkeypatch, *flags, "--steps=160", f"--output_dir={whole}")

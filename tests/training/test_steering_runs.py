@@ -68,7 +68,14 @@ class NoisePolicy(PreTrainedPolicy):
 
 
 def settings(folder, **options):
-    own = {"hidden_width": 32, "batch_size": 32, "warmup_decisions": 30, "observation": "state", "lr": 3e-3}
+    own = {
+        "hidden_width": 32,
+        "batch_size": 32,
+        "warmup_decisions": 30,
+        "observation": "state",
+        "lr": 3e-3,
+        "utd": 1,
+    }
     algorithm = SteeringConfig(**own | options.pop("algorithm", {}))
     return config(
         folder, **{"policy": NoiseConfig(), "algorithm": algorithm, "steps": 6 * STEPS_PER_UPDATE} | options

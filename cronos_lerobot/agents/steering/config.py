@@ -37,19 +37,20 @@ class SteeringConfig(AgentConfig):
     """b: every number of the noise lies in (-b, b). The policy was trained with N(0, 1)."""
     noise_repeat: bool = False
     """Choose the noise of one action and repeat it over the chunk; else that of every action of the chunk."""
-    gamma: float = 0.99
+    gamma: float = 0.95
     """Discount factor per control step (0.2 s)."""
-    utd: float = 1.0
-    """Optimizer steps for each decision that was made, at the next update."""
-    batch_size: int = 256
+    utd: float = 0.1
+    """Optimizer steps for each decision that was made, at the next update. Many at once, between two looks at the
+    streams, overrate what was never tried: with 1 the values grew without end."""
+    batch_size: int = 1024
     """Decisions in an optimizer step of one process."""
     warmup_decisions: int = 4096
     """Decisions on noise of N(0, 1), of all processes together, before the first optimizer step."""
     memory_size: int = 100_000
     """Decisions that are remembered, of all processes together; the newest stay. A checkpoint holds them."""
-    num_critics: int = 2
-    """Critics; 10 for more optimizer steps per decision (REDQ)."""
-    num_target_critics: int = 2
+    num_critics: int = 5
+    """Critics."""
+    num_target_critics: int = 5
     """Of them, drawn at every step, the least counts as the value of what follows."""
     hidden_width: int = 256
     """Width of the two hidden layers of the actor and of each critic."""
