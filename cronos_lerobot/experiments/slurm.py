@@ -110,10 +110,12 @@ class Task:
         jobs: needs come before those who need them.
         needs: those of them that other elements run.
         threads: of each command.
+        limit_s: its time limit [s].
     """
 
-    def __init__(self, jobs: Sequence[Job], needs: Sequence[Job], threads: int) -> None:
-        self.jobs, self.needs, self.threads = tuple(jobs), tuple(needs), threads
+    def __init__(self, jobs: Sequence[Job], needs: Sequence[Job], threads: int, limit_s: float) -> None:
+        self.jobs, self.needs, self.threads, self.limit_s = tuple(jobs), tuple(needs), threads, limit_s
+        self._began = time.monotonic()
         self._runner: Runner | None = None
 
     def __call__(self) -> dict[str, str]:
@@ -125,6 +127,7 @@ class Task:
         Raises:
             RuntimeError: something needed is not done, or a job failed.
         """
+        self._began = time.monotonic()
         if missing := [job.name for job in self.needs if not is_done(job)]:
             raise RuntimeError(f"blocked: {', '.join(missing)} is not done")
         own = {job.name for job in self.jobs}
@@ -148,12 +151,22 @@ class Task:
             time.sleep(60)
 
     def checkpoint(self) -> Any:
-        """Stop: submitit calls this shortly before the time limit, and then requeues what is returned."""
+        """Stop: submitit calls this shortly before the time limit, and then requeues what is returned.
+
+        None, which ends the job, where a whole time limit has left nothing to go on with: so would the next one.
+        """
         from submitit.helpers import DelayedSubmission
 
         if self._runner is not None:
             self._runner.stop()
-        return DelayedSubmission(Task(self.jobs, self.needs, self.threads))
+        unfinished = next((job for job in self.jobs if not is_done(job)), None)
+        has_timed_out = time.monotonic() - self._began > self.limit_s / 2
+        if has_timed_out and unfinished is not None and unfinished.resume() is None:
+            print(
+                f"{unfinished.name} came to its time limit before its first checkpoint: give a longer --slurm.time"
+            )
+            return None
+        return DelayedSubmission(Task(self.jobs, self.needs, self.threads, self.limit_s))
 
 
 def plan_arrays(jobs: Sequence[Job], waiting: Iterable[Job]) -> tuple[Elements, Elements, Elements]:
@@ -227,7 +240,8 @@ class Cluster:
             submitted: dict[str, str] = {}
 
             def array(name: str, elements: Elements, dependency: str | None) -> list[str]:
-                tasks = [Task(element, _needs(element, made), threads) for element in elements]
+                limit_s = 60.0 * self.options.minutes - self.options.warning_s
+                tasks = [Task(element, _needs(element, made), threads, limit_s) for element in elements]
                 parameters = self.options.parameters(threads, parallel) | {"dependency": dependency}
                 numbers = self._submit_array(f"cronos-{name}", tasks, parameters)
                 for element, number in zip(elements, numbers, strict=True):

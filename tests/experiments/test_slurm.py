@@ -12,7 +12,7 @@ from slurm_cluster import SlurmCluster, missing
 
 from cronos_lerobot.experiments.follow import Follower
 from cronos_lerobot.experiments.jobs import BASE, EVALUATION, RUN, Job, read_record
-from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, plan_arrays, read_submitted, squeue
+from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, Task, plan_arrays, read_submitted, squeue
 
 needs_slurm = pytest.mark.skipif(
     bool(missing()), reason=f"no Slurm here ({', '.join(missing())}): Debian has it in slurm-wlm and munge"
@@ -92,6 +92,16 @@ def test_arrays_have_bases_then_runs_then_their_evaluations(tmp_path):
     assert [[[job.name for job in element] for element in array] for array in made] == [
         [], [["r2"], ["r1"], ["e3"]], [["e2", "f2"]],
     ]  # fmt: skip
+
+
+def test_a_time_limit_that_leaves_nothing_to_go_on_with_ends_the_job(tmp_path, capsys):
+    anew = job(tmp_path, "anew")
+    resumable = Job(anew.name, anew.command, anew.output, resume=lambda: list(anew.command))
+    assert Task([anew], [], 1, limit_s=0).checkpoint() is None
+    assert "anew came to its time limit before its first checkpoint" in capsys.readouterr().out
+    # It was preempted before, or goes on from where it was.
+    for again in (Task([anew], [], 1, limit_s=3600), Task([resumable], [], 1, limit_s=0)):
+        assert [j.name for j in again.checkpoint().function.jobs] == ["anew"]
 
 
 @needs_slurm
