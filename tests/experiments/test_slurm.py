@@ -129,18 +129,20 @@ def test_arrays_wait_for_each_other_and_a_failure_blocks_only_its_own(cluster, t
 
 
 COUNT = """
-state = out / 'state'
-done = int(state.read_text()) if state.exists() else 0
+tape = out / 'tape'
+done = len(tape.read_text().split()) if tape.exists() else 0
 for n in range(done + 1, int(sys.argv[1]) + 1):
-    time.sleep(0.15)
-    state.with_suffix('.new').write_text(str(n))
-    state.with_suffix('.new').replace(state)
-    (out / 'tape').open('a').write(f'{n} ')
+    # Slow enough to be stopped, and then quick to end.
+    time.sleep(0.005 if done else 0.15)
+    # In one step: a kill leaves the old or the new.
+    new = tape.with_suffix('.new')
+    new.write_text((tape.read_text() if n > 1 else '') + f'{n} ')
+    new.replace(tape)
 """
 
 
 def counting_job(folder, number):
-    """Counts to `number`, 7 a second, and goes on from where it was stopped."""
+    """Counts to `number`, 7 a second, and goes on, faster, from where it was stopped."""
     counting = job(folder, "count", COUNT)
     command = (*counting.command, str(number))
     return Job(counting.name, command, counting.output, resume=lambda: list(command))
@@ -169,26 +171,26 @@ def hurrying(cluster, also=lambda: None):
 
 @needs_slurm
 def test_a_job_that_its_time_limit_stops_goes_on_and_ends_as_an_unbroken_one(cluster, tmp_path):
-    counting = counting_job(tmp_path, 120)
+    counting = counting_job(tmp_path, 400)
     with hurrying(cluster):
         # The limit is a minute, the word that it nears comes 50 s before, give or take what Slurm rounds.
         states, _, tape = follow([counting], tmp_path, time="1", warning_s=50)
     assert states == {"count": "done"}
     record = read_record(counting)
     assert record["starts"] == 2, json.dumps(record)
-    assert (tmp_path / "count/tape").read_text().split() == [str(n) for n in range(1, 121)]
+    assert (tmp_path / "count/tape").read_text().split() == [str(n) for n in range(1, 401)]
     assert [what for _, what in tape.events if "start 2" in what]
 
 
 @needs_slurm
 def test_a_preempted_job_waits_to_be_requeued_and_goes_on(cluster, tmp_path):
     """As Slurm does it: first SIGTERM, and at the end of the grace time it requeues what has not ended itself."""
-    counting, sent = counting_job(tmp_path, 20), []
+    counting, sent = counting_job(tmp_path, 100), []
 
     def preempt():
-        state = tmp_path / "count/state"
+        tape = tmp_path / "count/tape"
         number = read_submitted(tmp_path / "slurm").get("count")
-        if number and not sent and state.exists() and int(state.read_text()) > 5:
+        if number and not sent and tape.exists() and len(tape.read_text().split()) > 5:
             sent.append(number)
             cluster.ask("scancel", "--signal=TERM", number)
         elif sent == [number] and read_record(counting)["status"] != "running":
@@ -199,4 +201,4 @@ def test_a_preempted_job_waits_to_be_requeued_and_goes_on(cluster, tmp_path):
         states, _, _ = follow([counting], tmp_path, time="10")
     assert (states, sent[1:]) == ({"count": "done"}, ["requeued"])
     assert read_record(counting)["starts"] == 2
-    assert (tmp_path / "count/tape").read_text().split() == [str(n) for n in range(1, 21)]
+    assert (tmp_path / "count/tape").read_text().split() == [str(n) for n in range(1, 101)]
