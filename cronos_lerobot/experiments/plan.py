@@ -129,22 +129,27 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
     budgets = [f"{flag}={max(1, spec.scaled(number))}" for flag, number in spec.row.budgets]
     command = _with_flags(command, spec.row.flags, budgets, options.extra)
 
-    def resume() -> list[str] | None:
-        config = spec.train_folder / LAST_POLICY / TRAIN_CONFIG_NAME
-        plugins = [flag for flag in command if PLUGIN_FLAG in flag]
-        return ["cronos-train", "--resume=true", f"--config_path={config}", *plugins] if config.is_file() else None
-
     return Job(
         spec.name,
         tuple(command),
         spec.train_folder,
         made_from_it=(spec.evaluations_folder,),
         needs=(base,) if base else (),
-        resume=resume,
+        resume=lambda: resume_command(spec.train_folder, command),
         progress=lambda: train_progress(spec.train_folder, spec.steps),
         environment=gymnasium_id(spec.scene),
         work=spec.steps,
     )
+
+
+def resume_command(folder: Path, command: Iterable[str]) -> list[str] | None:
+    """`cronos-train` from the last checkpoint in `folder` of a run begun by `command`, with its plugins.
+
+    None before the first checkpoint.
+    """
+    config = folder / LAST_POLICY / TRAIN_CONFIG_NAME
+    plugins = [flag for flag in command if PLUGIN_FLAG in flag]
+    return ["cronos-train", "--resume=true", f"--config_path={config}", *plugins] if config.is_file() else None
 
 
 def _with_flags(command: list[str], *more: Iterable[str]) -> list[str]:

@@ -22,10 +22,10 @@ from typing import Any, NoReturn
 
 from cronos_lerobot.experiments.display import LineDisplay
 from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job, changes, is_done, read_record
-from cronos_lerobot.experiments.runner import DONE, Runner
+from cronos_lerobot.experiments.runner import DONE, FAILED, Runner
 from cronos_lerobot.locks import FolderLock
 
-INSTALL = "--launcher=slurm needs submitit: pip install 'cronos-lerobot[slurm]'"
+INSTALL = "--launcher=slurm needs submitit: pip install '.[slurm]' in a clone"
 
 
 class SlurmError(Exception):
@@ -61,6 +61,8 @@ class SlurmOptions:
         for name, low in (("requeues", 0), ("warning_s", 1), ("cpus", 1)):
             if (value := getattr(self, name)) is not None and value < low:
                 raise ValueError(f"--slurm.{name} must be at least {low}, got {value}")
+        if self.warning_s >= 60 * self.minutes:
+            raise ValueError(f"--slurm.warning_s={self.warning_s} must be less than --slurm.time={self.time}")
 
     @property
     def minutes(self) -> int:
@@ -138,7 +140,8 @@ class Task:
         except KeyboardInterrupt:
             states = self._await_end()
         # The signal reaches all processes of an element, and the command may have ended before the runner knew.
-        if any(read_record(job).get("returncode") == -signal.SIGTERM for job in jobs):
+        failed = [job for job in jobs if states[job.name] == FAILED]
+        if any(read_record(job).get("returncode") == -signal.SIGTERM for job in failed):
             self._await_end()
         if bad := {name: state for name, state in states.items() if state != DONE}:
             raise RuntimeError(f"not done: {bad}")
@@ -197,6 +200,11 @@ def plan_arrays(jobs: Sequence[Job], waiting: Iterable[Job]) -> tuple[Elements, 
     return list(bases.values()), [*([job] for job in runs), *evaluations.values()], behind
 
 
+def slurm_folder(root: Path) -> Path:
+    """Where what was submitted of a root is remembered."""
+    return root / "slurm"
+
+
 class Cluster:
     """Submits jobs, and remembers in `folder` which element of which array has each.
 
@@ -232,7 +240,7 @@ class Cluster:
             The id of the element that has each job, by name.
         """
         with FolderLock(self.folder):
-            known, queue = self.read(), squeue()
+            known, queue = read_submitted(self.folder), squeue()
             queued = {name: number for name, number in known.items() if number in queue}
             waiting = [job for job in jobs if job.name not in queued and not changes(job) and not is_done(job)]
             bases, runs, evaluations = plan_arrays(jobs, waiting)
@@ -279,11 +287,8 @@ class Cluster:
             raise SlurmError(f"sbatch: {error}") from None
         return [job.job_id for job in jobs]
 
-    def read(self) -> dict[str, str]:
-        """The id of the element that had each job last, by name."""
-        return read_submitted(self.folder)
-
     def _write(self, submitted: dict[str, str]) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
         partial = self.folder / ".submitted.json"
         partial.write_text(json.dumps(submitted, indent=2))
         os.replace(partial, self.folder / "submitted.json")
@@ -294,7 +299,7 @@ class Cluster:
 
 
 def read_submitted(folder: Path) -> dict[str, str]:
-    """See `Cluster.read`; {} if nothing was ever submitted from there."""
+    """The id of the element that had each job last, by name; {} if nothing was ever submitted from there."""
     path = folder / "submitted.json"
     return json.loads(path.read_text()) if path.is_file() else {}
 

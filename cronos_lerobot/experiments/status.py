@@ -12,7 +12,7 @@ from rich.table import Table
 from cronos_lerobot.experiments.display import duration
 from cronos_lerobot.experiments.jobs import RUNNING, STOPPED, Job, status
 from cronos_lerobot.experiments.progress import train_progress
-from cronos_lerobot.experiments.slurm import SlurmError, read_submitted, squeue
+from cronos_lerobot.experiments.slurm import SlurmError, read_submitted, slurm_folder, squeue
 
 NOTES = ("base/*/*.job.json", "runs/*/*/seed*/*.job.json", "runs/*/*/seed*/eval/*.job.json")
 """Where the notes of jobs lie in a root."""
@@ -42,7 +42,7 @@ def _name(output: Path, root: Path) -> str:
 
 def make_status_table(root: Path) -> Table:
     """A table of all jobs of a root that were started or are in the queue."""
-    submitted = read_submitted(root / "slurm")
+    submitted = read_submitted(slurm_folder(root))
     try:
         queue = squeue() if submitted else {}
     except (SlurmError, OSError):

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import sys
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from cronos_lerobot.experiments.display import make_display
+from cronos_lerobot.experiments.follow import Follower
+from cronos_lerobot.experiments.jobs import Job
 from cronos_lerobot.experiments.runner import DONE, Runner
-
-if TYPE_CHECKING:
-    from cronos_lerobot.experiments.jobs import Job
-    from cronos_lerobot.experiments.slurm import SlurmOptions
+from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, slurm_folder
 
 LAUNCHERS = ("local", "slurm")
 SLURM_FLAGS = {
@@ -22,27 +20,28 @@ SLURM_FLAGS = {
     "constraint": "features of the nodes",
     "gres": "such as gpu:1",
     "mem": "memory of a run, such as 8G",
-    "time": "time limit of a run: minutes, H:MM:SS or D-HH:MM:SS (default: 24:00:00); one that comes to it goes "
-    "on from its last checkpoint",
+    "time": "time limit of a run: minutes, H:MM:SS or D-HH:MM:SS; one that comes to it goes on from its last "
+    "checkpoint",
     "cpus": "cores of a run (default: --threads)",
     "setup": "a line of shell before the command, such as 'module load python'; may be given again",
-    "requeues": "how often a run may come to its time limit (default: 50)",
-    "warning_s": "seconds before the time limit at which a run is stopped (default: 120)",
+    "requeues": "how often a run may come to its time limit",
+    "warning_s": "seconds before the time limit at which a run is stopped",
 }
-"""Fields of `SlurmOptions`, and what `--help` says of them."""
+"""What `--help` says of the fields of `SlurmOptions`."""
 
 
 def add_launcher_flags(parser: argparse.ArgumentParser) -> None:
     """`--launcher` and what only a cluster needs."""
     group = parser.add_argument_group("clusters", "docs/cluster.md has it from nothing to a table")
     group.add_argument("--launcher", choices=LAUNCHERS, default="local", help="here (the default), or by Slurm")
-    for name, text in SLURM_FLAGS.items():
-        flag, dest = f"--slurm.{name}", f"slurm_{name}"
-        if name in ("cpus", "requeues", "warning_s"):
+    for option in fields(SlurmOptions):
+        flag, dest = f"--slurm.{option.name}", f"slurm_{option.name}"
+        text = SLURM_FLAGS[option.name] + (f" (default: {option.default})" if option.default else "")
+        if str(option.type).startswith("int"):
             group.add_argument(flag, dest=dest, type=int, metavar="N", help=text)
         else:
-            action = "append" if name == "setup" else "store"
-            group.add_argument(flag, dest=dest, action=action, metavar=name.upper(), help=text)
+            action = "append" if option.name == "setup" else "store"
+            group.add_argument(flag, dest=dest, action=action, metavar=option.name.upper(), help=text)
 
 
 def make_slurm_options(args: argparse.Namespace) -> SlurmOptions | None:
@@ -56,8 +55,6 @@ def make_slurm_options(args: argparse.Namespace) -> SlurmOptions | None:
         if given:
             raise ValueError(f"--slurm.{next(iter(given))} needs --launcher=slurm")
         return None
-    from cronos_lerobot.experiments.slurm import SlurmOptions
-
     if "setup" in given:
         given["setup"] = tuple(given["setup"])
     return SlurmOptions(**given)
@@ -85,9 +82,6 @@ def run_on_slurm(
         SlurmError: the cluster does not take it.
         KeyboardInterrupt: with what to do then as its text; the jobs go on.
     """
-    from cronos_lerobot.experiments.follow import Follower
-    from cronos_lerobot.experiments.slurm import Cluster
-
     cluster = Cluster(slurm_folder(root), options)
     submitted = cluster.submit(jobs, threads, parallel)
     arrays = " ".join(sorted({number.split("_")[0] for number in submitted.values()}, key=int))
@@ -101,13 +95,8 @@ def run_on_slurm(
         ) from None
 
 
-def slurm_folder(root: Path) -> Path:
-    """Where what was submitted of a root is remembered."""
-    return root / "slurm"
-
-
 def finish(states: dict[str, str]) -> bool:
     """Print how many jobs came to which end; returns whether all is done."""
     counts = {state: list(states.values()).count(state) for state in dict.fromkeys(states.values())}
-    print("jobs: " + ", ".join(f"{number} {state}" for state, number in counts.items()), file=sys.stdout)
+    print("jobs: " + ", ".join(f"{number} {state}" for state, number in counts.items()))
     return all(state == DONE for state in states.values())

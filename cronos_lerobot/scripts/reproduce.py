@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base, Experiment, Row, find_rows
 from cronos_lerobot.experiments.jobs import RUNNING, Job, changes, is_done, other_commits, status
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
+from cronos_lerobot.experiments.slurm import SlurmError, SlurmOptions
+from cronos_lerobot.locks import FolderInUseError
 from cronos_lerobot.scripts.launchers import (
     add_launcher_flags,
     finish,
@@ -28,7 +30,6 @@ from cronos_lerobot.scripts.launchers import (
 from cronos_lerobot.scripts.pipeline import command_line
 
 if TYPE_CHECKING:
-    from cronos_lerobot.experiments.slurm import SlurmOptions
     from cronos_lerobot.experiments.specs import Options
 
 # Modules that bring PyTorch are imported where they are needed: they take seconds, and mistakes are told before.
@@ -271,12 +272,9 @@ def run_jobs(jobs: list[Job], args: argparse.Namespace, slurm: SlurmOptions | No
         if slurm is None:
             parallel = args.jobs or max(1, (os.cpu_count() or 1) // args.threads)
             return run_here(jobs, parallel, args.threads)
-        from cronos_lerobot.experiments.slurm import SlurmError
-
-        try:
-            return run_on_slurm(jobs, slurm, args.root, args.threads, args.jobs)
-        except SlurmError as error:
-            sys.exit(f"error: {error}")
+        return run_on_slurm(jobs, slurm, args.root, args.threads, args.jobs)
+    except (SlurmError, FolderInUseError) as error:
+        sys.exit(f"error: {error}")
     except KeyboardInterrupt as end:
         sys.exit(f"\n{end}")
 

@@ -23,7 +23,7 @@ from lerobot_env_cronos import gymnasium_id
 
 from cronos_lerobot.experiments.display import make_display
 from cronos_lerobot.experiments.jobs import Job
-from cronos_lerobot.experiments.plan import LAST_POLICY
+from cronos_lerobot.experiments.plan import LAST_POLICY, resume_command
 from cronos_lerobot.experiments.progress import train_progress
 from cronos_lerobot.experiments.runner import DONE, Runner
 from cronos_lerobot.protocol.metrics import Summary, summarise
@@ -176,16 +176,12 @@ def _run_job(run: Run, folder: Path, environment: str) -> Job:
         f"--output_dir={output}",
     )  # fmt: skip
 
-    def resume() -> list[str] | None:
-        config = output / LAST_POLICY / "train_config.json"
-        return ["cronos-train", "--resume=true", f"--config_path={config}"] if config.is_file() else None
-
     return Job(
         run.name,
         command,
         output,
         needs=(f"base {run.kind}",),
-        resume=resume,
+        resume=lambda: resume_command(output, command),
         progress=lambda: train_progress(output, run.steps),
         environment=environment,
         work=run.steps,
@@ -206,8 +202,6 @@ class Gain:
     """By seed."""
     interventions: int
     """Of a run, in the mean."""
-    n: int
-    """Episodes of each evaluation."""
 
     @property
     def gain(self) -> Summary:
@@ -232,7 +226,6 @@ def read_gain(runs: Sequence[Run], folder: Path) -> Gain | None:
         float(np.mean([first["success"] for first, _ in ends])),
         tuple(last["success"] for _, last in ends),
         round(np.mean([last["interventions"] for _, last in ends])),
-        ends[0][1]["n"],
     )
 
 
@@ -247,7 +240,7 @@ def make_table(runs: Sequence[Run], folder: Path) -> str:
         groups.setdefault((run.kind, run.agent, run.interval), []).append(run)
     for (kind, agent, interval), group in groups.items():
         if gain := read_gain(group, folder):
-            after = " ".join(f"{value:.3f}"[1:] if value < 1 else "1" for value in gain.after)
+            after = " ".join(f"{value:.3f}".lstrip("0") for value in gain.after)
             summary = gain.gain
             bounds = "" if summary.ci95 is None else " [{:+.3f}, {:+.3f}]".format(*summary.ci95)
             resets = f"{interval}{' + EER' if len(RESETS[interval]) > 1 else ''}"

@@ -107,6 +107,10 @@ def test_list_names_every_row(monkeypatch, capsys):
         (["table1", "--slurm.time=60"], "--slurm.time needs --launcher=slurm"),
         (["table1", "--launcher=slurm", "--slurm.time=2h"], "--slurm.time must be minutes, H:MM:SS or D-HH:MM:SS"),
         (["table1", "--launcher=slurm", "--slurm.cpus=0"], "--slurm.cpus must be at least 1, got 0"),
+        (
+            ["table1", "--launcher=slurm", "--slurm.time=2"],
+            "--slurm.warning_s=120 must be less than",
+        ),
         (["status", "--root=nowhere"], "nothing was started in nowhere yet"),
         (["table2"], "invalid choice: 'table2'"),
         (["all", "--rows", "t80"], "for one experiment"),

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 import tempfile
 import threading
 from contextlib import contextmanager
@@ -11,7 +12,7 @@ import pytest
 from slurm_cluster import SlurmCluster, missing
 
 from cronos_lerobot.experiments.follow import Follower
-from cronos_lerobot.experiments.jobs import BASE, EVALUATION, RUN, Job, read_record
+from cronos_lerobot.experiments.jobs import BASE, EVALUATION, RUN, Job, read_record, write_record
 from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, Task, plan_arrays, read_submitted, squeue
 
 needs_slurm = pytest.mark.skipif(
@@ -64,7 +65,7 @@ def follow(jobs, folder, **options):
     ("text", "minutes"), [("90", 90), ("1:00:00", 60), ("0:00:30", 1), ("2-03:10:00", 2 * 1440 + 190)]
 )
 def test_a_time_limit_is_read_as_slurm_does(text, minutes):
-    assert SlurmOptions(time=text).minutes == minutes
+    assert SlurmOptions(time=text, warning_s=1).minutes == minutes
 
 
 @pytest.mark.parametrize("text", ["", "1h", "1:2", "-3", "0"])
@@ -104,6 +105,17 @@ def test_a_time_limit_that_leaves_nothing_to_go_on_with_ends_the_job(tmp_path, c
         assert [j.name for j in again.checkpoint().function.jobs] == ["anew"]
 
 
+def test_an_old_interruption_of_what_is_blocked_is_not_taken_for_a_signal(tmp_path):
+    """It would wait for Slurm to end it, for all of its time limit."""
+    bad = job(tmp_path, "bad", "sys.exit('wrong')")
+    blocked = job(tmp_path, "blocked", needs=("bad",))
+    write_record(
+        blocked, {"command": [], "status": "stopped", "seconds": 1.0, "starts": 1, "returncode": -signal.SIGTERM}
+    )
+    with pytest.raises(RuntimeError, match="'bad': 'failed', 'blocked': 'blocked'"):
+        Task([bad, blocked], [], 1, limit_s=60)()
+
+
 @needs_slurm
 def test_arrays_wait_for_each_other_and_a_failure_blocks_only_its_own(cluster, tmp_path):
     base = job(tmp_path, "base/a/demos", "time.sleep(1); (out / 'x').write_text('2')", stage=BASE)
@@ -123,9 +135,10 @@ def test_arrays_wait_for_each_other_and_a_failure_blocks_only_its_own(cluster, t
     arrays = [int(submitted[made.name].split("_")[0]) for made in jobs]
     assert [array - arrays[0] for array in arrays] == [0, 1, 1, 2, 2]
     assert ("good", "done") in tape.events
-    # Once more: what is done is not submitted again.
-    _, again, _ = follow([base, good], tmp_path)
-    assert again == {}
+    # Once more: what is done is not submitted again, also by one who has never submitted anything.
+    for remembered in (tmp_path, tmp_path / "elsewhere"):
+        states, again, _ = follow([base, good], remembered)
+        assert (states, again) == ({base.name: "done", "good": "done"}, {})
 
 
 COUNT = """
@@ -177,7 +190,7 @@ def test_a_job_that_its_time_limit_stops_goes_on_and_ends_as_an_unbroken_one(clu
         states, _, tape = follow([counting], tmp_path, time="1", warning_s=50)
     assert states == {"count": "done"}
     record = read_record(counting)
-    assert record["starts"] == 2, json.dumps(record)
+    assert record["starts"] >= 2, json.dumps(record)
     assert (tmp_path / "count/tape").read_text().split() == [str(n) for n in range(1, 401)]
     assert [what for _, what in tape.events if "start 2" in what]
 

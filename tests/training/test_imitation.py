@@ -23,7 +23,7 @@ from test_trainer import (
     weights,
 )
 
-from cronos_lerobot.agents.imitation.agent import ImitationAgent
+from cronos_lerobot.agents.imitation.agent import ImitationAgent, copy_trained
 from cronos_lerobot.agents.imitation.config import ImitationConfig
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.evaluation.actors import SelectingPolicy
@@ -138,13 +138,13 @@ def test_a_weighted_run_keeps_what_failed_and_resumes(tmp_path, weighting):
 
 
 def test_the_policy_may_be_an_average_of_what_is_trained_and_resumes(tmp_path, monkeypatch):
-    trained, average = [], ImitationAgent._average
+    trained, average = [], ImitationAgent._move_average
 
     def spy(agent):
         trained.append(agent._learner.actor.weight.detach().clone())
         average(agent)
 
-    monkeypatch.setattr(ImitationAgent, "_average", spy)
+    monkeypatch.setattr(ImitationAgent, "_move_average", spy)
     algorithm = ImitationConfig(steps_per_update=2, batch_size=8, warmup_segments=3, ema_decay=0.75)
     unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
     train(settings(unbroken, algorithm=algorithm))
@@ -158,6 +158,20 @@ def test_the_policy_may_be_an_average_of_what_is_trained_and_resumes(tmp_path, m
     resumed.checkpoint_path = (broken / "checkpoints/last").resolve()
     train(resumed, policy_seed=8)
     assert_same_run(unbroken, broken)
+
+
+def test_an_average_costs_only_what_is_trained(tmp_path):
+    """Of a large policy with a small adapter, that is little in memory and in the checkpoint."""
+    policy = ClonedPolicy()
+    policy.critic.requires_grad_(False)
+    copied = copy_trained(policy)
+    assert copied.critic.weight is policy.critic.weight
+    assert copied.actor.weight is not policy.actor.weight
+    algorithm = ImitationConfig(steps_per_update=2, batch_size=8, warmup_segments=3)
+    trainer = Trainer(
+        settings(tmp_path, algorithm=algorithm), DummyEnv(4), DummyEnv, policy, *identity_processors()
+    )
+    assert set(trainer.agent.state_dict()["learner"]) == {"actor.weight", "actor.bias"}
 
 
 def in_processes(processes, cfg, env_class=DummyEnv):

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from cronos_lerobot.agents.base import (
     ActionSample,
@@ -52,7 +54,8 @@ class ImitationAgent(LearningAgent):
         self.config: ImitationConfig = context.config
         self.policy = context.policy.eval()
         # What the optimizer trains: the policy itself, or where the policy is an average over its steps, a copy.
-        self._learner = copy.deepcopy(self.policy) if self.config.ema_decay else self.policy
+        self._learner = copy_trained(self.policy) if self.config.ema_decay else self.policy
+        self._average = get_ema_multi_avg_fn(self.config.ema_decay)
         self._processors, self._processes = context.processors, context.processes
         self._stopwatch, self._streams = context.stopwatch, context.streams
         self._rng = context.rng("imitation")
@@ -122,7 +125,10 @@ class ImitationAgent(LearningAgent):
 
     def state_dict(self) -> dict[str, Any]:
         """The segments that each process remembers, and what an average is of; see `LearningAgent`."""
-        learner = self._learner.state_dict() if self.config.ema_decay else {}
+        learner = {}
+        if self.config.ema_decay:
+            frozen = {name for name, param in self.policy.named_parameters() if not param.requires_grad}
+            learner = {name: value for name, value in self._learner.state_dict().items() if name not in frozen}
         return {"memory": to_tensors(self._processes.gather(self.memory.state_dict())), "learner": learner}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -130,7 +136,7 @@ class ImitationAgent(LearningAgent):
         processes = self._processes
         self.memory.load_state_dict(own_share(to_arrays(state["memory"]), processes.rank, processes.count))
         if self.config.ema_decay:
-            self._learner.load_state_dict(state.get("learner") or self.policy.state_dict())
+            self._learner.load_state_dict(state.get("learner") or self.policy.state_dict(), strict=False)
 
     def _make_player(self, generator: torch.Generator) -> Player:
         if not isinstance(self.policy, TrainablePolicy):
@@ -198,16 +204,6 @@ class ImitationAgent(LearningAgent):
         assert batch is not None
         return batch
 
-    @torch.no_grad()
-    def _average(self) -> None:
-        """Move the policy a little towards what is trained; what is not a weight is taken over."""
-        new = self._learner.state_dict()
-        for name, value in self.policy.state_dict().items():
-            if value.is_floating_point():
-                value.lerp_(new[name], 1 - self.config.ema_decay)
-            else:
-                value.copy_(new[name])
-
     def _step(self) -> tuple[float, float]:
         """One optimizer step, as `lerobot-train` takes it; returns the loss and the gradient's norm."""
         loss, _ = self._learner.forward(self._processors.preprocessor(self._batch()))
@@ -223,5 +219,19 @@ class ImitationAgent(LearningAgent):
         if callable(after_step := getattr(self._learner, "update", None)):
             after_step()
         if self.config.ema_decay:
-            self._average()
+            self._move_average()
         return loss.item(), float(norm)
+
+    @torch.no_grad()
+    def _move_average(self) -> None:
+        """Move the policy a little towards what is trained; buffers are taken over."""
+        averaged = [param for param in self.policy.parameters() if param.requires_grad]
+        self._average(averaged, self._trained, 0)
+        for buffer, new in zip(self.policy.buffers(), self._learner.buffers(), strict=True):
+            buffer.copy_(new)
+
+
+def copy_trained(policy: PreTrainedPolicy) -> PreTrainedPolicy:
+    """A copy that shares the parameters that are not trained, which may be most of a large policy."""
+    shared = {id(param): param for param in policy.parameters() if not param.requires_grad}
+    return copy.deepcopy(policy, memo=shared)
