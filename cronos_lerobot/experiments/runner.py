@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -30,9 +30,12 @@ from cronos_lerobot.experiments.jobs import (
 
 POLL_S = 0.5
 """How often the running jobs are looked at [s]."""
-GRACE_S = 15.0
-"""How long a job may take to end after it was asked to [s]."""
+GRACE_S = 120.0
+"""How long a job may take to end after it was asked to [s]: `cronos-train` ends its update and saves."""
+KILL_S = 15.0
+"""How long one may take that was killed [s]."""
 ELSEWHERE = "is being run by another process: waiting for it"
+STOPPING = "saves what it has and stops; Ctrl-C ends it at once"
 DONE, FAILED, CHANGED, BLOCKED = "done", "failed", "changed", "blocked"
 ENDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 """Those that end the runner as Ctrl-C does; the second is a closed terminal's."""
@@ -70,17 +73,23 @@ class Runner:
         parallel: how many run at once.
         display: shows what happens.
         environment: variables of the commands, besides those of this process.
+        grace_s: how long a job may take to end after it was asked to [s].
     """
 
     def __init__(
-        self, jobs: Sequence[Job], parallel: int, display: Display, environment: dict[str, str] | None = None
+        self,
+        jobs: Sequence[Job],
+        parallel: int,
+        display: Display,
+        environment: dict[str, str] | None = None,
+        grace_s: float = GRACE_S,
     ) -> None:
         self.jobs = {job.name: job for job in jobs}
         if len(self.jobs) < len(jobs):
             raise ValueError("two jobs have the same name")
         if parallel < 1:
             raise ValueError(f"at least one job must run at a time, got {parallel}")
-        self.parallel, self.display = parallel, display
+        self.parallel, self.display, self.grace_s = parallel, display, grace_s
         # Unbuffered, so that a log says in time, and in order, what its command does.
         self.environment = os.environ | {"PYTHONUNBUFFERED": "1"} | (environment or {})
         self.states: dict[str, str] = {}
@@ -186,19 +195,25 @@ class Runner:
         self.display.event(job, state)
 
     def stop(self) -> None:
-        """End the commands that still run: they can be resumed."""
+        """End the commands that still run: they can be resumed. Ctrl-C ends them at once."""
+        for child in self._children:
+            self.display.event(child.job, STOPPING)
         # Not by SIGINT: whoever starts us in the background has it ignored.
-        for sent in (signal.SIGTERM, signal.SIGKILL):
+        for sent, limit_s in ((signal.SIGTERM, self.grace_s), (signal.SIGKILL, KILL_S)):
             _signal_groups(self._children, sent)
-            deadline = time.monotonic() + GRACE_S
-            while any(child.process.poll() is None for child in self._children) and time.monotonic() < deadline:
-                time.sleep(0.05)
+            with suppress(KeyboardInterrupt):
+                self._await_children(limit_s)
         stopped = list(self._children)
         for child in stopped:
             self._end(child, STOPPED, {"returncode": child.process.wait()})
         # A terminal that is gone cannot be written to: the notes come first.
         for child in stopped:
             self.display.event(child.job, STOPPED)
+
+    def _await_children(self, limit_s: float) -> None:
+        deadline = time.monotonic() + limit_s
+        while any(child.process.poll() is None for child in self._children) and time.monotonic() < deadline:
+            time.sleep(0.05)
 
 
 @contextmanager

@@ -113,10 +113,14 @@ class Task:
         needs: those of them that other elements run.
         threads: of each command.
         limit_s: its time limit [s].
+        grace_s: how long a command may take to end after it was asked to [s].
     """
 
-    def __init__(self, jobs: Sequence[Job], needs: Sequence[Job], threads: int, limit_s: float) -> None:
-        self.jobs, self.needs, self.threads, self.limit_s = tuple(jobs), tuple(needs), threads, limit_s
+    def __init__(
+        self, jobs: Sequence[Job], needs: Sequence[Job], threads: int, limit_s: float, grace_s: float
+    ) -> None:
+        self.jobs, self.needs, self.threads = tuple(jobs), tuple(needs), threads
+        self.limit_s, self.grace_s = limit_s, grace_s
         self._began = time.monotonic()
         self._runner: Runner | None = None
 
@@ -134,7 +138,7 @@ class Task:
             raise RuntimeError(f"blocked: {', '.join(missing)} is not done")
         own = {job.name for job in self.jobs}
         jobs = [replace(job, needs=tuple(need for need in job.needs if need in own)) for job in self.jobs]
-        self._runner = Runner(jobs, 1, LineDisplay(jobs), {"OMP_NUM_THREADS": str(self.threads)})
+        self._runner = Runner(jobs, 1, LineDisplay(jobs), {"OMP_NUM_THREADS": str(self.threads)}, self.grace_s)
         try:
             states = self._runner.run()
         except KeyboardInterrupt:
@@ -169,7 +173,7 @@ class Task:
                 f"{unfinished.name} came to its time limit before its first checkpoint: give a longer --slurm.time"
             )
             return None
-        return DelayedSubmission(Task(self.jobs, self.needs, self.threads, self.limit_s))
+        return DelayedSubmission(Task(self.jobs, self.needs, self.threads, self.limit_s, self.grace_s))
 
 
 def plan_arrays(jobs: Sequence[Job], waiting: Iterable[Job]) -> tuple[Elements, Elements, Elements]:
@@ -249,7 +253,9 @@ class Cluster:
 
             def array(name: str, elements: Elements, dependency: str | None) -> list[str]:
                 limit_s = 60.0 * self.options.minutes - self.options.warning_s
-                tasks = [Task(element, _needs(element, made), threads, limit_s) for element in elements]
+                # The rest of the warning is for what follows a killed command.
+                grace_s = 0.75 * self.options.warning_s
+                tasks = [Task(element, _needs(element, made), threads, limit_s, grace_s) for element in elements]
                 parameters = self.options.parameters(threads, parallel) | {"dependency": dependency}
                 numbers = self._submit_array(f"cronos-{name}", tasks, parameters)
                 for element, number in zip(elements, numbers, strict=True):

@@ -5,7 +5,8 @@ Example:
         --protocol.scene_reset_interval=1280 --steps=1300000 --output_dir=outputs/train/eer
 """
 
-from contextlib import ExitStack
+import signal
+from contextlib import ExitStack, nullcontext
 from typing import Any
 
 import torch
@@ -22,6 +23,7 @@ from cronos_lerobot.processes import join_processes
 from cronos_lerobot.scripts.errors import error_line, parse_command_line
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.factory import make_env, make_eval_env, make_policy_and_processors
+from cronos_lerobot.training.stopping import StopRequest, end_by
 from cronos_lerobot.training.trainer import Trainer
 
 
@@ -55,7 +57,14 @@ def train(config: CronosTrainConfig) -> None:
 
             trainer = Trainer(config, env, make_own_eval_env, policy, preprocessor, postprocessor, processes)
             trainer.load()
-        trainer.train()
+        # What keeps nothing ends at once.
+        stop = StopRequest()
+        with stop if config.save_checkpoint else nullcontext():
+            has_ended = trainer.train(stop)
+    if not has_ended:
+        processes.leave()
+        # None: another of the processes was told.
+        end_by(stop.number or signal.SIGTERM)
     if processes.is_main:
         push_to_hub(config, trainer.agent, preprocessor, postprocessor)
     processes.leave()

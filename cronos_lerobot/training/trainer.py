@@ -30,6 +30,7 @@ from cronos_lerobot.training.recording import FilmedEnv, StreamObserver
 from cronos_lerobot.training.rollout import RolloutStatistics, SmoothedSuccess
 from cronos_lerobot.training.seeding import NamedGenerators
 from cronos_lerobot.training.sharding import ShardedEnv, whole_step
+from cronos_lerobot.training.stopping import StopRequest
 
 
 class Trainer:
@@ -137,15 +138,22 @@ class Trainer:
         elif budget is not None and self.loop.b >= budget:
             logging.warning(f"The run has spent its {self.loop.b} interventions: --protocol.reset_budget=<more>.")
 
-    def train(self) -> None:
-        """Run to the last step or the end of the budget, from the start or from the config's checkpoint."""
+    def train(self, stop: StopRequest | None = None) -> bool:
+        """Run to the last step or the end of the budget, from the start or from the config's checkpoint.
+
+        Args:
+            stop: once it has a signal, the run ends after the update that it is in, with a checkpoint.
+
+        Returns:
+            Whether it came to its end.
+        """
         if not self._observers:
             self.load()
         self._open_observers(self._observers)
         try:
             if self.loop.t == 0:
                 self._evaluate()
-            self._run()
+            return self._run(stop or StopRequest())
         finally:
             self.recorder.close()
             self.logger.close()
@@ -161,7 +169,7 @@ class Trainer:
                 self.config, self.env, states.get("recorder"), lambda why: self.logger.log("recording", why)
             )
 
-    def _run(self) -> None:
+    def _run(self, stop: StopRequest) -> bool:
         last_save = self.loop.n
         updated = False
         env_state: dict[str, np.ndarray] | None = None
@@ -182,15 +190,24 @@ class Trainer:
             if _due(self.loop.n, self._last_evaluation, self.config.eval_freq) or self._reached():
                 self._evaluate()
             self._last_interventions = self.loop.b
-            if self.config.save_checkpoint and _due(self.loop.n, last_save, self.config.save_freq):
+            ends = self._is_stopped(stop)
+            if self.config.save_checkpoint and (ends or _due(self.loop.n, last_save, self.config.save_freq)):
                 self._save(env_state)
                 last_save = self.loop.n
+            if ends:
+                return False
         if self._last_evaluation < self.loop.n:
             self._evaluate()
         if self.config.save_checkpoint and (last_save < self.loop.n or not self._has_checkpoint()):
             self._save(self.env.get_state() if env_state is None else env_state)
         if summary := self.critic_log.summary():
             self.logger.log("resets", summary)
+        return True
+
+    def _is_stopped(self, stop: StopRequest) -> bool:
+        """Whether any process was told to stop; all of them then do, but not where the run ends anyway."""
+        asked = self.processes.concatenate(np.array([stop.number is not None])).any()
+        return bool(asked) and self.loop.n < self.config.total_steps
 
     def _events(self) -> Any:
         record = self.config.record

@@ -98,10 +98,10 @@ def test_arrays_have_bases_then_runs_then_their_evaluations(tmp_path):
 def test_a_time_limit_that_leaves_nothing_to_go_on_with_ends_the_job(tmp_path, capsys):
     anew = job(tmp_path, "anew")
     resumable = Job(anew.name, anew.command, anew.output, resume=lambda: list(anew.command))
-    assert Task([anew], [], 1, limit_s=0).checkpoint() is None
+    assert Task([anew], [], 1, limit_s=0, grace_s=1).checkpoint() is None
     assert "anew came to its time limit before its first checkpoint" in capsys.readouterr().out
     # It was preempted before, or goes on from where it was.
-    for again in (Task([anew], [], 1, limit_s=3600), Task([resumable], [], 1, limit_s=0)):
+    for again in (Task([anew], [], 1, 3600, 1), Task([resumable], [], 1, 0, 1)):
         assert [j.name for j in again.checkpoint().function.jobs] == ["anew"]
 
 
@@ -113,7 +113,7 @@ def test_an_old_interruption_of_what_is_blocked_is_not_taken_for_a_signal(tmp_pa
         blocked, {"command": [], "status": "stopped", "seconds": 1.0, "starts": 1, "returncode": -signal.SIGTERM}
     )
     with pytest.raises(RuntimeError, match="'bad': 'failed', 'blocked': 'blocked'"):
-        Task([bad, blocked], [], 1, limit_s=60)()
+        Task([bad, blocked], [], 1, limit_s=60, grace_s=1)()
 
 
 @needs_slurm

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import signal
 import sys
 from pathlib import Path
 
@@ -38,14 +39,41 @@ def weights(folder):
     return load_file(folder / "checkpoints/last/pretrained_model/model.safetensors")
 
 
+STOPPED = """
+import os, signal, sys, threading, time
+from pathlib import Path
+from cronos_lerobot.scripts import train
+
+folder = Path(sys.argv.pop(1))
+# As a cluster does: to all processes, those that draw among them.
+os.setsid()
+
+def stop():
+    while not list(folder.glob("checkpoints/*")):
+        time.sleep(0.01)
+    os.killpg(0, signal.SIGTERM)
+
+threading.Thread(target=stop, daemon=True).start()
+train.main()
+"""
+
+
 @pytest.mark.parametrize("observation", OBSERVATIONS)
-def test_train_kill_resume(observation, tmp_path, monkeypatch):
+def test_a_run_that_is_told_to_stop_saves_and_resumes(observation, tmp_path, monkeypatch):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
-    cronos_train(monkeypatch, *SMALL, *OBSERVATIONS[observation], f"--output_dir={whole}")
-    cronos_train(monkeypatch, *SMALL, *OBSERVATIONS[observation], f"--output_dir={broken}", "--steps=16")
-    last = broken / "checkpoints/last/pretrained_model"
-    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=32")
-    before, after = load_file(broken / "checkpoints/000016/pretrained_model/model.safetensors"), weights(broken)
+    flags = (*SMALL, *OBSERVATIONS[observation], f"--output_dir={broken}", "--steps=100000", "--save_freq=16")
+    stopped = run_forked([sys.executable, "-c", STOPPED, broken, *flags])
+    assert stopped.returncode == -signal.SIGTERM, stopped.stderr
+    assert "SIGTERM: ending after this update, with a checkpoint" in stopped.stderr
+    last = broken / "checkpoints/last"
+    steps = int(last.resolve().name)
+    lines = [json.loads(line) for line in (broken / "metrics.jsonl").read_text().splitlines()]
+    assert [line["interaction_steps"] for line in lines if line["kind"] == "update"][-1] == steps < 100_000
+    before = weights(broken)
+    end = f"--steps={steps + 16}"
+    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/pretrained_model/train_config.json", end)
+    cronos_train(monkeypatch, *SMALL, *OBSERVATIONS[observation], f"--output_dir={whole}", end)
+    after = weights(broken)
     assert any(not torch.equal(before[name], after[name]) for name in before)
     for name, tensor in weights(whole).items():
         assert torch.equal(tensor, after[name]), name

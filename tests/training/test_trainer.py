@@ -1,6 +1,7 @@
 """Whole runs with a dummy environment and policy: resuming, seeds, logs, recordings."""
 
 import json
+import signal
 from importlib.metadata import version
 
 import numpy as np
@@ -13,6 +14,7 @@ from safetensors.torch import load_file
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.training.config import CronosTrainConfig, PeriodicEvaluationConfig, RecordConfig
+from cronos_lerobot.training.stopping import StopRequest
 from cronos_lerobot.training.trainer import Trainer
 
 VOLATILE = ("time", "time_share", "steps_per_s")
@@ -103,6 +105,44 @@ def test_resumed_run_equals_the_unbroken_one(tmp_path):
     train(resumed, policy_seed=8)
     assert_same_run(unbroken, broken)
     assert len(json.loads((broken / "manifest.json").read_text())["starts"]) == 2
+
+
+class SignallingEnv(DummyEnv):
+    """Has the process told to stop in the middle of a segment."""
+
+    def step(self, actions):
+        if self.t == 21:
+            signal.raise_signal(signal.SIGINT)
+        return super().step(actions)
+
+
+def test_a_run_that_is_told_to_stop_ends_its_update_and_resumes_as_the_unbroken_one(tmp_path):
+    """Saved where no checkpoint was due: the one at the end of the update that it is in."""
+    unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
+    rarely = {"save_freq": 4 * STEPS_PER_UPDATE}
+    train(config(unbroken, **rarely))
+    with StopRequest() as stop:
+        assert not make_trainer(
+            config(broken, **rarely), env=SignallingEnv(STREAMS, diverge_at={(5, 1), (21, 2)})
+        ).train(stop)
+    assert stop.number == signal.SIGINT
+    resumed = config(broken, **rarely)
+    resumed.checkpoint_path = (broken / "checkpoints/last").resolve()
+    assert resumed.checkpoint_path.name == f"{3 * STEPS_PER_UPDATE:06d}"
+    assert make_trainer(resumed, policy_seed=8).train()
+    assert_same_run(unbroken, broken)
+
+
+@pytest.mark.parametrize(("after_s", "ends"), [(0.5, []), (2.5, [signal.SIGTERM])])
+def test_a_second_signal_ends_at_once_but_not_an_echo_of_the_first(after_s, ends, monkeypatch):
+    ended, clock = [], [100.0]
+    monkeypatch.setattr("cronos_lerobot.training.stopping.end_by", ended.append)
+    monkeypatch.setattr("cronos_lerobot.training.stopping.time.monotonic", lambda: clock[0])
+    with StopRequest() as stop:
+        signal.raise_signal(signal.SIGINT)
+        clock[0] += after_s
+        signal.raise_signal(signal.SIGTERM)
+    assert (stop.number, ended) == (signal.SIGINT, ends)
 
 
 def test_evaluations_at_so_many_interventions(tmp_path):

@@ -76,8 +76,10 @@ def shared_arrays(path: str, capacity: int, nq: int, height: int, width: int) ->
 def serve(model_path: str, shared_path: str, *numbers: str) -> None:
     """Draw what is asked for on standard input, until it ends."""
     height, width, camera, capacity = map(int, numbers)
-    # Ctrl-C goes to all processes of a terminal; the one that asked decides.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Ctrl-C goes to all processes of a terminal, SIGTERM to all of a cluster's job; the one that asked decides,
+    # and this one ends with its standard input.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     model = mujoco.MjModel.from_binary_path(model_path)
     states, frames = shared_arrays(shared_path, capacity, model.nq, height, width)
     canvas = Canvas(model, height, width, camera)
