@@ -203,12 +203,15 @@ class Runner:
             _signal_groups(self._children, sent)
             with suppress(KeyboardInterrupt):
                 self._await_children(limit_s)
-        stopped = list(self._children)
-        for child in stopped:
-            self._end(child, STOPPED, {"returncode": child.process.wait()})
+        ends = []
+        for child in list(self._children):
+            code = child.process.wait()
+            # It may have been at its end anyway.
+            ends.append((child.job, DONE if code == 0 else STOPPED))
+            self._end(child, ends[-1][1], {"returncode": code})
         # A terminal that is gone cannot be written to: the notes come first.
-        for child in stopped:
-            self.display.event(child.job, STOPPED)
+        for job, end in ends:
+            self.display.event(job, end)
 
     def _await_children(self, limit_s: float) -> None:
         deadline = time.monotonic() + limit_s

@@ -272,6 +272,42 @@ def test_signals_stop_the_children_and_theirs(tmp_path, number):
         _raise_if_gone(int(pid.read_text()))
 
 
+TRAPPING = """
+import signal
+def end(number, frame):
+    time.sleep({after})
+    (out / 'saved').touch()
+    sys.exit({code})
+signal.signal(signal.SIGTERM, end)
+(out / 'ready').touch()
+time.sleep(60)
+"""
+
+
+class Interrupting(Tape):
+    """Ctrl-C, once all jobs are ready."""
+
+    def __init__(self, jobs):
+        super().__init__()
+        self.jobs = jobs
+
+    def update(self, states, running):
+        if all((job.output / "ready").exists() for job in self.jobs):
+            raise KeyboardInterrupt
+
+
+def test_a_job_has_time_to_save_but_not_for_ever(tmp_path):
+    ends = {"saves": (0.3, 1), "at_its_end": (0, 0), "for_ever": (60, 1)}
+    jobs = [
+        python_job(tmp_path, name, TRAPPING.format(after=after, code=code)) for name, (after, code) in ends.items()
+    ]
+    with pytest.raises(KeyboardInterrupt):
+        Runner(jobs, 3, Interrupting(jobs), grace_s=2).run()
+    assert [(job.output / "saved").exists() for job in jobs] == [True, True, False]
+    notes = [(record["status"], record["returncode"]) for record in map(read_record, jobs)]
+    assert notes == [("stopped", 1), ("done", 0), ("stopped", -signal.SIGKILL)]
+
+
 def test_child_of_a_killed_runner_keeps_its_claim(tmp_path):
     process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(RUNNER), str(tmp_path)])
     pid = tmp_path / "a/pid"
