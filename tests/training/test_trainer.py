@@ -112,7 +112,7 @@ class SignallingEnv(DummyEnv):
 
     def step(self, actions):
         if self.t == 21:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGTERM)
         return super().step(actions)
 
 
@@ -125,12 +125,25 @@ def test_a_run_that_is_told_to_stop_ends_its_update_and_resumes_as_the_unbroken_
         assert not make_trainer(
             config(broken, **rarely), env=SignallingEnv(STREAMS, diverge_at={(5, 1), (21, 2)})
         ).train(stop)
-    assert stop.number == signal.SIGINT
+    assert stop.number == signal.SIGTERM
     resumed = config(broken, **rarely)
     resumed.checkpoint_path = (broken / "checkpoints/last").resolve()
     assert resumed.checkpoint_path.name == f"{3 * STEPS_PER_UPDATE:06d}"
     assert make_trainer(resumed, policy_seed=8).train()
     assert_same_run(unbroken, broken)
+
+
+def test_ctrl_c_stays_ignored_where_it_is():
+    """A shell has it ignored for what it runs in the background."""
+    for handler, expected in ((signal.SIG_IGN, None), (signal.default_int_handler, signal.SIGINT)):
+        before = signal.signal(signal.SIGINT, handler)
+        try:
+            with StopRequest() as stop:
+                signal.raise_signal(signal.SIGINT)
+            assert stop.number == expected
+            assert signal.getsignal(signal.SIGINT) == handler
+        finally:
+            signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize(("after_s", "ends"), [(0.5, []), (2.5, [signal.SIGTERM])])
@@ -139,10 +152,10 @@ def test_a_second_signal_ends_at_once_but_not_an_echo_of_the_first(after_s, ends
     monkeypatch.setattr("cronos_lerobot.training.stopping.end_by", ended.append)
     monkeypatch.setattr("cronos_lerobot.training.stopping.time.monotonic", lambda: clock[0])
     with StopRequest() as stop:
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGTERM)
         clock[0] += after_s
         signal.raise_signal(signal.SIGTERM)
-    assert (stop.number, ended) == (signal.SIGINT, ends)
+    assert (stop.number, ended) == (signal.SIGTERM, ends)
 
 
 def test_evaluations_at_so_many_interventions(tmp_path):
