@@ -116,6 +116,11 @@ class SlurmCluster:
             # They would take seconds to end in order, and leave nothing that is looked at.
             with suppress(OSError, ValueError):
                 os.kill(int((self.folder / f"{name}.pid").read_text()), signal.SIGKILL)
+        # What watches over a job (slurmstepd) would look for the controller for minutes.
+        for step in Path("/proc").glob("[0-9]*/environ"):
+            with suppress(OSError):
+                if f"SLURM_CONF={os.environ['SLURM_CONF']}\0".encode() in step.read_bytes():
+                    os.kill(int(step.parent.name), signal.SIGKILL)
         if self._before is None:
             os.environ.pop("SLURM_CONF", None)
         else:

@@ -2,10 +2,12 @@
 
 import csv
 import json
+import os
+import signal
 import subprocess
 import sys
+import time
 from importlib.metadata import entry_points
-from types import SimpleNamespace
 
 import pandas as pd
 import pytest
@@ -74,6 +76,40 @@ def test_failed_step_is_resumed_where_it_can_be(folder):
     assert contents(folder)["b"] == "half and half"
 
 
+SAVING = """
+import pathlib, signal, sys, time
+folder = pathlib.Path(sys.argv[1])
+def end(number, frame):
+    time.sleep(1)
+    (folder / "saved").touch()
+    sys.exit(1)
+signal.signal(signal.SIGINT, end)
+(folder / "ready").touch()
+time.sleep(60)
+"""
+
+
+def test_ctrl_c_leaves_a_command_the_time_to_save(tmp_path):
+    command = ["python", "-c", SAVING, str(tmp_path)]
+    code = f"from cronos_lerobot.scripts.pipeline import run_command; run_command({command})"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        # Some shells start background commands with it ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "ready").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=30)
+    assert (tmp_path / "saved").exists()
+    assert said.endswith("KeyboardInterrupt\n")
+
+
 def test_unfinished_output_without_resume_is_removed_first(folder):
     steps = [append_step(folder, "a")]
     run_steps(steps, folder)
@@ -136,12 +172,12 @@ def test_full_demo_evaluates_every_configuration_of_both_splits(tmp_path):
 
 
 def test_demo_end_to_end(tmp_path, monkeypatch, capsys):
-    def run(command, check):
-        done = run_forked(command, check=check)
+    def run(command):
+        done = run_forked(command)
         print(done.stdout, done.stderr[-3000:])
-        return done
+        return done.returncode
 
-    monkeypatch.setattr(pipeline, "subprocess", SimpleNamespace(run=run))
+    monkeypatch.setattr(pipeline, "_run", run)
     output = tmp_path / "demo"
     monkeypatch.setattr(sys, "argv", ["cronos-demo", "--scale=smoke", f"--output_dir={output}"])
     (script,) = entry_points(group="console_scripts", name="cronos-demo")

@@ -35,7 +35,7 @@ GRACE_S = 120.0
 KILL_S = 15.0
 """How long one may take that was killed [s]."""
 ELSEWHERE = "is being run by another process: waiting for it"
-STOPPING = "saves what it has and stops; Ctrl-C ends it at once"
+STOPPING = "was asked to stop; Ctrl-C ends it at once"
 DONE, FAILED, CHANGED, BLOCKED = "done", "failed", "changed", "blocked"
 ENDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 """Those that end the runner as Ctrl-C does; the second is a closed terminal's."""
@@ -196,22 +196,26 @@ class Runner:
 
     def stop(self) -> None:
         """End the commands that still run: they can be resumed. Ctrl-C ends them at once."""
-        for child in self._children:
-            self.display.event(child.job, STOPPING)
         # Not by SIGINT: whoever starts us in the background has it ignored.
         for sent, limit_s in ((signal.SIGTERM, self.grace_s), (signal.SIGKILL, KILL_S)):
             _signal_groups(self._children, sent)
             with suppress(KeyboardInterrupt):
+                if sent == signal.SIGTERM:
+                    self._show({child.job.name: STOPPING for child in self._children})
                 self._await_children(limit_s)
-        ends = []
+        ends = {}
         for child in list(self._children):
             code = child.process.wait()
             # It may have been at its end anyway.
-            ends.append((child.job, DONE if code == 0 else STOPPED))
-            self._end(child, ends[-1][1], {"returncode": code})
-        # A terminal that is gone cannot be written to: the notes come first.
-        for job, end in ends:
-            self.display.event(job, end)
+            ends[child.job.name] = DONE if code == 0 else STOPPED
+            self._end(child, ends[child.job.name], {"returncode": code})
+        self._show(ends)
+
+    def _show(self, events: dict[str, str]) -> None:
+        """Show what happened to jobs while all is stopped, perhaps because the terminal is gone."""
+        with suppress(OSError):
+            for name, what in events.items():
+                self.display.event(self.jobs[name], what)
 
     def _await_children(self, limit_s: float) -> None:
         deadline = time.monotonic() + limit_s

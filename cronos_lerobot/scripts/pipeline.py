@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,12 +93,25 @@ def run_command(command: list[str]) -> None:
 
     Raises:
         StepFailedError: it ended with an error.
+        KeyboardInterrupt: Ctrl-C; the command has ended by itself, or was killed by a second one.
     """
     print(f"    $ {command_line(command)}\n", flush=True)
     # The script of the environment that this Python runs in, whatever PATH says.
     program = Path(sys.executable) if command[0] == "python" else Path(sys.executable).with_name(command[0])
-    if subprocess.run([str(program), *command[1:]], check=False).returncode != 0:
+    if _run([str(program), *command[1:]]) != 0:
         raise StepFailedError(f"the command failed:\n    {command_line(command)}")
+
+
+def _run(command: list[str]) -> int:
+    """Run a command, which Ctrl-C reaches as it does us, to its end; a second one kills it. Its exit status."""
+    with subprocess.Popen(command) as process:
+        try:
+            return process.wait()
+        except KeyboardInterrupt:
+            with suppress(KeyboardInterrupt):
+                process.wait()
+            process.kill()
+            raise
 
 
 def command_line(command: list[str]) -> str:

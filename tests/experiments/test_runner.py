@@ -1,5 +1,6 @@
 """The runner with tiny real commands: order, skipping, resuming, failing, stopping."""
 
+import errno
 import fcntl
 import json
 import os
@@ -27,7 +28,7 @@ from cronos_lerobot.experiments.jobs import (
     read_record,
     status,
 )
-from cronos_lerobot.experiments.runner import Runner
+from cronos_lerobot.experiments.runner import STOPPING, Runner
 
 
 class Tape:
@@ -306,6 +307,25 @@ def test_a_job_has_time_to_save_but_not_for_ever(tmp_path):
     assert [(job.output / "saved").exists() for job in jobs] == [True, True, False]
     notes = [(record["status"], record["returncode"]) for record in map(read_record, jobs)]
     assert notes == [("stopped", 1), ("done", 0), ("stopped", -signal.SIGKILL)]
+
+
+class Gone(Interrupting):
+    """A terminal that was closed while jobs ran."""
+
+    def event(self, job, what):
+        super().event(job, what)
+        if what not in ("started", "done"):
+            raise OSError(errno.EIO, "Input/output error")
+
+
+def test_a_terminal_that_is_gone_does_not_keep_jobs_from_being_stopped(tmp_path):
+    job = python_job(tmp_path, "a", TRAPPING.format(after=0, code=1))
+    display = Gone([job])
+    with pytest.raises(KeyboardInterrupt):
+        Runner([job], 1, display).run()
+    assert [what for _, what in display.events] == ["started", STOPPING, "stopped"]
+    assert (job.output / "saved").exists()
+    assert read_record(job)["status"] == "stopped"
 
 
 def test_child_of_a_killed_runner_keeps_its_claim(tmp_path):

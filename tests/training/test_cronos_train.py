@@ -26,7 +26,7 @@ SMALL = (
 )  # fmt: skip
 OBSERVATIONS = {
     "state": ("--env.obs_type=environment_state_agent_pos",),
-    "pixels": ("--env.observation_height=64", "--env.observation_width=64"),
+    "pixels": ("--env.observation_height=64", "--env.observation_width=64", "--env.num_threads=2"),
 }
 
 
@@ -42,8 +42,12 @@ def weights(folder):
 STOPPED = """
 import os, signal, sys, threading, time
 from pathlib import Path
+from lerobot_env_cronos.simulation import rendering
+
 from cronos_lerobot.scripts import train
 
+# Two frames are drawn by two processes.
+rendering.MIN_FRAMES = 1
 folder = Path(sys.argv.pop(1))
 # As a cluster does: to all processes, those that draw among them.
 os.setsid()

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -32,6 +33,7 @@ from cronos_lerobot.stopwatch import Stopwatch
 from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
 from cronos_lerobot.training.factory import make_env
 from cronos_lerobot.training.sharding import ShardedEnv
+from cronos_lerobot.training.stopping import StopRequest
 from cronos_lerobot.training.trainer import Trainer
 
 # Whatever threads there are wait for work when the test forks.
@@ -137,6 +139,31 @@ def test_a_run_of_two_processes_goes_on_in_one(tmp_path, caplog):
     expected, weights = train(Processes(), settings(tmp_path / "one", 32))
     assert loop == expected
     assert policy == pytest.approx(weights, rel=1e-3, abs=1e-5)
+
+
+class SignallingEnv(WanderingEnv):
+    """Has its process told to stop in the middle of a segment."""
+
+    def step(self, actions):
+        if self.t == 13:
+            signal.raise_signal(signal.SIGTERM)
+        return super().step(actions)
+
+
+def stopped(processes, cfg):
+    """Train until it ends; whether that is the run's end, the signal of this process, and the steps done."""
+    mine = processes.share_of(cfg.num_envs)
+    env = (SignallingEnv if processes.rank == 1 else WanderingEnv)(mine.stop - mine.start, mine.start)
+    trainer = Trainer(cfg, env, DummyEnv, ScriptedPolicy(), *identity_processors(), processes)
+    with StopRequest() as stop:
+        return trainer.train(stop), stop.number, trainer.loop.n
+
+
+def test_one_process_that_is_told_to_stop_stops_both(tmp_path):
+    cfg = settings(tmp_path / "run", 16, save_freq=4 * STEPS_PER_UPDATE)
+    steps = 2 * STEPS_PER_UPDATE
+    assert together(stopped, cfg) == [(False, None, steps), (False, signal.SIGTERM, steps)]
+    assert (tmp_path / "run/checkpoints/last").resolve().name == f"{steps:06d}"
 
 
 def test_every_process_draws_its_own_actions(tmp_path):

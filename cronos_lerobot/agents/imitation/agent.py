@@ -127,7 +127,8 @@ class ImitationAgent(LearningAgent):
         """The segments that each process remembers, and what an average is of; see `LearningAgent`."""
         learner = {}
         if self.config.ema_decay:
-            frozen = {name for name, param in self.policy.named_parameters() if not param.requires_grad}
+            params = self.policy.named_parameters(remove_duplicate=False)
+            frozen = {name for name, param in params if not param.requires_grad}
             learner = {name: value for name, value in self._learner.state_dict().items() if name not in frozen}
         return {"memory": to_tensors(self._processes.gather(self.memory.state_dict())), "learner": learner}
 
@@ -136,7 +137,7 @@ class ImitationAgent(LearningAgent):
         processes = self._processes
         self.memory.load_state_dict(own_share(to_arrays(state["memory"]), processes.rank, processes.count))
         if self.config.ema_decay:
-            self._learner.load_state_dict(state.get("learner") or self.policy.state_dict(), strict=False)
+            self._learner.load_state_dict(self.policy.state_dict() | state.get("learner", {}))
 
     def _make_player(self, generator: torch.Generator) -> Player:
         if not isinstance(self.policy, TrainablePolicy):
