@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
-import subprocess
 import sys
 import tempfile
-import time
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 from hub_stand_in import serve
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from transcripts import Act, perform
 
 HEAD = (
     "# The whole life of a policy\n\n"
@@ -29,18 +29,6 @@ HEAD = (
 )
 PORT = 8787
 STATE = "--env.obs_type=environment_state_agent_pos"
-
-
-@dataclass(frozen=True)
-class Act:
-    """A command of the story."""
-
-    title: str
-    command: str
-    lines: int = 2
-    """The last lines of its output that are shown."""
-    elsewhere: bool = False
-    """In another folder, with empty caches."""
 
 
 STORY = (
@@ -99,49 +87,6 @@ print("average chain length", info["overall"]["avg_sum_reward"], "n", info["over
 )  # fmt: skip
 
 
-def wrap(command: str) -> str:
-    """A command over several lines, none longer than a page is wide."""
-    if "\n" in command:
-        return command
-    lines = [""]
-    for word in command.split():
-        if len(lines[-1]) + len(word) > 104:
-            lines[-1] += " \\"
-            lines.append("    " + word)
-        else:
-            lines[-1] += f" {word}" if lines[-1] else word
-    return "\n".join(lines)
-
-
-def tail(output: str, count: int) -> str:
-    """The last lines, as a terminal shows them."""
-    shown = [line.split("\r")[-1].rstrip() for line in output.splitlines()]
-    shown = [re.sub(r"^INFO \S+ \S+ \S+ ", "", line) for line in shown if line]
-    return "\n".join(shown[-count:] if count else [])
-
-
-def perform(act: Act, user: str, folder: Path, environment: dict[str, str]) -> str:
-    """Run a command; returns its part of the transcript."""
-    command = act.command.replace("USER", user)
-    start = time.perf_counter()
-    result = subprocess.run(
-        command,
-        shell=True,
-        cwd=folder,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    seconds = time.perf_counter() - start
-    print(f"{seconds:6.1f} s  {command.splitlines()[0][:90]}", flush=True)
-    if result.returncode:
-        sys.exit(f"{command}\n{result.stdout[-3000:]}")
-    output = tail(result.stdout, act.lines)
-    block = f"```console\n$ {wrap(command)}\n{output}\n```\n".replace("\n\n```", "\n```")
-    return f"{act.title}:\n\n{block}" if act.title else block
-
-
 def main() -> None:
     """Run the story and write it down."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -161,10 +106,9 @@ def main() -> None:
         for act in STORY:
             name = "elsewhere" if act.elsewhere else "here"
             home = {"HF_HOME": str(Path(root) / f"cache_{name}")}
-            parts.append(perform(act, args.user, Path(root) / name, environment | home))
-    args.output.write_text(
-        "# The whole life of a policy\n\n" + (__doc__ or "").split("\n\n")[0] + "\n\n" + "\n".join(parts)
-    )
+            act = replace(act, command=act.command.replace("USER", args.user))
+            parts.append(perform(act, Path(root) / name, environment | home))
+    args.output.write_text("\n".join([HEAD, *parts]))
 
 
 if __name__ == "__main__":
