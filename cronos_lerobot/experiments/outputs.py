@@ -10,6 +10,7 @@ from typing import Any
 
 from cronos_lerobot.experiments import plots, tables
 from cronos_lerobot.experiments.definitions import Experiment, Row
+from cronos_lerobot.experiments.differences import RowDifference, differences_to_first
 from cronos_lerobot.experiments.intervention_plots import interventions_figure
 from cronos_lerobot.experiments.jobs import this_commit
 from cronos_lerobot.experiments.results import (
@@ -22,6 +23,7 @@ from cronos_lerobot.experiments.results import (
 )
 from cronos_lerobot.experiments.specs import Options, base_policy
 from cronos_lerobot.protocol.metrics import Summary
+from cronos_lerobot.report.paired import ALPHA
 from cronos_lerobot.report.statistics import Rate
 from cronos_lerobot.report.tables import write_csv
 from cronos_lerobot.training.logging import METRICS
@@ -38,6 +40,7 @@ def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options,
     name = experiment.name
     data = {
         name: tables.main_rows(result),
+        f"{name}_differences": tables.difference_rows(result),
         f"{name}_curves": tables.curve_rows(result),
         f"{name}_segments": tables.segment_rows(result),
         f"{name}_tasks": tables.task_rows(result),
@@ -61,6 +64,7 @@ def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options,
             (folder / f"{file}.png").write_bytes(buffer.getvalue())
             drawn.append(f"{file}.png")
     summary = _settings(result) | {"rows": data[name], "claims": tables.claim_rows(result)}
+    summary |= {"differences": data[f"{name}_differences"]}
     summary |= {"segments": data[f"{name}_segments"], "sequential": data[f"{name}_sequential"]}
     (folder / f"{name}.json").write_text(json.dumps(summary, indent=2))
     page = markdown(result, drawn)
@@ -99,6 +103,8 @@ def markdown(result: ExperimentResult, figures: Sequence[str]) -> str:
     lines = [*_introduction(result), "", *_table(_main_columns(result)), "", NOTES, "", PPO_NOTES]
     if result.experiment.source:
         lines += _about_the_paper(result)
+    if difference_columns := _difference_columns(result):
+        lines += [*_section("Which rows differ", difference_columns), "", DIFFERENCE_NOTES]
     if budget_columns := _budget_columns(result):
         lines += [*_section("Success after so many interventions", budget_columns), *_budget_notes(result)]
     lines += _section("What the text says", _claim_columns(tables.claim_rows(result)))
@@ -118,6 +124,13 @@ NOTES = (
     " interaction steps and over interventions (Equations 3 and 4), divided by the length of the axis: smaller is"
     " better. Found complete, never grasped: of the successes at the end, all seeds together, those for which"
     " nothing had to be done, and others without a grasp."
+)
+DIFFERENCE_NOTES = (
+    "Success of a row minus that of its reference, the first row from the same kind of base policy, at the end of"
+    " the runs and on the same episodes; 95 % interval and p are those of `cronos-report compare`: of trainings"
+    " like these, clustered by training and configuration, or where both rows have one seed of these two policies."
+    " p (Holm) is adjusted for the lines of this table. Not separated is no sign that two rows do alike. All pairs"
+    " of rows are in the CSV file."
 )
 BUDGET_NOTES = (
     "A number without a mark is measured, by the evaluation at the first policy update at which so many"
@@ -191,6 +204,32 @@ def _main_columns(result: ExperimentResult) -> Columns:
         title = f"C up to {shared:,}"
         columns[title] = [_cell(row.gap("interventions", up_to=shared)) for row in result.rows]
     return columns
+
+
+def _difference_columns(result: ExperimentResult) -> Columns:
+    found = differences_to_first(result)
+    if not found:
+        return {}
+    return {
+        "": [one.row.row.label for one in found],
+        "reference": [one.reference.row.label for one in found],
+        "difference": [f"{one.difference.value:+.3f}" for one in found],
+        "95 %": [_signed_interval(one.difference.ci95) for one in found],
+        "p": [MISSING if one.difference.p is None else f"{one.difference.p:.2g}" for one in found],
+        "p (Holm)": [f"{one.p_holm:.2g}" for one in found],
+        "of": ["trainings" if one.of_trainings else "two policies" for one in found],
+        "verdict": [_verdict(one) for one in found],
+    }
+
+
+def _signed_interval(ends: tuple[float, float] | None) -> str:
+    return MISSING if ends is None else f"[{ends[0]:+.3f}, {ends[1]:+.3f}]"
+
+
+def _verdict(one: RowDifference) -> str:
+    if one.p_holm >= ALPHA:
+        return "not separated"
+    return "better" if one.difference.value > 0 else "worse"
 
 
 def _budget_columns(result: ExperimentResult) -> Columns:

@@ -318,6 +318,25 @@ def test_files_of_table1(options, tmp_path):
         assert len({tuple(pixel) for pixel in picture[::7, ::7, :3].reshape(-1, 3).tolist()}) > 5
 
 
+def test_rows_are_compared_as_the_report_compares_them(options, tmp_path):
+    for row, seed, successes in (("t80", 1, 6), ("t80", 2, 7), ("t1280_eer", 1, 3), ("t1280_eer", 2, 2)):
+        make_run(options, "table1", row, seed, (2, 4, successes))
+    make_run(options, "table1", "t1280", 1, (2, 4, 6))
+    text = write_outputs(EXPERIMENTS["table1"], EXPERIMENTS["table1"].rows, options, tmp_path / "out")
+    found = {(d["row"], d["reference"]): d for d in read_csv(tmp_path / "out/table1_differences.csv")}
+    assert list(found) == [("t1280", "t80"), ("t1280_eer", "t80"), ("t1280_eer", "t1280")]
+    one = found["t1280_eer", "t80"]
+    assert (one["difference"], one["episodes"], one["of_trainings"]) == ("-0.5", "32", "True")
+    folders = [next((tmp_path / "root/runs").rglob(f"{row}_10k")) for row in ("t80", "t1280_eer")]
+    said = run_forked(["cronos-report", "compare", *folders, "--json"], check=True).stdout
+    compared = json.loads(said)["comparisons"][0]["rows"][0]["trainings"]
+    assert [float(one[name]) for name in ("ci95_low", "ci95_high", "p")] == [*compared["ci95"], compared["p"]]
+    # Two of the three pairs have the first row as their reference, and p is adjusted for as many.
+    line = next(line for line in text.splitlines() if line.startswith("| T = 1280, EER | T = 80 |"))
+    assert line.split(" | ")[5] == f"{2 * compared['p']:.2g}"
+    assert ("worse" if 2 * compared["p"] < 0.05 else "not separated") in line
+
+
 def test_tasks_and_reset_tasks_by_quarter(options, tmp_path):
     task, reset = INSTRUCTIONS[0], "put it on the table"
     for seed in (1, 2):
