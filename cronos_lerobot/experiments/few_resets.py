@@ -78,7 +78,9 @@ AIDS = (
 )
 """The paper's: Table 1's rows with end-effector resets."""
 METHOD = plugged(*TOGETHER)
-SCREENED = (*AIDS, *(plugged(name) for name in PLUGS), METHOD)
+TAUGHT = plugged("takeover", "memory")
+"""An expert's segments are cloned only where successes are kept."""
+SCREENED = (*AIDS, *(plugged(name) for name in PLUGS), TAUGHT, METHOD)
 
 METHOD_BY_BUDGET = (
     *(plugged(*TOGETHER, interval=interval) for interval in (1280, 5120, 20480)),
