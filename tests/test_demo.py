@@ -80,16 +80,20 @@ SAVING = """
 import pathlib, signal, sys, time
 folder = pathlib.Path(sys.argv[1])
 def end(number, frame):
-    time.sleep(1)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    time.sleep(1.5)
     (folder / "saved").touch()
     sys.exit(1)
-signal.signal(signal.SIGINT, end)
+for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, end)
 (folder / "ready").touch()
 time.sleep(60)
 """
 
 
-def test_ctrl_c_leaves_a_command_the_time_to_save(tmp_path):
+@pytest.mark.parametrize("to_all", [True, False])
+def test_ctrl_c_leaves_a_command_the_time_to_save(to_all, tmp_path):
+    """Of a terminal, which sends it to the command as well, or of whoever knows the demo's process alone."""
     command = ["python", "-c", SAVING, str(tmp_path)]
     code = f"from cronos_lerobot.scripts.pipeline import run_command; run_command({command})"
     process = subprocess.Popen(
@@ -104,7 +108,7 @@ def test_ctrl_c_leaves_a_command_the_time_to_save(tmp_path):
     deadline = time.monotonic() + 60
     while not (tmp_path / "ready").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)
+    (os.killpg if to_all else os.kill)(process.pid, signal.SIGINT)
     _, said = process.communicate(timeout=30)
     assert (tmp_path / "saved").exists()
     assert said.endswith("KeyboardInterrupt\n")

@@ -126,11 +126,11 @@ NOTES = (
     " nothing had to be done, and others without a grasp."
 )
 DIFFERENCE_NOTES = (
-    "Success of a row minus that of its reference, the first row from the same kind of base policy, at the end of"
+    "Success of a row minus that of its reference, the first finished row from the same base policy, at the end of"
     " the runs and on the same episodes; 95 % interval and p are those of `cronos-report compare`: of trainings"
-    " like these, clustered by training and configuration, or where both rows have one seed of these two policies."
-    " p (Holm) is adjusted for the lines of this table. Not separated is no sign that two rows do alike. All pairs"
-    " of rows are in the CSV file."
+    " like these, clustered by training and configuration, or where a row has one seed of these policies alone,"
+    " which says nothing of other trainings. p (Holm) is adjusted for the lines of this table. Not separated is no"
+    " sign that two rows do alike. All pairs of rows that were evaluated on the same episodes are in the CSV file."
 )
 BUDGET_NOTES = (
     "A number without a mark is measured, by the evaluation at the first policy update at which so many"
@@ -217,7 +217,7 @@ def _difference_columns(result: ExperimentResult) -> Columns:
         "95 %": [_signed_interval(one.difference.ci95) for one in found],
         "p": [MISSING if one.difference.p is None else f"{one.difference.p:.2g}" for one in found],
         "p (Holm)": [f"{one.p_holm:.2g}" for one in found],
-        "of": ["trainings" if one.of_trainings else "two policies" for one in found],
+        "of": ["trainings" if one.of_trainings else "these policies" for one in found],
         "verdict": [_verdict(one) for one in found],
     }
 

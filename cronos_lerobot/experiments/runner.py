@@ -27,6 +27,7 @@ from cronos_lerobot.experiments.jobs import (
     this_commit,
     write_record,
 )
+from cronos_lerobot.training.stopping import SAME_S
 
 POLL_S = 0.5
 """How often the running jobs are looked at [s]."""
@@ -60,6 +61,8 @@ class _Child:
     process: subprocess.Popen
     lock: int
     started: float = field(default_factory=time.time)
+    is_asked: bool = False
+    """Whether it was asked to end."""
 
 
 class Runner:
@@ -195,10 +198,18 @@ class Runner:
         self.display.event(job, state)
 
     def stop(self) -> None:
-        """End the commands that still run: they can be resumed. Ctrl-C ends them at once."""
+        """End the commands that still run: they can be resumed. Ctrl-C ends them at once.
+
+        May be called again before it has returned, by a handler: then it only waits.
+        """
+        _silence_ending_signals()
         # Not by SIGINT: whoever starts us in the background has it ignored.
         for sent, limit_s in ((signal.SIGTERM, self.grace_s), (signal.SIGKILL, KILL_S)):
-            _signal_groups(self._children, sent)
+            # A second SIGTERM would end at once what the first one has made save.
+            told = [child for child in self._children if sent == signal.SIGKILL or not child.is_asked]
+            _signal_groups(told, sent)
+            for child in told:
+                child.is_asked = True
             with suppress(KeyboardInterrupt):
                 if sent == signal.SIGTERM:
                     self._show({child.job.name: STOPPING for child in self._children})
@@ -218,9 +229,15 @@ class Runner:
                 self.display.event(self.jobs[name], what)
 
     def _await_children(self, limit_s: float) -> None:
-        deadline = time.monotonic() + limit_s
-        while any(child.process.poll() is None for child in self._children) and time.monotonic() < deadline:
-            time.sleep(0.05)
+        began = time.monotonic()
+        while time.monotonic() < began + limit_s:
+            try:
+                if all(child.process.poll() is not None for child in self._children):
+                    return
+                time.sleep(0.05)
+            except KeyboardInterrupt:
+                if time.monotonic() > began + SAME_S:
+                    return
 
 
 @contextmanager
@@ -244,14 +261,20 @@ def _program(name: str) -> str:
     return sys.executable if name == "python" else str(Path(sys.executable).with_name(name))
 
 
+def _silence_ending_signals() -> None:
+    """A terminal that closes sends several: the children are to be stopped in peace, but for Ctrl-C."""
+    if threading.current_thread() is threading.main_thread():
+        for number in ENDING_SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
+
+
 def _raise_on_signals() -> dict[signal.Signals, Any]:
     """Let ENDING_SIGNALS end this process as Ctrl-C does; returns the handlers before."""
     if threading.current_thread() is not threading.main_thread():
         return {}
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        # A closing terminal sends it more than once; the children are to be stopped in peace.
-        signal.signal(number, signal.SIG_IGN)
+        _silence_ending_signals()
         raise KeyboardInterrupt
 
     # nohup has SIGHUP ignored, and means it.

@@ -97,8 +97,8 @@ def difference_rows(result: ExperimentResult) -> list[Row]:
         {
             "row": one.row.row.name,
             "reference": one.reference.row.name,
-            "seeds": len(one.row.finished),
-            "seeds_reference": len(one.reference.finished),
+            "seeds": one.seeds[0],
+            "seeds_reference": one.seeds[1],
             "episodes": one.episodes,
             "difference": one.difference.value,
             "ci95_low": (one.difference.ci95 or (None, None))[0],

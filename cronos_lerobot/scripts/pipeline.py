@@ -9,10 +9,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from cronos_lerobot.training.stopping import SAME_S
+
+ECHO_S = 1.0
+"""When a command is told what Ctrl-C may not have [s]; within SAME_S it is no second signal."""
 STATE = "demo.json"
 """What has been done, in the output folder."""
 
@@ -108,10 +111,22 @@ def _run(command: list[str]) -> int:
         try:
             return process.wait()
         except KeyboardInterrupt:
-            with suppress(KeyboardInterrupt):
-                process.wait()
-            process.kill()
+            _end(process)
             raise
+
+
+def _end(process: subprocess.Popen) -> None:
+    """Await a command that Ctrl-C has reached, too; should it have come to us alone, SIGTERM tells the command."""
+    began, told = time.monotonic(), False
+    while process.poll() is None:
+        try:
+            time.sleep(0.05)
+            if not told and time.monotonic() > began + ECHO_S:
+                process.terminate()
+                told = True
+        except KeyboardInterrupt:
+            if time.monotonic() > began + SAME_S:
+                process.kill()
 
 
 def command_line(command: list[str]) -> str:

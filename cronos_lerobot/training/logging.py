@@ -7,6 +7,7 @@ import os
 import platform
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +112,9 @@ class RunLogger:
         }
         if self._bar.disable:
             line = ", ".join(f"{name} {value}" for name, value in text.items())
-            print(f"{self.loop.n}/{self.config.total_steps} steps: {line}", flush=True)
+            # A run whose terminal or pipe is gone goes on, and saves.
+            with suppress(OSError):
+                print(f"{self.loop.n}/{self.config.total_steps} steps: {line}", flush=True)
             return
         self._bar.set_postfix(text, refresh=False)
         self._bar.update(self.loop.n - self._bar.n)

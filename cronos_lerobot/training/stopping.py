@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+from contextlib import suppress
 from types import FrameType
 from typing import Any, Self
 
@@ -43,14 +44,20 @@ class StopRequest:
             self.number, self._at = number, now
             # Not by logging: it may be what was interrupted.
             name = signal.Signals(number).name
-            os.write(2, f"{name}: ending after this update, with a checkpoint; once more ends at once\n".encode())
+            # Who read it may be gone: `2>&1 | tee log` ends by the same Ctrl-C.
+            with suppress(OSError):
+                os.write(
+                    2, f"{name}: ending after this update, with a checkpoint; once more ends at once\n".encode()
+                )
         elif now - self._at > SAME_S:
             end_by(number)
 
 
 def end_by(number: int) -> None:
     """End this process by a signal, so that whoever started it sees why."""
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        # The reader may be gone, or the signal have come in the middle of a flush.
+        with suppress(OSError, ValueError, RuntimeError):
+            stream.flush()
     signal.signal(number, signal.SIG_DFL)
     signal.raise_signal(number)

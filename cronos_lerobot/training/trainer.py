@@ -151,8 +151,10 @@ class Trainer:
             self.load()
         self._open_observers(self._observers)
         try:
-            if self.loop.t == 0:
+            # A run that was told to stop has left an evaluation to the one that goes on from it.
+            if self.loop.t == 0 or self._is_evaluation_due():
                 self._evaluate()
+                self._last_interventions = self.loop.b
             return self._run(stop or StopRequest())
         finally:
             self.recorder.close()
@@ -187,10 +189,12 @@ class Trainer:
             updated = False
             self._check_processes()
             self._log_update()
-            if _due(self.loop.n, self._last_evaluation, self.config.eval_freq) or self._reached():
-                self._evaluate()
-            self._last_interventions = self.loop.b
             ends = self._is_stopped(stop)
+            is_due = self._is_evaluation_due()
+            if is_due and not ends:
+                self._evaluate()
+            if not (is_due and ends):
+                self._last_interventions = self.loop.b
             if self.config.save_checkpoint and (ends or _due(self.loop.n, last_save, self.config.save_freq)):
                 self._save(env_state)
                 last_save = self.loop.n
@@ -208,6 +212,9 @@ class Trainer:
         """Whether any process was told to stop; all of them then do, but not where the run ends anyway."""
         asked = self.processes.concatenate(np.array([stop.number is not None])).any()
         return bool(asked) and self.loop.n < self.config.total_steps
+
+    def _is_evaluation_due(self) -> bool:
+        return _due(self.loop.n, self._last_evaluation, self.config.eval_freq) or bool(self._reached())
 
     def _events(self) -> Any:
         record = self.config.record

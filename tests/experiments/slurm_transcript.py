@@ -14,7 +14,6 @@ import shutil
 import sys
 import tempfile
 import threading
-import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -34,7 +33,7 @@ from pathlib import Path
 from safetensors.torch import load_file
 
 def run(root):
-    folder, = Path(root).glob("runs/*/*/seed1/checkpoints/last/pretrained_model")
+    folder, = Path(root).glob("runs/*/*/seed1/train/checkpoints/last/pretrained_model")
     log = (folder.parents[2] / "metrics.jsonl").read_text().splitlines()
     counted = [{k: v for k, v in json.loads(line).items() if k not in TIMES} for line in log]
     return load_file(folder / "model.safetensors"), counted
@@ -95,15 +94,13 @@ def main() -> None:
             hurrying = threading.Thread(target=hurry, args=(cluster, ended))
             hurrying.start()
             environment["SLURM_CONF"] = os.environ["SLURM_CONF"]
-            start = time.perf_counter()
-            parts = [
-                perform(act, folder / "here", environment) for act in story(args.scale, args.time, args.warning_s)
-            ]
-            ended.set()
-            hurrying.join()
-            print(f"{time.perf_counter() - start:.0f} s")
+            try:
+                acts = story(args.scale, args.time, args.warning_s)
+                parts = [perform(act, folder / "here", environment) for act in acts]
+            finally:
+                ended.set()
+                hurrying.join()
     finally:
-        ended.set()
         shutil.rmtree(folder, ignore_errors=True)
     args.output.write_text("\n".join([HEAD, *parts]))
 

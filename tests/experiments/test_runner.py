@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -307,6 +308,55 @@ def test_a_job_has_time_to_save_but_not_for_ever(tmp_path):
     assert [(job.output / "saved").exists() for job in jobs] == [True, True, False]
     notes = [(record["status"], record["returncode"]) for record in map(read_record, jobs)]
     assert notes == [("stopped", 1), ("done", 0), ("stopped", -signal.SIGKILL)]
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
+def test_what_follows_ctrl_c_at_once_does_not_keep_a_job_from_saving(tmp_path, number):
+    """A terminal that is closed after it, or an echo."""
+
+    class Following(Interrupting):
+        def event(self, job, what):
+            super().event(job, what)
+            if what == STOPPING:
+                threading.Timer(0.2, signal.raise_signal, [number]).start()
+
+    job = python_job(tmp_path, "a", TRAPPING.format(after=1, code=1))
+    before = {n: signal.getsignal(n) for n in (signal.SIGHUP, signal.SIGTERM)}
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+        with pytest.raises(KeyboardInterrupt):
+            Runner([job], 1, Following([job])).run()
+    finally:
+        signal.signal(signal.SIGINT, previous)
+        for n, handler in before.items():
+            signal.signal(n, handler)
+    assert (job.output / "saved").exists()
+    assert read_record(job)["returncode"] == 1
+
+
+def test_a_runner_that_is_stopped_twice_asks_once(tmp_path):
+    """A time limit may come while a preempted job is being stopped."""
+
+    class Stopping(Interrupting):
+        def event(self, job, what):
+            super().event(job, what)
+            if what == STOPPING and not self.again:
+                self.again = True
+                threading.Timer(0.2, signal.raise_signal, [signal.SIGUSR2]).start()
+
+    code = TRAPPING.replace("time.sleep({after})", "(out / 'asked').open('a').write('x'); time.sleep({after})")
+    job = python_job(tmp_path, "a", code.format(after=1, code=1))
+    display = Stopping([job])
+    display.again = False
+    runner = Runner([job], 1, display)
+    before = signal.signal(signal.SIGUSR2, lambda number, frame: runner.stop())
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            runner.run()
+    finally:
+        signal.signal(signal.SIGUSR2, before)
+    assert ((job.output / "asked").read_text(), (job.output / "saved").exists()) == ("x", True)
 
 
 class Gone(Interrupting):

@@ -174,6 +174,36 @@ def test_an_average_costs_only_what_is_trained(tmp_path):
     assert set(trainer.agent.state_dict()["learner"]) == {"actor.weight", "actor.bias"}
 
 
+class TiedPolicy(ClonedPolicy):
+    """Has one frozen weight under two names."""
+
+    def __init__(self, seed=0):
+        super().__init__(seed)
+        self.embedding = torch.nn.Linear(2, 2, bias=False).requires_grad_(False)
+        self.head = torch.nn.Linear(2, 2, bias=False)
+        self.head.weight = self.embedding.weight
+
+
+def test_what_is_frozen_under_two_names_is_in_neither_and_the_average_resumes(tmp_path):
+    algorithm = ImitationConfig(steps_per_update=2, batch_size=8, warmup_segments=3, ema_decay=0.75)
+
+    def agent(folder, seed):
+        cfg = settings(tmp_path / folder, algorithm=algorithm)
+        return Trainer(cfg, DummyEnv(4), DummyEnv, TiedPolicy(seed), *identity_processors(), Processes()).agent
+
+    saved = agent("saved", 0)
+    with torch.no_grad():
+        saved._learner.actor.weight += 1
+    state = saved.state_dict()
+    assert not {"embedding.weight", "head.weight"} & set(state["learner"])
+    resumed = agent("resumed", 8)
+    resumed.policy.load_state_dict(saved.policy.state_dict())
+    resumed.load_state_dict(state)
+    assert torch.equal(resumed._learner.actor.weight, saved._learner.actor.weight)
+    assert not torch.equal(resumed._learner.actor.weight, resumed.policy.actor.weight)
+    assert torch.equal(resumed._learner.head.weight, saved.policy.head.weight)
+
+
 def in_processes(processes, cfg, env_class=DummyEnv):
     trainer = train(cfg, env_class, processes)
     if trainer is None:

@@ -2,6 +2,8 @@
 
 import json
 import signal
+import subprocess
+import sys
 from importlib.metadata import version
 
 import numpy as np
@@ -116,21 +118,47 @@ class SignallingEnv(DummyEnv):
         return super().step(actions)
 
 
-def test_a_run_that_is_told_to_stop_ends_its_update_and_resumes_as_the_unbroken_one(tmp_path):
-    """Saved where no checkpoint was due: the one at the end of the update that it is in."""
+@pytest.mark.parametrize("evaluated_after", [2, 3])
+def test_a_run_that_is_told_to_stop_ends_its_update_and_resumes_as_the_unbroken_one(evaluated_after, tmp_path):
+    """Saved where no checkpoint was due; an evaluation that is due then is left to the run that goes on."""
     unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
-    rarely = {"save_freq": 4 * STEPS_PER_UPDATE}
+    rarely = {"save_freq": 4 * STEPS_PER_UPDATE, "eval_freq": evaluated_after * STEPS_PER_UPDATE}
     train(config(unbroken, **rarely))
     with StopRequest() as stop:
         assert not make_trainer(
             config(broken, **rarely), env=SignallingEnv(STREAMS, diverge_at={(5, 1), (21, 2)})
         ).train(stop)
     assert stop.number == signal.SIGTERM
+    evaluations = [line for line in metrics(broken) if line["kind"] == "evaluation"]
+    assert [line["interaction_steps"] for line in evaluations] == [0, 2 * STEPS_PER_UPDATE][: 4 - evaluated_after]
     resumed = config(broken, **rarely)
     resumed.checkpoint_path = (broken / "checkpoints/last").resolve()
     assert resumed.checkpoint_path.name == f"{3 * STEPS_PER_UPDATE:06d}"
     assert make_trainer(resumed, policy_seed=8).train()
     assert_same_run(unbroken, broken)
+
+
+PIPED = """
+import os, signal, sys
+from cronos_lerobot.training.stopping import StopRequest, end_by
+reader, writer = os.pipe()
+os.dup2(writer, 1)
+os.dup2(writer, 2)
+os.close(reader)
+with StopRequest() as stop:
+    signal.raise_signal(signal.SIGTERM)
+open(sys.argv[1], "w").close()
+sys.stdout.write("said to nobody")
+end_by(stop.number)
+"""
+
+
+def test_a_run_whose_output_nobody_reads_any_more_saves_and_ends_by_the_signal(tmp_path, monkeypatch):
+    """As in `2>&1 | tee log`, where Ctrl-C ends `tee` as well."""
+    # What was written waits for the flush at the end.
+    monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)
+    done = subprocess.run([sys.executable, "-c", PIPED, str(tmp_path / "saved")], timeout=60)
+    assert (done.returncode, (tmp_path / "saved").exists()) == (-signal.SIGTERM, True)
 
 
 def test_ctrl_c_stays_ignored_where_it_is():
