@@ -19,8 +19,8 @@ examples:
   two policies
       cronos-report compare outputs/eval/base outputs/eval/eer
   two rows of a table, all seeds of each
-      cronos-report compare outputs/reproduce/runs/kitchen_2x2_state_small/t80 \\
-          outputs/reproduce/runs/kitchen_2x2_state_small/t1280_eer
+      cronos-report compare outputs/reproduce/runs/kitchen_2x2_state_small/t80_307k \\
+          outputs/reproduce/runs/kitchen_2x2_state_small/t1280_eer_307k
   seeds that lie apart, as JSON
       cronos-report compare outputs/eval/eer_[123] --with outputs/eval/best_[123] --json
 
