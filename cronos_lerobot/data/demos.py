@@ -58,10 +58,14 @@ class StartConfig:
     """`home`; `random`: at a random place above the table; `after_task`: where another task left it."""
     occupied_receptacles: bool = False
     """The target receptacle already holds another object."""
+    misplaced_objects: bool = False
+    """The task's object lies on another receptacle, where another task has put it; beside `occupied_receptacles`
+    it is either, with equal chances for each task that may have come before."""
     leaning_share: float = 0.0
     """Share of the layouts in which one object has fallen over the edge of another body, from 0 to 1."""
     share: float = 1.0
-    """Share of the episodes that `arm_pose` and `occupied_receptacles` apply to; the others start at home."""
+    """Share of the episodes that `arm_pose`, `occupied_receptacles` and `misplaced_objects` apply to; the others
+    start at home, with every object on the table."""
 
     def __post_init__(self) -> None:
         """Check the choices."""
@@ -264,7 +268,9 @@ class DemoCollector:
         episode = _Episode(task, number, prelude=None, at_home=rng.random() >= start.share, rng=rng)
         if start.leaning_share and rng.random() < start.leaning_share:
             drop_against_another(self.env, stream, rng)
-        after_another = start.occupied_receptacles or start.arm_pose == "after_task"
+        after_another = (
+            start.occupied_receptacles or start.misplaced_objects or start.arm_pose == "after_task"
+        )
         # An object that lies on the table from the start would leave nothing to show of its reset task.
         if task.receptacle is None or (after_another and not episode.at_home):
             episode.prelude = self._prelude(task, rng)
@@ -275,18 +281,21 @@ class DemoCollector:
         return episode
 
     def _prelude(self, task: Task, rng: np.random.Generator) -> Task:
-        """Another object onto the target receptacle, or onto another one if that shall stay free.
+        """What was done before: another object put onto the target receptacle, or the task's own onto another one.
 
-        Before a reset task, its object onto any receptacle.
+        With neither asked for, another object onto another receptacle; before a reset task, its object onto any.
         """
         if task.receptacle is None:
             own = [other for other in self.env.scene.tasks if other.object == task.object]
             return own[rng.integers(len(own))]
-        occupied = self.config.start.occupied_receptacles
+        start = self.config.start
+        # Whether the task before had the same object, and the same receptacle.
+        wanted = {(False, True)} if start.occupied_receptacles else set()
+        wanted |= {(True, False)} if start.misplaced_objects else set()
         choices = [
             other
             for other in self.env.scene.tasks
-            if other.object != task.object and (other.receptacle == task.receptacle) == occupied
+            if (other.object == task.object, other.receptacle == task.receptacle) in (wanted or {(False, False)})
         ]
         return choices[rng.integers(len(choices))]
 

@@ -54,7 +54,8 @@ _WIDE_FLAGS = (
     "--start.layouts=reach",
     "--start.arm_pose=after_task",
     "--start.occupied_receptacles=true",
-    "--start.share=0.3",
+    "--start.misplaced_objects=true",
+    "--start.share=0.5",
 )
 BASE_KINDS: dict[str, tuple[str, ...]] = {
     NARROW: (),
