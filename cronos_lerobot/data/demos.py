@@ -268,9 +268,7 @@ class DemoCollector:
         episode = _Episode(task, number, prelude=None, at_home=rng.random() >= start.share, rng=rng)
         if start.leaning_share and rng.random() < start.leaning_share:
             drop_against_another(self.env, stream, rng)
-        after_another = (
-            start.occupied_receptacles or start.misplaced_objects or start.arm_pose == "after_task"
-        )
+        after_another = start.occupied_receptacles or start.misplaced_objects or start.arm_pose == "after_task"
         # An object that lies on the table from the start would leave nothing to show of its reset task.
         if task.receptacle is None or (after_another and not episode.at_home):
             episode.prelude = self._prelude(task, rng)

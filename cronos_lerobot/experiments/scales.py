@@ -63,8 +63,8 @@ BASE_KINDS: dict[str, tuple[str, ...]] = {
     WIDE_RESETS: (*_WIDE_FLAGS, "--reset_tasks=true"),
 }
 """Kinds of base policies by where their demonstrations begin, as flags of `cronos-record-demos`: in the training
-configurations; wherever the arm can do the tasks, three in ten where another task left arm and bodies; the same
-with reset tasks among them."""
+configurations; wherever the arm can do the tasks, every second where another task left the arm, and another object
+on the target or the object itself on another receptacle; the same with reset tasks among them."""
 
 
 @dataclass(frozen=True)
@@ -122,12 +122,13 @@ CLEAN_RECIPES: dict[tuple[str, str], BaseRecipe] = {
 }
 """The same from clean demonstrations, where that is measured."""
 WIDE_RECIPES: dict[tuple[str, str], BaseRecipe] = {
-    ("kitchen_2x2", STATE): BaseRecipe(400, 2560, checkpoint=1920, kind=WIDE),
+    ("kitchen_2x2", STATE): BaseRecipe(1200, 1280, checkpoint=960, kind=WIDE),
     ("playroom_2x2", STATE): BaseRecipe(400, 960, checkpoint=720, kind=WIDE),
     ("kitchen_3x3", STATE): BaseRecipe(900, 1080, checkpoint=1080, kind=WIDE),
     ("kitchen_2x2", PIXELS): BaseRecipe(800, 2400, checkpoint=2400, kind=WIDE),
 }
-"""The same over the whole reach, with as many demonstrations."""
+"""The same over the whole reach. What lies anywhere takes three times the demonstrations for the same success: of 400
+the clone of `kitchen_2x2` came to .43 and stayed there, of 1,200 to .82."""
 SMOKE_RECIPE = BaseRecipe(8, 5, checkpoint=5, clone_batch=32)
 
 ALGORITHM_FLAGS = {

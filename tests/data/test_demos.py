@@ -180,6 +180,36 @@ def test_occupied_receptacles_hold_the_other_object(env, tmp_path):
         np.testing.assert_allclose(episode["observation.state"][0, :3], home, atol=2e-3)
 
 
+def test_misplaced_objects_lie_on_another_receptacle(env, tmp_path):
+    start = StartConfig(misplaced_objects=True, arm_pose="after_task")
+    dataset, _ = collect(env, tmp_path / "d", DemoConfig(start=start))
+    bodies = env.scene.bodies
+    for episode, (task,) in zip(episodes_of(dataset), dataset.meta.episodes["tasks"], strict=True):
+        (task,) = [t for t in env.scene.tasks if t.instruction == task]
+        (other,) = [name for name in env.scene.receptacles if name != task.receptacle]
+        xy = episode["observation.environment_state"][0].reshape(len(bodies), -1)[:, :2]
+        assert np.linalg.norm(xy[bodies.index(task.object)] - xy[bodies.index(other)]) < 0.07
+        assert np.linalg.norm(xy[bodies.index(task.object)] - xy[bodies.index(task.receptacle)]) > 0.07
+        assert episode["next.success"][-1]
+
+
+def test_starts_with_either_an_occupied_receptacle_or_a_misplaced_object(env, tmp_path):
+    start = StartConfig(misplaced_objects=True, occupied_receptacles=True)
+    dataset, _ = collect(env, tmp_path / "d", DemoConfig(start=start), 8)
+    bodies, on = env.scene.bodies, []
+    for episode, (task,) in zip(episodes_of(dataset), dataset.meta.episodes["tasks"], strict=True):
+        (task,) = [t for t in env.scene.tasks if t.instruction == task]
+        xy = episode["observation.environment_state"][0].reshape(len(bodies), -1)[:, :2]
+        places = xy[[bodies.index(name) for name in env.scene.receptacles]]
+        near = {name: np.linalg.norm(places - xy[bodies.index(name)], axis=1) < 0.07 for name in env.scene.objects}
+        target = env.scene.receptacles.index(task.receptacle)
+        misplaced = near[task.object].any() and not near[task.object][target]
+        occupied = any(near[name][target] for name in env.scene.objects if name != task.object)
+        assert misplaced != occupied
+        on.append(misplaced)
+    assert 0 < sum(on) < 8
+
+
 def test_layouts_over_the_reach(env, tmp_path):
     dataset, _ = collect(env, tmp_path / "d", DemoConfig(start=StartConfig(layouts="reach")), 8)
     assert dataset.meta.episodes["cronos.configuration"] == [-1] * 8

@@ -60,8 +60,13 @@ def test_each_plug_stands_alone_and_together_on_both_bases():
 
 def test_commands(tmp_path):
     jobs = jobs_of("few_resets", tmp_path)
-    base = "base/kitchen_2x2_state_400widedemos_2560steps"
-    wanted = {"--start.layouts=reach", "--start.arm_pose=after_task", "--start.share=0.3", "--noise.share=0.75"}
+    base = "base/kitchen_2x2_state_1200widedemos_1280steps"
+    wanted = {
+        "--start.layouts=reach",
+        "--start.arm_pose=after_task",
+        "--start.misplaced_objects=true",
+        "--start.share=0.5",
+    }
     assert wanted < set(jobs[f"{base}/demos"].command)
     assert "--reset_tasks=true" in jobs[f"{base.replace('widedemos', 'wide_resetsdemos')}/demos"].command
     run = jobs["kitchen_2x2_state_small/t1280_eer_critic_staggered_wide_307k/seed1"]
