@@ -127,8 +127,8 @@ WIDE_RECIPES: dict[tuple[str, str], BaseRecipe] = {
     ("kitchen_3x3", STATE): BaseRecipe(900, 1080, checkpoint=1080, kind=WIDE),
     ("kitchen_2x2", PIXELS): BaseRecipe(800, 2400, checkpoint=2400, kind=WIDE),
 }
-"""The same over the whole reach. What lies anywhere takes three times the demonstrations for the same success: of 400
-the clone of `kitchen_2x2` came to .43 and stayed there, of 1,200 to .82."""
+"""The same over the whole reach. What may lie anywhere takes more demonstrations: `kitchen_2x2`'s clone of 400
+came to .43 and stayed there, of 1,200 to .82 (docs/results.md)."""
 SMOKE_RECIPE = BaseRecipe(8, 5, checkpoint=5, clone_batch=32)
 
 ALGORITHM_FLAGS = {
