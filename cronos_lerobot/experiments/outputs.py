@@ -10,7 +10,7 @@ from typing import Any
 
 from cronos_lerobot.experiments import plots, tables
 from cronos_lerobot.experiments.definitions import Experiment, Row
-from cronos_lerobot.experiments.differences import RowDifference, differences_to_first
+from cronos_lerobot.experiments.differences import RowDifference, compare_rows, to_first
 from cronos_lerobot.experiments.intervention_plots import interventions_figure
 from cronos_lerobot.experiments.jobs import this_commit
 from cronos_lerobot.experiments.results import (
@@ -23,7 +23,7 @@ from cronos_lerobot.experiments.results import (
 )
 from cronos_lerobot.experiments.specs import Options, base_policy
 from cronos_lerobot.protocol.metrics import Summary
-from cronos_lerobot.report.paired import ALPHA
+from cronos_lerobot.report.paired import ALPHA, holm
 from cronos_lerobot.report.statistics import Rate
 from cronos_lerobot.report.tables import write_csv
 from cronos_lerobot.training.logging import METRICS
@@ -38,9 +38,10 @@ def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options,
     result = collect(experiment, rows, options)
     folder.mkdir(parents=True, exist_ok=True)
     name = experiment.name
+    differences = compare_rows(result)
     data = {
         name: tables.main_rows(result),
-        f"{name}_differences": tables.difference_rows(result),
+        f"{name}_differences": tables.difference_rows(differences),
         f"{name}_curves": tables.curve_rows(result),
         f"{name}_segments": tables.segment_rows(result),
         f"{name}_tasks": tables.task_rows(result),
@@ -67,7 +68,7 @@ def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options,
     summary |= {"differences": data[f"{name}_differences"]}
     summary |= {"segments": data[f"{name}_segments"], "sequential": data[f"{name}_sequential"]}
     (folder / f"{name}.json").write_text(json.dumps(summary, indent=2))
-    page = markdown(result, drawn)
+    page = markdown(result, differences, drawn)
     (folder / f"{name}.md").write_text(page)
     return f"{page}\nWritten to {folder}"
 
@@ -98,12 +99,12 @@ def _settings(result: ExperimentResult) -> dict[str, Any]:
     }
 
 
-def markdown(result: ExperimentResult, figures: Sequence[str]) -> str:
+def markdown(result: ExperimentResult, differences: Sequence[RowDifference], figures: Sequence[str]) -> str:
     """The page: what was run, the table, what the paper's text says, the figures, what is missing."""
     lines = [*_introduction(result), "", *_table(_main_columns(result)), "", NOTES, "", PPO_NOTES]
     if result.experiment.source:
         lines += _about_the_paper(result)
-    if difference_columns := _difference_columns(result):
+    if difference_columns := _difference_columns(to_first(result, differences)):
         lines += [*_section("Which rows differ", difference_columns), "", DIFFERENCE_NOTES]
     if budget_columns := _budget_columns(result):
         lines += [*_section("Success after so many interventions", budget_columns), *_budget_notes(result)]
@@ -206,19 +207,20 @@ def _main_columns(result: ExperimentResult) -> Columns:
     return columns
 
 
-def _difference_columns(result: ExperimentResult) -> Columns:
-    found = differences_to_first(result)
+def _difference_columns(found: Sequence[RowDifference]) -> Columns:
     if not found:
         return {}
+    ps = [one.difference.p for one in found]
+    adjusted = holm([1.0 if p is None else p for p in ps])
     return {
         "": [one.row.row.label for one in found],
         "reference": [one.reference.row.label for one in found],
         "difference": [f"{one.difference.value:+.3f}" for one in found],
         "95 %": [_signed_interval(one.difference.ci95) for one in found],
-        "p": [MISSING if one.difference.p is None else f"{one.difference.p:.2g}" for one in found],
-        "p (Holm)": [f"{one.p_holm:.2g}" for one in found],
+        "p": [MISSING if p is None else f"{p:.2g}" for p in ps],
+        "p (Holm)": [f"{p:.2g}" for p in adjusted],
         "of": ["trainings" if one.of_trainings else "these policies" for one in found],
-        "verdict": [_verdict(one) for one in found],
+        "verdict": [_verdict(one.difference.value, p) for one, p in zip(found, adjusted, strict=True)],
     }
 
 
@@ -226,10 +228,10 @@ def _signed_interval(ends: tuple[float, float] | None) -> str:
     return MISSING if ends is None else f"[{ends[0]:+.3f}, {ends[1]:+.3f}]"
 
 
-def _verdict(one: RowDifference) -> str:
-    if one.p_holm >= ALPHA:
+def _verdict(difference: float, p: float) -> str:
+    if p >= ALPHA:
         return "not separated"
-    return "better" if one.difference.value > 0 else "worse"
+    return "better" if difference > 0 else "worse"
 
 
 def _budget_columns(result: ExperimentResult) -> Columns:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from cronos_lerobot.experiments.definitions import INTERACTION_STEPS, INTERVENTIONS
-from cronos_lerobot.experiments.differences import all_differences
+from cronos_lerobot.experiments.differences import RowDifference
 from cronos_lerobot.experiments.results import APART, ExperimentResult, RowResult, paper_results, sequential
 from cronos_lerobot.protocol.metrics import Summary, interpolate, summarise
 from cronos_lerobot.report.series import segment_rates, task_rates
@@ -91,8 +92,8 @@ def _rate_cells(rate: Rate) -> Row:
     return {"success": rate.value, "successes": rate.successes, "n": rate.n, "ci95_low": low, "ci95_high": high}
 
 
-def difference_rows(result: ExperimentResult) -> list[Row]:
-    """Every two finished rows: success of the one minus that of the other, its reference, on the same episodes."""
+def difference_rows(found: Sequence[RowDifference]) -> list[Row]:
+    """Success of a row minus that of its reference, on the same episodes."""
     return [
         {
             "row": one.row.row.name,
@@ -104,10 +105,9 @@ def difference_rows(result: ExperimentResult) -> list[Row]:
             "ci95_low": (one.difference.ci95 or (None, None))[0],
             "ci95_high": (one.difference.ci95 or (None, None))[1],
             "p": one.difference.p,
-            "p_holm": one.p_holm,
             "of_trainings": one.of_trainings,
         }
-        for one in all_differences(result)
+        for one in found
     ]
 
 

@@ -13,7 +13,7 @@ from synthetic_runs import INSTRUCTIONS, write_training_run
 
 from cronos_lerobot.experiments import plots, tables
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, LONG, SHORT, Base
-from cronos_lerobot.experiments.differences import differences_to_first
+from cronos_lerobot.experiments.differences import compare_rows, to_first
 from cronos_lerobot.experiments.jobs import made_by, write_record
 from cronos_lerobot.experiments.outputs import write_outputs
 from cronos_lerobot.experiments.plan import train_job
@@ -346,16 +346,21 @@ def test_rows_from_other_bases_have_references_of_their_own(options, tmp_path):
     """p is adjusted for all lines of the table; rows of other episodes are not compared."""
     ends = {"t1280_eer": 6, "t1280_eer_critic": 2, "t80_wide": 7, "t1280_eer_wide": 1}
     specs = {row: make_run(options, "few_resets", row, 1, (2, 4, end)) for row, end in ends.items()}
-    found = differences_to_first(results(options, "few_resets"))
+    result = results(options, "few_resets")
+    found = to_first(result, compare_rows(result))
     # T = 80 from the narrow base is not finished: the first that is takes its place.
     pairs = [(one.row.row.name, one.reference.row.name) for one in found]
     assert pairs == [("t1280_eer_critic", "t1280_eer"), ("t1280_eer_wide", "t80_wide")]
     assert [one.difference.value for one in found] == [-0.5, -0.75]
+    experiment = EXPERIMENTS["few_resets"]
+    text = write_outputs(experiment, experiment.rows, options, tmp_path / "out")
+    lines = [line.split(" | ") for line in text.splitlines() if "these policies |" in line]
     ps = [one.difference.p for one in found]
-    assert [one.p_holm for one in found] == [max(ps[0], 2 * ps[1]), 2 * ps[1]]
+    assert [line[5] for line in lines] == [f"{max(ps[0], 2 * ps[1]):.2g}", f"{2 * ps[1]:.2g}"]
     metrics = specs["t1280_eer_wide"].train_folder / "metrics.jsonl"
     metrics.write_text(metrics.read_text().replace("[1000, ", "[1001, "))
-    assert len(differences_to_first(results(options, "few_resets"))) == 1
+    result = results(options, "few_resets")
+    assert len(to_first(result, compare_rows(result))) == 1
 
 
 def test_tasks_and_reset_tasks_by_quarter(options, tmp_path):
