@@ -154,7 +154,7 @@ class Trainer:
             # A run that was told to stop has left an evaluation to the one that goes on from it.
             if self.loop.t == 0 or self._is_evaluation_due():
                 self._evaluate()
-                self._last_interventions = self.loop.b
+            self._last_interventions = self.loop.b
             return self._run(stop or StopRequest())
         finally:
             self.recorder.close()
@@ -190,10 +190,9 @@ class Trainer:
             self._check_processes()
             self._log_update()
             ends = self._is_stopped(stop)
-            is_due = self._is_evaluation_due()
-            if is_due and not ends:
-                self._evaluate()
-            if not (is_due and ends):
+            if not ends:
+                if self._is_evaluation_due():
+                    self._evaluate()
                 self._last_interventions = self.loop.b
             if self.config.save_checkpoint and (ends or _due(self.loop.n, last_save, self.config.save_freq)):
                 self._save(env_state)
