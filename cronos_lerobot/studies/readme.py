@@ -9,12 +9,12 @@ The files are those that `cronos-reproduce` wrote, in docs/results; the table st
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import sys
 from pathlib import Path
 from typing import Any
 
+README = Path("README.md")
 RESULTS = Path("docs/results/few_resets_small_state")
 ROWS = {
     "t80_wide": "episodic: a reset every 80 steps",
@@ -30,33 +30,29 @@ BEGIN, END = "<!-- few_resets: made by python -m cronos_lerobot.studies.readme -
 
 def make_table(folder: Path) -> str:
     """The table in Markdown, of what `cronos-reproduce few_resets` wrote into a folder."""
-    rows = {row["row"]: row for row in _read(folder / "few_resets.csv")}
-    differences = {
-        (found["row"], found["reference"]): found for found in _read(folder / "few_resets_differences.csv")
-    }
+    found = json.loads((folder / "few_resets.json").read_text())
+    rows = {row["row"]: row for row in found["rows"] if row["success_train_mean"] is not None}
     reference, *_ = ROWS
+    differences = {one["row"]: one for one in found["differences"] if one["reference"] == reference}
     lines = [
         "| training, from the wide base | interventions | success | seeds | minus episodic [95 %] |",
         "|---|---|---|---|---|",
     ]
-    shown = [name for name in ROWS if rows.get(name, {}).get("success_train_mean")]
+    shown = [name for name in ROWS if name in rows]
     for name in shown:
         row = rows[name]
-        difference = differences.get((name, reference))
         cells = (
             ROWS[name],
-            f"{float(row['interventions_mean']):,.0f}",
+            f"{row['interventions_mean']:,.0f}",
             _success(row),
-            row["seeds"],
-            _difference(difference) if difference else "",
+            str(row["seeds"]),
+            _difference(differences[name]) if name in differences else "",
         )
         lines.append(f"| {' | '.join(cells)} |")
-    base = {rows[name]["base_success_mean"] for name in shown}
-    settings = json.loads((folder / "few_resets.json").read_text())
-    n = rows[shown[0]]["n_train"]
-    before = " and ".join(f"{float(value):.3f}" for value in sorted(base))
+    before = " and ".join(f"{value:.3f}" for value in sorted({rows[name]["base_success_mean"] for name in shown}))
+    steps, n = found["steps"], rows[shown[0]]["n_train"]
     return "\n".join(
-        [*lines, "", f"{settings['steps']:,} interaction steps; before training {before}; n = {n} for each seed."]
+        [*lines, "", f"{steps:,} interaction steps; before training {before}; n = {n} for each seed."]
     )
 
 
@@ -73,38 +69,31 @@ def rewrite(readme: str, folder: Path) -> str:
 
 
 def _success(row: dict[str, Any]) -> str:
-    mean, std = float(row["success_train_mean"]), row["success_train_std"]
-    ends = [row["success_train_ci95_low"], row["success_train_ci95_high"]]
-    spread = f" ± {float(std):.3f}" if std else ""
-    interval = " [{:.3f}, {:.3f}]".format(*map(float, ends)) if all(ends) else ""
-    return f"{mean:.3f}{spread}{interval}"
+    std = row["success_train_std"]
+    spread = "" if std is None else f" ± {std:.3f}"
+    ends = row["success_train_ci95_low"], row["success_train_ci95_high"]
+    return f"{row['success_train_mean']:.3f}{spread}" + _interval(ends, ".3f")
 
 
 def _difference(found: dict[str, Any]) -> str:
-    ends = [found["ci95_low"], found["ci95_high"]]
-    interval = " [{:+.3f}, {:+.3f}]".format(*map(float, ends)) if all(ends) else ""
-    return f"{float(found['difference']):+.3f}{interval}"
+    return f"{found['difference']:+.3f}" + _interval((found["ci95_low"], found["ci95_high"]), "+.3f")
 
 
-def _read(path: Path) -> list[dict[str, Any]]:
-    with path.open() as file:
-        return list(csv.DictReader(file))
+def _interval(ends: tuple[float | None, float | None], form: str) -> str:
+    return "" if None in ends else f" [{ends[0]:{form}}, {ends[1]:{form}}]"
 
 
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--readme", type=Path, default=Path("README.md"))
-    parser.add_argument("--results", type=Path, default=RESULTS, help=f"default: {RESULTS}")
     parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if it is not up to date")
     args = parser.parse_args()
-    before = args.readme.read_text()
-    after = rewrite(before, args.results)
-    if args.check:
-        sys.exit(
-            "" if after == before else f"{args.readme} is not what {args.results} says: run it without --check"
-        )
-    args.readme.write_text(after)
+    before = README.read_text()
+    after = rewrite(before, RESULTS)
+    if not args.check:
+        README.write_text(after)
+    elif after != before:
+        sys.exit(f"{README} is not what {RESULTS} says: run it without --check")
 
 
 if __name__ == "__main__":
