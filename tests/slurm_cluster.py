@@ -117,10 +117,11 @@ class SlurmCluster:
             with suppress(OSError, ValueError):
                 os.kill(int((self.folder / f"{name}.pid").read_text()), signal.SIGKILL)
         # What watches over a job (slurmstepd) would look for the controller for minutes.
-        for step in Path("/proc").glob("[0-9]*/environ"):
+        for step in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
-                if f"SLURM_CONF={os.environ['SLURM_CONF']}\0".encode() in step.read_bytes():
-                    os.kill(int(step.parent.name), signal.SIGKILL)
+                is_ours = f"SLURM_CONF={os.environ['SLURM_CONF']}\0".encode() in (step / "environ").read_bytes()
+                if is_ours and (step / "comm").read_text().strip() == "slurmstepd":
+                    os.kill(int(step.name), signal.SIGKILL)
         if self._before is None:
             os.environ.pop("SLURM_CONF", None)
         else:

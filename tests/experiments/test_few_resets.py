@@ -66,6 +66,7 @@ def test_commands(tmp_path):
         "--start.arm_pose=after_task",
         "--start.misplaced_objects=true",
         "--start.share=0.5",
+        "--noise.share=0.75",
     }
     assert wanted < set(jobs[f"{base}/demos"].command)
     assert "--reset_tasks=true" in jobs[f"{base.replace('widedemos', 'wide_resetsdemos')}/demos"].command
