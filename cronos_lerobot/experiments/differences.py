@@ -37,7 +37,7 @@ class RowDifference:
 
 
 def compare_rows(result: ExperimentResult) -> list[RowDifference]:
-    """Every two finished rows whose runs were evaluated on the same episodes, the later against the earlier one."""
+    """Every two finished rows that were evaluated on the same episodes, the later against the earlier one."""
     finished = [(row, outcomes) for row in result.rows if (outcomes := _outcomes(row))]
     return [
         _compare(*reference, *row)

@@ -3,7 +3,7 @@
 import draccus
 import numpy as np
 import pytest
-from test_experiment_outputs import TINY, make_run
+from experiment_runs import TINY, make_run
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base
 from cronos_lerobot.experiments.few_resets import PLUGS, plugged, wide

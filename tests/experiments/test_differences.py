@@ -1,0 +1,54 @@
+"""Which rows differ: paired on the same episodes, as `cronos-report compare` has it."""
+
+import json
+
+from experiment_runs import make_run, read_csv, results
+from forked_commands import run_forked
+
+from cronos_lerobot.experiments.definitions import EXPERIMENTS
+from cronos_lerobot.experiments.differences import compare_rows, to_first
+from cronos_lerobot.experiments.outputs import write_outputs
+
+
+def test_rows_are_compared_as_the_report_compares_them(options, tmp_path):
+    for row, seed, successes in (("t80", 1, 6), ("t80", 2, 7), ("t1280_eer", 1, 3), ("t1280_eer", 2, 2)):
+        make_run(options, "table1", row, seed, (2, 4, successes))
+    make_run(options, "table1", "t1280", 1, (2, 4, 6))
+    text = write_outputs(EXPERIMENTS["table1"], EXPERIMENTS["table1"].rows, options, tmp_path / "out")
+    found = {(d["row"], d["reference"]): d for d in read_csv(tmp_path / "out/table1_differences.csv")}
+    assert list(found) == [("t1280", "t80"), ("t1280_eer", "t80"), ("t1280_eer", "t1280")]
+    one = found["t1280_eer", "t80"]
+    assert (one["difference"], one["episodes"], one["of_trainings"]) == ("-0.5", "32", "True")
+    folders = [next((tmp_path / "root/runs").rglob(f"{row}_10k")) for row in ("t80", "t1280_eer")]
+    said = run_forked(["cronos-report", "compare", *folders, "--json"], check=True).stdout
+    compared = json.loads(said)["comparisons"][0]["rows"][0]["trainings"]
+    assert [float(one[name]) for name in ("ci95_low", "ci95_high", "p")] == [*compared["ci95"], compared["p"]]
+    # Two of the three pairs have the first row as their reference, and p is adjusted for as many.
+    line = next(line for line in text.splitlines() if line.startswith("| T = 1280, EER | T = 80 |"))
+    assert line.split(" | ")[5] == f"{2 * compared['p']:.2g}"
+    assert ("worse" if 2 * compared["p"] < 0.05 else "not separated") in line
+    # One seed of a row says nothing of its trainings.
+    assert {pair: d["of_trainings"] for pair, d in found.items()} == {
+        ("t1280", "t80"): "False", ("t1280_eer", "t80"): "True", ("t1280_eer", "t1280"): "False",
+    }  # fmt: skip
+
+
+def test_rows_from_other_bases_have_references_of_their_own(options, tmp_path):
+    """p is adjusted for all lines of the table; rows of other episodes are not compared."""
+    ends = {"t1280_eer": 6, "t1280_eer_critic": 2, "t80_wide": 7, "t1280_eer_wide": 1}
+    specs = {row: make_run(options, "few_resets", row, 1, (2, 4, end)) for row, end in ends.items()}
+    result = results(options, "few_resets")
+    found = to_first(result, compare_rows(result))
+    # T = 80 from the narrow base is not finished: the first that is takes its place.
+    pairs = [(one.row.row.name, one.reference.row.name) for one in found]
+    assert pairs == [("t1280_eer_critic", "t1280_eer"), ("t1280_eer_wide", "t80_wide")]
+    assert [one.difference.value for one in found] == [-0.5, -0.75]
+    experiment = EXPERIMENTS["few_resets"]
+    text = write_outputs(experiment, experiment.rows, options, tmp_path / "out")
+    lines = [line.split(" | ") for line in text.splitlines() if "these policies |" in line]
+    ps = [one.difference.p for one in found]
+    assert [line[5] for line in lines] == [f"{max(ps[0], 2 * ps[1]):.2g}", f"{2 * ps[1]:.2g}"]
+    metrics = specs["t1280_eer_wide"].train_folder / "metrics.jsonl"
+    metrics.write_text(metrics.read_text().replace("[1000, ", "[1001, "))
+    result = results(options, "few_resets")
+    assert len(to_first(result, compare_rows(result))) == 1
