@@ -6,6 +6,7 @@ From the privileged state of kitchen_2x2: one set of demonstrations, a base poli
 `cronos-train` for each agent, interval and seed, evaluated on the same 256 episodes before and after. It prints
 both successes, and the gain's 95 % interval over the seeds (Student's t). All commands lie beside what they made;
 the same command again goes on where this one was stopped, and `--report_only` makes the table of what there is.
+`gains.csv` has a line for each run, `gains.png` is drawn of them; `--merge=gains.csv` adds another machine's.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 from lerobot_env_cronos import gymnasium_id
 
 from cronos_lerobot.experiments.display import make_display
@@ -26,8 +26,15 @@ from cronos_lerobot.experiments.jobs import Job
 from cronos_lerobot.experiments.plan import LAST_POLICY, resume_command
 from cronos_lerobot.experiments.progress import train_progress
 from cronos_lerobot.experiments.runner import DONE, Runner
-from cronos_lerobot.protocol.metrics import Summary, summarise
-from cronos_lerobot.training.logging import METRICS
+from cronos_lerobot.studies.every_policy_report import (
+    Ended,
+    draw_gains,
+    make_table,
+    merge,
+    read_end,
+    read_gains,
+    write_gains,
+)
 
 OBSERVATION = (
     "--env.type=cronos",
@@ -193,62 +200,12 @@ def run_folder(run: Run, folder: Path) -> Path:
     return folder / "runs" / run.name
 
 
-@dataclass(frozen=True)
-class Gain:
-    """What an agent made of a base policy."""
-
-    before: float
-    after: tuple[float, ...]
-    """By seed."""
-    interventions: int
-    """Of a run, in the mean."""
-
-    @property
-    def gain(self) -> Summary:
-        """After minus before, over the seeds; the base's success is taken as it was measured."""
-        summary = summarise([after - self.before for after in self.after])
-        assert summary is not None
-        return summary
-
-
-def read_gain(runs: Sequence[Run], folder: Path) -> Gain | None:
-    """Read the finished ones of some runs that differ in their seed; None if there is none."""
-    ends = []
-    for run in runs:
-        path = run_folder(run, folder) / METRICS
-        lines = path.read_text().splitlines() if path.is_file() else []
-        evaluations = [record for record in map(json.loads, lines) if record["kind"] == "evaluation"]
-        if evaluations and evaluations[-1]["interaction_steps"] >= run.steps:
-            ends.append((evaluations[0], evaluations[-1]))
-    if not ends:
-        return None
-    return Gain(
-        float(np.mean([first["success"] for first, _ in ends])),
-        tuple(last["success"] for _, last in ends),
-        round(np.mean([last["interventions"] for _, last in ends])),
+def read_ends(runs: Sequence[Run], folder: Path) -> list[Ended]:
+    """Those runs of the folder that are over."""
+    found = (
+        read_end(run_folder(run, folder), run.kind, run.agent, run.interval, run.seed, run.steps) for run in runs
     )
-
-
-def make_table(runs: Sequence[Run], folder: Path) -> str:
-    """A table in Markdown, a line for each kind, agent and interval that has a finished run."""
-    lines = [
-        "| policy | agent | T | steps | interventions | before | after, by seed | gain [95 %] |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    groups: dict[tuple[str, str, int], list[Run]] = {}
-    for run in runs:
-        groups.setdefault((run.kind, run.agent, run.interval), []).append(run)
-    for (kind, agent, interval), group in groups.items():
-        if gain := read_gain(group, folder):
-            after = " ".join(f"{value:.3f}".lstrip("0") for value in gain.after)
-            summary = gain.gain
-            bounds = "" if summary.ci95 is None else " [{:+.3f}, {:+.3f}]".format(*summary.ci95)
-            resets = f"{interval}{' + EER' if len(RESETS[interval]) > 1 else ''}"
-            lines.append(
-                f"| {kind} | {agent} | {resets} | {group[0].steps:,} | {gain.interventions:,} "
-                f"| {gain.before:.3f} | {after} | {summary.mean:+.3f}{bounds} |"
-            )
-    return "\n".join(lines)
+    return [end for end in found if end]
 
 
 def main() -> None:
@@ -262,6 +219,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="commands at a time")
     parser.add_argument("--report_only", action="store_true", help="run nothing")
+    parser.add_argument(
+        "--merge", type=Path, nargs="+", default=[], metavar="GAINS.CSV", help="report these runs, too"
+    )
     args = parser.parse_args()
     runs = make_runs(args.policies, args.agents, args.intervals, args.seeds)
     jobs, done = make_jobs(runs, args.output_dir), True
@@ -272,7 +232,13 @@ def main() -> None:
         except KeyboardInterrupt:
             sys.exit("\ninterrupted: the same command goes on from here")
         done = all(state == DONE for state in states.values())
-    print(make_table(runs, args.output_dir))
+    others = [end for path in args.merge for end in read_gains(path)]
+    ends = merge(read_ends(runs, args.output_dir), others, list(KINDS))
+    if ends:
+        args.output_dir.mkdir(parents=True, exist_ok=True)
+        write_gains(ends, args.output_dir / "gains.csv")
+        draw_gains(ends).savefig(args.output_dir / "gains.png", dpi=150)
+    print(make_table(ends))
     if not done:
         sys.exit(1)
 

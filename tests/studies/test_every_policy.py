@@ -1,8 +1,20 @@
 """The study's runs differ in what they say they differ in, and its table is what the runs wrote."""
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
-from cronos_lerobot.studies.every_policy import KINDS, make_jobs, make_runs, make_table, run_folder
+from cronos_lerobot.studies.every_policy import KINDS, make_jobs, make_runs, read_ends, run_folder
+from cronos_lerobot.studies.every_policy_report import (
+    Ended,
+    draw_gains,
+    make_table,
+    merge,
+    read_gains,
+    write_gains,
+)
+
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 def flags_of(job):
@@ -41,11 +53,43 @@ def test_the_table_has_the_gain_over_the_seeds(tmp_path):
         write_run(tmp_path, run, 0.5, after)
     # One that is not over has no line of its own.
     write_run(tmp_path, imitation[0], 0.5, 0.9, steps=51_200)
-    lines = make_table(runs, tmp_path).splitlines()
+    lines = make_table(read_ends(runs, tmp_path)).splitlines()
     assert len(lines) == 3
     # 0.2 +- 4.303 * 0.1 / sqrt(3), t of two degrees of freedom.
     half = 4.302653 * 0.1 / 3**0.5
     gain = f"+0.200 [{0.2 - half:+.3f}, {0.2 + half:+.3f}]"
+    assert 0.2 - half < 0
     assert lines[2] == f"| act | ppo | 80 | 204,800 | 2,560 | 0.500 | .600 .700 .800 | {gain} |"
     write_run(tmp_path, imitation[1], 0.5, 0.55)
-    assert make_table(runs, tmp_path).splitlines()[3].endswith("| .550 | +0.050 |")
+    assert make_table(read_ends(runs, tmp_path)).splitlines()[3].endswith("| .550 | +0.050 |")
+    write_run(tmp_path, imitation[2], 0.5, 0.56)
+    # An interval above zero is bold: 0.055 +- 12.706 * 0.005 is not, 0.055 +- 12.706 * 0.0005 is.
+    ends = read_ends(imitation, tmp_path)
+    assert "**" not in make_table(ends)
+    ends = [replace(end, after=after) for end, after in zip(ends, (0.5545, 0.5555), strict=True)]
+    assert make_table(ends).endswith("| **+0.055 [+0.049, +0.061]** |")
+
+
+def test_runs_of_another_machine_count_where_there_is_no_own(tmp_path):
+    own = [Ended("flow", "ppo", 80, seed, 1000, 12, 0.5, 0.6, 256) for seed in (1, 2)]
+    others = [Ended("flow", "ppo", 80, seed, 1000, 12, 0.5, 0.7, 256) for seed in (2, 3)]
+    others += [replace(others[0], policy="tokens"), replace(others[0], agent="imitation", interval=320)]
+    write_gains(others, tmp_path / "gains.csv")
+    assert read_gains(tmp_path / "gains.csv") == others
+    found = merge(own, read_gains(tmp_path / "gains.csv"), list(KINDS))
+    assert [(end.policy, end.agent, end.seed, end.after) for end in found] == [
+        ("tokens", "ppo", 2, 0.7), ("flow", "ppo", 1, 0.6), ("flow", "ppo", 2, 0.6), ("flow", "ppo", 3, 0.7),
+        ("flow", "imitation", 2, 0.7),
+    ]  # fmt: skip
+
+
+def test_the_docs_have_the_table_of_their_file():
+    assert make_table(read_gains(DOCS / "results/every_policy/gains.csv")) in (DOCS / "results.md").read_text()
+
+
+def test_the_figure_has_a_line_for_each_policy_agent_and_interval():
+    ends = read_gains(DOCS / "results/every_policy/gains.csv")
+    (ax,) = draw_gains(ends).axes
+    assert len(ax.get_yticks()) == len({(end.policy, end.agent, end.interval) for end in ends})
+    low, high = ax.get_xlim()
+    assert all(low < end.after < high for end in ends)

@@ -1,0 +1,175 @@
+"""What the runs of `every_policy` came to: a line of a file for each, a table and a figure of all."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cronos_lerobot.protocol.metrics import Summary, summarise
+from cronos_lerobot.report.figures import COLORS, INK, style_axes
+from cronos_lerobot.report.tables import write_csv
+from cronos_lerobot.training.logging import METRICS
+
+AGENTS = {"ppo": COLORS[0], "imitation": COLORS[1], "steering": COLORS[2]}
+MARKERS = {80: "o", 320: "s"}
+"""By T."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A run that is over, as a line of `gains.csv`."""
+
+    policy: str
+    agent: str
+    interval: int
+    """T [control steps], with end-effector resets where it is not 80."""
+    seed: int
+    steps: int
+    """Interaction steps."""
+    interventions: int
+    before: float
+    """Success of the base policy, on the same episodes."""
+    after: float
+    n: int
+    """Episodes of an evaluation."""
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What an agent made of a base policy: runs that differ in their seed."""
+
+    runs: tuple[Ended, ...]
+
+    @property
+    def before(self) -> float:
+        """Mean over the runs, which begin with one policy wherever one machine has cloned it."""
+        return float(np.mean([run.before for run in self.runs]))
+
+    @property
+    def gain(self) -> Summary:
+        """After minus before, over the seeds; the base's success is taken as it was measured."""
+        summary = summarise([run.after - run.before for run in self.runs])
+        assert summary is not None
+        return summary
+
+
+def read_end(folder: Path, policy: str, agent: str, interval: int, seed: int, steps: int) -> Ended | None:
+    """Read the first and the last evaluation of a run; None before it is over."""
+    path = folder / METRICS
+    lines = path.read_text().splitlines() if path.is_file() else []
+    evaluations = [record for record in map(json.loads, lines) if record["kind"] == "evaluation"]
+    if not evaluations or evaluations[-1]["interaction_steps"] < steps:
+        return None
+    first, last = evaluations[0], evaluations[-1]
+    success = first["success"], last["success"]
+    return Ended(policy, agent, interval, seed, steps, last["interventions"], *success, last["n"])
+
+
+def write_gains(runs: Iterable[Ended], path: Path) -> None:
+    """Write a line for each run."""
+    write_csv(path, [asdict(run) for run in runs])
+
+
+def read_gains(path: Path) -> list[Ended]:
+    """Read what `write_gains` wrote."""
+    with path.open() as file:
+        return [
+            Ended(
+                row["policy"],
+                row["agent"],
+                *(int(row[name]) for name in ("interval", "seed", "steps", "interventions")),
+                before=float(row["before"]),
+                after=float(row["after"]),
+                n=int(row["n"]),
+            )
+            for row in csv.DictReader(file)
+        ]
+
+
+def merge(runs: Iterable[Ended], others: Iterable[Ended], policies: Sequence[str]) -> list[Ended]:
+    """Join runs with those of other machines, which count where the same run is not among the first.
+
+    They come in the order of `policies`, then by agent, T and seed.
+    """
+    found = {(*_group(run), run.seed): run for run in (*others, *runs)}
+    agents = list(AGENTS)
+    return sorted(
+        found.values(),
+        key=lambda run: (policies.index(run.policy), agents.index(run.agent), run.interval, run.steps, run.seed),
+    )
+
+
+def _group(run: Ended) -> tuple[str, str, int, int]:
+    return run.policy, run.agent, run.interval, run.steps
+
+
+def gains(runs: Iterable[Ended]) -> list[Gain]:
+    """Runs that differ in their seed, together."""
+    groups: dict[tuple[str, str, int, int], list[Ended]] = {}
+    for run in runs:
+        groups.setdefault(_group(run), []).append(run)
+    return [Gain(tuple(group)) for group in groups.values()]
+
+
+def make_table(runs: Iterable[Ended]) -> str:
+    """A table in Markdown, a line for each policy, agent and interval; intervals above zero are bold."""
+    lines = [
+        "| policy | agent | T | steps | interventions | before | after, by seed | gain [95 %] |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for gain in gains(runs):
+        run = gain.runs[0]
+        after = " ".join(f"{one.after:.3f}".lstrip("0") for one in gain.runs)
+        interventions = round(np.mean([one.interventions for one in gain.runs]))
+        lines.append(
+            f"| {run.policy} | {run.agent} | {_resets(run)} | {run.steps:,} | {interventions:,} "
+            f"| {gain.before:.3f} | {after} | {_gain_cell(gain.gain)} |"
+        )
+    return "\n".join(lines)
+
+
+def _resets(run: Ended) -> str:
+    return f"{run.interval}{'' if run.interval == min(MARKERS) else ' + EER'}"
+
+
+def _gain_cell(gain: Summary) -> str:
+    if gain.ci95 is None:
+        return f"{gain.mean:+.3f}"
+    text = "{:+.3f} [{:+.3f}, {:+.3f}]".format(gain.mean, *gain.ci95)
+    return f"**{text}**" if gain.ci95[0] > 0 else text
+
+
+def draw_gains(runs: Sequence[Ended]) -> Figure:
+    """Success before and after: a line for each policy, agent and T, dots for the seeds.
+
+    Marks are means; their interval is the gain's, drawn from the base policy's success.
+    """
+    lines = gains(runs)
+    figure = Figure(figsize=(8, 0.34 * len(lines) + 1.2), layout="constrained")
+    ax = figure.subplots()
+    policies = list(dict.fromkeys(line.runs[0].policy for line in lines))
+    for i, line in enumerate(lines):
+        run, gain = line.runs[0], line.gain
+        y, color = i + 0.7 * policies.index(run.policy), AGENTS[run.agent]
+        ax.plot([line.before] * 2, [y - 0.4, y + 0.4], color="#8a8a8a", linewidth=2)
+        ax.plot([line.before, line.before + gain.mean], [y, y], color=color, linewidth=1, alpha=0.4)
+        ax.plot([one.after for one in line.runs], [y] * len(line.runs), ".", color=color, alpha=0.6, markersize=5)
+        bars = None if gain.ci95 is None else [[gain.mean - gain.ci95[0]], [gain.ci95[1] - gain.mean]]
+        ax.errorbar(
+            line.before + gain.mean, y, xerr=bars, fmt=MARKERS[run.interval], color=color, markersize=6, capsize=3
+        )
+    ax.set_yticks(
+        [i + 0.7 * policies.index(line.runs[0].policy) for i, line in enumerate(lines)],
+        [f"{line.runs[0].policy}, {line.runs[0].agent}, T = {_resets(line.runs[0])}" for line in lines],
+    )
+    ax.invert_yaxis()
+    style_axes(ax, "success before (grey) and after, with the gain's 95 % interval")
+    ax.xaxis.set_major_formatter("{x:.2f}")
+    ax.tick_params(axis="y", labelcolor=INK)
+    return figure
