@@ -3,12 +3,14 @@
 import multiprocessing
 import os
 import socket
+import threading
 import traceback
 
 import numpy as np
 import torch
 from dummies import DummyEnv, DummyPolicy
 from test_trainer import KilledError
+from tqdm import tqdm
 
 from cronos_lerobot.processes import join_processes
 
@@ -43,6 +45,8 @@ def together(function, *args, count=2):
 
 def _child(rank, count, port, results, function, args):
     torch.set_num_threads(1)
+    # The parent's lock is shared: a child that is killed while it draws a bar would keep it for ever.
+    tqdm.set_lock(threading.RLock())
     os.environ |= {
         "RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count),
         "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "OMP_NUM_THREADS": "1",
