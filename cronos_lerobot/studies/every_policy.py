@@ -4,9 +4,10 @@
 
 From the privileged state of kitchen_2x2: one set of demonstrations, a base policy of each kind, and a run of
 `cronos-train` for each agent, interval and seed, evaluated on the same 256 episodes before and after. It prints
-both successes, and the gain's 95 % interval over the seeds (Student's t). All commands lie beside what they made;
-the same command again goes on where this one was stopped, and `--report_only` makes the table of what there is.
-`gains.csv` has a line for each run, `gains.png` is drawn of them; `--merge=gains.csv` adds another machine's.
+both successes, the gain's 95 % interval over the seeds (Student's t), and what a step of training costs. All
+commands lie beside what they made; the same command again goes on where this one was stopped, and `--report_only`
+makes the table of what there is. `gains.csv` has a line for each run, `gains.png` is drawn of them;
+`--merge=gains.csv` adds another machine's.
 """
 
 from __future__ import annotations
@@ -27,10 +28,13 @@ from cronos_lerobot.experiments.plan import LAST_POLICY, resume_command
 from cronos_lerobot.experiments.progress import train_progress
 from cronos_lerobot.experiments.runner import DONE, Runner
 from cronos_lerobot.studies.every_policy_report import (
+    Cost,
     Ended,
     draw_gains,
+    make_cost_table,
     make_table,
     merge,
+    read_cost,
     read_end,
     read_gains,
     write_gains,
@@ -208,6 +212,15 @@ def read_ends(runs: Sequence[Run], folder: Path) -> list[Ended]:
     return [end for end in found if end]
 
 
+def read_costs(runs: Sequence[Run], folder: Path) -> dict[tuple[str, str], list[Cost]]:
+    """By policy and agent, of the runs that have begun."""
+    costs: dict[tuple[str, str], list[Cost]] = {}
+    for run in runs:
+        if cost := read_cost(run_folder(run, folder)):
+            costs.setdefault((run.kind, run.agent), []).append(cost)
+    return costs
+
+
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -238,7 +251,7 @@ def main() -> None:
         args.output_dir.mkdir(parents=True, exist_ok=True)
         write_gains(ends, args.output_dir / "gains.csv")
         draw_gains(ends).savefig(args.output_dir / "gains.png", dpi=150)
-    print(make_table(ends))
+    print(make_table(ends), make_cost_table(read_costs(runs, args.output_dir)), sep="\n\n")
     if not done:
         sys.exit(1)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -143,6 +143,42 @@ def _gain_cell(gain: Summary) -> str:
         return f"{gain.mean:+.3f}"
     text = "{:+.3f} [{:+.3f}, {:+.3f}]".format(gain.mean, *gain.ci95)
     return f"**{text}**" if gain.ci95[0] > 0 else text
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What the steps of a run cost, on the machine that it had."""
+
+    steps_per_s: float
+    """Interaction steps."""
+    physics: float
+    """Time of a step over that of its physics: what a faster or a busier machine changes least."""
+
+
+def read_cost(folder: Path) -> Cost | None:
+    """Read the time that updates took, but for the first, which starts things; None before there is a second."""
+    path = folder / METRICS
+    lines = path.read_text().splitlines() if path.is_file() else []
+    updates = [record for record in map(json.loads, lines) if record["kind"] == "update"]
+    steps = np.diff([update["interaction_steps"] for update in updates])
+    if len(steps) == 0:
+        return None
+    seconds = steps / [update["steps_per_s"] for update in updates[1:]]
+    physics = seconds @ [update["time_share"]["physics"] for update in updates[1:]]
+    return Cost(float(steps.sum() / seconds.sum()), float(seconds.sum() / physics))
+
+
+def make_cost_table(costs: Mapping[tuple[str, str], Sequence[Cost]]) -> str:
+    """A table in Markdown of the least and the greatest cost of the runs of each policy and agent."""
+    lines = ["| policy | agent | steps/s | a step, in times of its physics |", "|---|---|---|---|"]
+    for (policy, agent), found in costs.items():
+        speed, physics = [cost.steps_per_s for cost in found], [cost.physics for cost in found]
+        lines.append(f"| {policy} | {agent} | {_span(speed, '.0f')} | {_span(physics, '.1f')} |")
+    return "\n".join(lines)
+
+
+def _span(values: Sequence[float], form: str) -> str:
+    return " to ".join(dict.fromkeys(f"{value:{form}}" for value in (min(values), max(values))))
 
 
 def draw_gains(runs: Sequence[Ended]) -> Figure:

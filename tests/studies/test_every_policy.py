@@ -4,10 +4,11 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-from cronos_lerobot.studies.every_policy import KINDS, make_jobs, make_runs, read_ends, run_folder
+from cronos_lerobot.studies.every_policy import KINDS, make_jobs, make_runs, read_costs, read_ends, run_folder
 from cronos_lerobot.studies.every_policy_report import (
     Ended,
     draw_gains,
+    make_cost_table,
     make_table,
     merge,
     read_gains,
@@ -93,3 +94,24 @@ def test_the_figure_has_a_line_for_each_policy_agent_and_interval():
     assert len(ax.get_yticks()) == len({(end.policy, end.agent, end.interval) for end in ends})
     low, high = ax.get_xlim()
     assert all(low < end.after < high for end in ends)
+
+
+def test_cost_is_time_over_the_time_of_physics(tmp_path):
+    runs = make_runs(["flow"], ["ppo"], [80], [1, 2, 3])
+    # 1000 steps in 10 s, 4 s of them physics, and in 5 s, 1 s of them; the first update does not count.
+    speeds = {1: ((1, 1.0), (100, 0.4), (200, 0.2)), 2: ((1, 1.0), (100, 0.5)), 3: ((1, 1.0),)}
+    for run in runs:
+        path = run_folder(run, tmp_path)
+        path.mkdir(parents=True)
+        records = [
+            {
+                "kind": "update",
+                "interaction_steps": 1000 * (i + 1),
+                "steps_per_s": speed,
+                "time_share": {"physics": p},
+            }
+            for i, (speed, p) in enumerate(speeds[run.seed])
+        ]
+        (path / "metrics.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+    table = make_cost_table(read_costs(runs, tmp_path))
+    assert table.splitlines()[2] == "| flow | ppo | 100 to 133 | 2.0 to 3.0 |"
