@@ -92,7 +92,7 @@ def write_progress(streams: StreamDataset, output: Path, weighting: Weighting) -
         `gae_lambda`.
 
     Raises:
-        ValueError: rewards that do not go with the successes, values that are not finite, or `output` is a folder.
+        ValueError: rewards that do not go with the successes, no value for every frame, or `output` is a folder.
     """
     if output.is_dir():
         raise ValueError(f"{output} is a folder; name a file in it, {output / 'progress.parquet'} say")
@@ -106,6 +106,7 @@ def write_progress(streams: StreamDataset, output: Path, weighting: Weighting) -
         rows = _progress_rows(frames, flags.get("protocol.reward", "difference"), gamma)
     else:
         made_with["gae_lambda"] = gae_lambda
+        _check_values(frames[VALUE].to_numpy(), flags)
         rows = _advantage_rows(frames, gamma, gae_lambda)
     columns = {name: frames[name].to_numpy(np.int64) for name in INDICES}
     columns[COLUMN] = np.concatenate(rows).astype(np.float32)
@@ -132,12 +133,23 @@ def _progress_rows(frames: pd.DataFrame, reward: str, gamma: float) -> list[np.n
     return rows
 
 
-def _advantage_rows(frames: pd.DataFrame, gamma: float, gae_lambda: float) -> list[np.ndarray]:
-    if bad := int((~np.isfinite(frames[VALUE].to_numpy())).sum()):
+def _check_values(values: np.ndarray, flags: Mapping[str, Any]) -> None:
+    instead = f"; --weight_by={PROGRESS} needs none"
+    if bad := int((~np.isfinite(values)).sum()):
         raise ValueError(
-            f"{VALUE} is not finite in {bad} of {len(frames)} frames: who chose these actions had no critic;"
-            f" --weight_by={PROGRESS} needs none"
+            f"{VALUE} is not finite in {bad} of {len(values)} frames: who chose these actions had no critic{instead}"
         )
+    if not values.any():
+        raise ValueError(f"{VALUE} is 0 in every frame: who chose these actions had no critic{instead}")
+    # A value is recorded for each decision, and repeated for all of its actions.
+    if (played := int(flags.get("policy.n_action_steps") or 1)) > 1:
+        raise ValueError(
+            f"the policy that was recorded played {played} actions a decision, and {VALUE} is of the first alone:"
+            f" advantages want values of every frame{instead}"
+        )
+
+
+def _advantage_rows(frames: pd.DataFrame, gamma: float, gae_lambda: float) -> list[np.ndarray]:
     return [
         summed_advantages(
             segment[REWARD].to_numpy(np.float64), segment[VALUE].to_numpy(np.float64), gamma, gae_lambda

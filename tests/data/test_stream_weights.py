@@ -187,7 +187,14 @@ def test_what_cannot_be_weighed_is_refused(tmp_path):
     record_weighted(tmp_path / "no_critic", value=np.nan)
     with pytest.raises(ValueError, match=r"cronos.value is not finite in 26 of 26 frames.*--weight_by=progress"):
         write(tmp_path / "no_critic", tmp_path / "p", weight_by="advantage")
+    record_weighted(tmp_path / "imitation", value=0)
+    with pytest.raises(ValueError, match=r"cronos.value is 0 in every frame.*had no critic"):
+        write(tmp_path / "imitation", tmp_path / "p", weight_by="advantage")
+    record_weighted(tmp_path / "chunks", origin=replace(ORIGIN, flags={"policy.n_action_steps": 2}))
+    with pytest.raises(ValueError, match=r"played 2 actions a decision, and cronos.value is of the first alone"):
+        write(tmp_path / "chunks", tmp_path / "p", weight_by="advantage")
     assert not (tmp_path / "p").exists()
+    write(tmp_path / "chunks", tmp_path / "p")
 
 
 def test_policies_that_lerobot_can_weigh_are_those_of_the_docs():
