@@ -137,7 +137,8 @@ def _check_values(values: np.ndarray, flags: Mapping[str, Any]) -> None:
     instead = f"; --weight_by={PROGRESS} needs none"
     if bad := int((~np.isfinite(values)).sum()):
         raise ValueError(
-            f"{VALUE} is not finite in {bad} of {len(values)} frames: who chose these actions had no critic{instead}"
+            f"{VALUE} is not finite in {bad} of {len(values)} frames: who chose these actions had no critic"
+            f"{instead}"
         )
     if not values.any():
         raise ValueError(f"{VALUE} is 0 in every frame: who chose these actions had no critic{instead}")

@@ -37,14 +37,38 @@ ACT_ALONE = """
 import json, sys
 sys.modules["cronos_lerobot"] = None
 import torch
-from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
-policy = DiffusionPolicy.from_pretrained(sys.argv[1])
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class
+config = PreTrainedConfig.from_pretrained(sys.argv[1])
+policy = get_policy_class(config.type).from_pretrained(sys.argv[1], config=config)
 torch.manual_seed(0)
-shapes = {name: feature.shape for name, feature in policy.config.input_features.items()}
-batch, noise = {name: torch.rand(2, *shape) for name, shape in shapes.items()}, torch.randn(2, 8, 7)
+batch = {name: torch.rand(2, *feature.shape) for name, feature in config.input_features.items()}
+noise = {"noise": torch.randn(2, 8, 7)} if config.type == "diffusion" else {}
 policy.reset()
-print(json.dumps(policy.select_action(batch, noise=noise).tolist()))
+print(json.dumps([policy.select_action(batch, **noise).tolist() for _ in range(config.n_action_steps)]))
 """
+"""Plays a chunk, without this project."""
+
+
+def actions_alone(folder):
+    """(n, 2, 7) actions of LeRobot's policy in a process that has only LeRobot."""
+    acted = run_forked([sys.executable, "-c", ACT_ALONE, folder], check=True)
+    return json.loads(acted.stdout.splitlines()[-1])
+
+
+def actions_here(policy):
+    """The same by the adapter, at noise level 0."""
+    adapter = make_trainable(policy, AdapterOptions())
+    torch.manual_seed(0)
+    batch = {name: torch.rand(2, *feature.shape) for name, feature in adapter.config.input_features.items()}
+    noise = {}
+    if adapter.config.type == "diffusion":
+        noise = {"noise": torch.randn(2, 8, 7)}
+        # Of its first observation LeRobot makes both.
+        batch = {name: torch.stack([value, value], 1) for name, value in batch.items()}
+    with torch.no_grad():
+        actions = adapter.sample_actions(batch, temperature=0, **noise)["actions"]
+    return actions[:, : adapter.config.n_action_steps].transpose(0, 1).tolist()
 
 
 @pytest.fixture
@@ -76,8 +100,7 @@ def test_act_learns_in_chunks_saves_resumes_and_is_a_lerobot_policy(tmp_path, mo
 
     policy = ACTPolicy.from_pretrained(whole / "checkpoints/last/pretrained_model")
     assert not [name for name in policy.state_dict() if "critic" in name or "log_std" in name]
-    shapes = {name: feature.shape for name, feature in policy.config.input_features.items()}
-    assert policy.select_action({name: torch.zeros(2, *shape) for name, shape in shapes.items()}).shape == (2, 7)
+    assert actions_alone(whole / "checkpoints/last/pretrained_model") == actions_here(policy)
 
 
 @pytest.mark.usefixtures("paid_for_moving")
@@ -100,16 +123,7 @@ def test_diffusion_learns_by_its_chain_saves_resumes_and_is_a_lerobot_policy(tmp
     from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 
     last = whole / "checkpoints/last/pretrained_model"
-    acted = run_forked([sys.executable, "-c", ACT_ALONE, last], check=True)
-    adapter = make_trainable(DiffusionPolicy.from_pretrained(last), AdapterOptions())
-    torch.manual_seed(0)
-    shapes = {name: feature.shape for name, feature in adapter.config.input_features.items()}
-    batch, noise = {name: torch.rand(2, *shape) for name, shape in shapes.items()}, torch.randn(2, 8, 7)
-    # Of its first observation LeRobot makes both.
-    batch = {name: torch.stack([value, value], 1) for name, value in batch.items()}
-    with torch.no_grad():
-        actions = adapter.sample_actions(batch, temperature=0, noise=noise)["actions"]
-    assert json.loads(acted.stdout.splitlines()[-1]) == actions[:, 0].tolist()
+    assert actions_alone(last) == actions_here(DiffusionPolicy.from_pretrained(last))
 
 
 def test_noise_at_some_steps_is_for_flows(tmp_path, monkeypatch):
