@@ -128,7 +128,7 @@ WIDE_RECIPES: dict[tuple[str, str], BaseRecipe] = {
     ("kitchen_2x2", PIXELS): BaseRecipe(800, 2400, checkpoint=2400, kind=WIDE),
 }
 """The same over the whole reach. What may lie anywhere takes more demonstrations: `kitchen_2x2`'s clone of 400
-came to .43 and stayed there, of 1,200 to .82 (docs/results.md)."""
+came to .43 and stayed there, of 1,200 to .82 (docs/trials.md)."""
 SMOKE_RECIPE = BaseRecipe(8, 5, checkpoint=5, clone_batch=32)
 
 ALGORITHM_FLAGS = {

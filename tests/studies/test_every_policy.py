@@ -1,6 +1,8 @@
 """The study's runs differ in what they say they differ in, and its table is what the runs wrote."""
 
 import json
+import re
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -115,3 +117,24 @@ def test_cost_is_time_over_the_time_of_physics(tmp_path):
         (path / "metrics.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
     table = make_cost_table(read_costs(runs, tmp_path))
     assert table.splitlines()[2] == "| flow | ppo | 100 to 133 | 2.0 to 3.0 |"
+
+
+def test_the_commands_of_the_docs_are_those_of_the_study():
+    """The table of baselines can be made by hand."""
+    page = (DOCS / "results.md").read_text()
+    block = page[page.index("## Baselines") : page.index("| base | cloned for")].replace("\\\n", " ")
+    (shared,) = re.findall(r'^clone="(.*?)"$', block, re.MULTILINE)
+    lines = [shlex.split(f"{shared} {line}") for line in re.findall(r"^\$clone (.*)$", block, re.MULTILINE)]
+    by_hand = {flag.split("/")[-1]: line for line in lines for flag in line if flag.startswith("--output_dir")}
+    jobs = {job.name: job for job in make_jobs(make_runs(list(KINDS), ["ppo"], [80], [1]), Path("outputs"))}
+    for kind in KINDS:
+        expected = flags_of(jobs[f"base {kind}"]) | {"--output_dir": f"outputs/{kind}"}
+        assert _parsed(by_hand[kind]) == _parsed([f"{name}={value}" for name, value in expected.items()])
+    (record,) = [shlex.split(line) for line in block.splitlines() if line.startswith("cronos-record-demos")]
+    assert _parsed(record) == _parsed(jobs["demos"].command)
+
+
+def _parsed(flags):
+    """JSON is the same however it is written."""
+    parts = [flag.split("=", 1) for flag in flags if "=" in flag]
+    return {name: json.loads(value) if value.startswith("{") else value for name, value in parts}
