@@ -6,8 +6,8 @@ From the privileged state of kitchen_2x2: one set of demonstrations, a base poli
 `cronos-train` for each agent, interval and seed, evaluated on the same 256 episodes before and after. It prints
 both successes, the gain's 95 % interval over the seeds (Student's t), and what a step of training costs. All
 commands lie beside what they made; the same command again goes on where this one was stopped, and `--report_only`
-makes the table of what there is. `gains.csv` has a line for each run, `gains.png` is drawn of them;
-`--merge=gains.csv` adds another machine's.
+makes the tables of what there is. `gains.csv` has a line for each run of the folder, `gains.png` is drawn of
+them; `--merge=gains.csv` adds another machine's.
 """
 
 from __future__ import annotations
@@ -204,6 +204,12 @@ def run_folder(run: Run, folder: Path) -> Path:
     return folder / "runs" / run.name
 
 
+def find_runs(folder: Path) -> list[Run]:
+    """Runs of the study that have begun in a folder, whatever was asked for this time."""
+    names = (path.name.split("_") for path in sorted((folder / "runs").glob("*_*_*_*")) if path.is_dir())
+    return [Run(kind, agent, int(interval), int(seed)) for kind, agent, interval, seed in names if kind in KINDS]
+
+
 def read_ends(runs: Sequence[Run], folder: Path) -> list[Ended]:
     """Those runs of the folder that are over."""
     found = (
@@ -246,12 +252,13 @@ def main() -> None:
             sys.exit("\ninterrupted: the same command goes on from here")
         done = all(state == DONE for state in states.values())
     others = [end for path in args.merge for end in read_gains(path)]
-    ends = merge(read_ends(runs, args.output_dir), others, list(KINDS))
+    begun = find_runs(args.output_dir)
+    ends = merge(read_ends(begun, args.output_dir), others, list(KINDS))
     if ends:
         args.output_dir.mkdir(parents=True, exist_ok=True)
         write_gains(ends, args.output_dir / "gains.csv")
         draw_gains(ends).savefig(args.output_dir / "gains.png", dpi=150)
-    print(make_table(ends), make_cost_table(read_costs(runs, args.output_dir)), sep="\n\n")
+    print(make_table(ends), make_cost_table(read_costs(begun, args.output_dir)), sep="\n\n")
     if not done:
         sys.exit(1)
 

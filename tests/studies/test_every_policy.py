@@ -6,7 +6,15 @@ import shlex
 from dataclasses import replace
 from pathlib import Path
 
-from cronos_lerobot.studies.every_policy import KINDS, make_jobs, make_runs, read_costs, read_ends, run_folder
+from cronos_lerobot.studies.every_policy import (
+    KINDS,
+    find_runs,
+    make_jobs,
+    make_runs,
+    read_costs,
+    read_ends,
+    run_folder,
+)
 from cronos_lerobot.studies.every_policy_report import (
     Ended,
     draw_gains,
@@ -64,6 +72,9 @@ def test_the_table_has_the_gain_over_the_seeds(tmp_path):
     assert 0.2 - half < 0
     assert lines[2] == f"| act | ppo | 80 | 204,800 | 2,560 | 0.500 | .600 .700 .800 | {gain} |"
     write_run(tmp_path, imitation[1], 0.5, 0.55)
+    begun = find_runs(tmp_path)
+    assert set(begun) == {*ppo, *imitation[:2]}
+    assert read_ends(begun, tmp_path) == read_ends(sorted(runs, key=lambda run: run.name), tmp_path)
     assert make_table(read_ends(runs, tmp_path)).splitlines()[3].endswith("| .550 | +0.050 |")
     write_run(tmp_path, imitation[2], 0.5, 0.56)
     # An interval above zero is bold: 0.055 +- 12.706 * 0.005 is not, 0.055 +- 12.706 * 0.0005 is.
