@@ -140,7 +140,11 @@ def draw_batch(
         parts.append(demos.batch(num_demos, rng))
     if num_demos < size and len(memory):
         parts.append(segment_batch(memory.draw(size - num_demos, rng, weights), config))
-    return join_batches(*parts) if len(parts) == 2 else parts[0] if parts else None
+    if not parts:
+        return None
+    batch = join_batches(*parts) if len(parts) == 2 else parts[0]
+    # Frames that are remembered are no dataset's rows, but LeRobot's TD-MPC counts a batch by their numbers.
+    return {"index": torch.arange(size)} | batch
 
 
 def join_batches(first: Batch, second: Batch) -> Batch:
