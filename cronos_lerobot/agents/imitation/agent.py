@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import OBS_LANGUAGE, OBS_STR
 from torch import Tensor
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
@@ -20,6 +21,7 @@ from cronos_lerobot.agents.base import (
     plain_sample,
 )
 from cronos_lerobot.agents.chunk_player import ChunkPlayer, Player, make_player
+from cronos_lerobot.agents.history import observation_steps
 from cronos_lerobot.agents.imitation.batches import Demonstrations, draw_batch
 from cronos_lerobot.agents.imitation.config import ImitationConfig
 from cronos_lerobot.agents.imitation.memory import OpenSegments, SegmentMemory, own_share
@@ -144,12 +146,11 @@ class ImitationAgent(LearningAgent):
             return make_player(self.policy)
 
         def plan(frames: list[Batch]) -> Tensor:
-            sample = self.policy.sample_actions(
-                frames[-1], temperature=self.config.temperature, generator=generator
-            )
+            batch = frames[0] if len(frames) == 1 else with_history(frames)
+            sample = self.policy.sample_actions(batch, temperature=self.config.temperature, generator=generator)
             return sample["actions"]
 
-        return ChunkPlayer(plan)
+        return ChunkPlayer(plan, observation_steps(self.policy))
 
     def _make_optimizer(self) -> None:
         try:
@@ -236,3 +237,17 @@ def copy_trained(policy: PreTrainedPolicy) -> PreTrainedPolicy:
     """A copy that shares the parameters that are not trained, which may be most of a large policy."""
     shared = {id(param): param for param in policy.parameters() if not param.requires_grad}
     return copy.deepcopy(policy, memo=shared)
+
+
+def with_history(frames: list[Batch]) -> Batch:
+    """Return preprocessed observations, oldest first, as one batch of a policy that looks back.
+
+    As `PolicyProcessors.batch` makes it of columns with a history: `observation.*` (B, H, ...), and of the
+    instruction, which is the same in all frames, the newest.
+    """
+    batch = dict(frames[-1])
+    for name, value in batch.items():
+        seen = name.startswith(f"{OBS_STR}.") and not name.startswith(OBS_LANGUAGE)
+        if seen and isinstance(value, Tensor):
+            batch[name] = torch.stack([frame[name] for frame in frames], 1)
+    return batch
