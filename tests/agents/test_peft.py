@@ -3,17 +3,35 @@
 import numpy as np
 import pytest
 import torch
+from dummies import identity_processors
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import PeftConfig
 from lerobot.policies.factory import get_policy_class
 from peft import PeftModel
-from test_vla_adapters import OPTIONS, STATISTICS, generator, one_update
+from test_act_adapter import make_act
+from test_diffusion_adapter import HORIZON, make_diffusion
+from test_imitation_agent import learn, make_imitating
+from test_vla_adapters import OPTIONS, STATISTICS, TEXTS, generator, one_update
 from tiny_pi0 import tiny_gemma
 from tiny_vlas import CHUNK, KINDS, PADDED, PLAYED, make_batch, make_processors, make_vla, save_vla
 
 from cronos_lerobot.agents.adapters.registry import make_trainable
+from cronos_lerobot.agents.ppo.agent import PPOAgent
+from cronos_lerobot.agents.ppo.config import PPOConfig
+from cronos_lerobot.agents.ppo.ppo import PPO
+from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
+from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.agents.processing import make_processors as around
 from cronos_lerobot.agents.weights import load_weights, save_policy, unwrapped, weights_file, wrap
+
+
+def load_as_lerobot(kind, base, adapters):
+    """As LeRobot's `make_policy` does it."""
+    config = PreTrainedConfig.from_pretrained(adapters)
+    assert config.use_peft
+    with tiny_gemma():
+        loaded = get_policy_class(kind).from_pretrained(base, config=config)
+    return PeftModel.from_pretrained(loaded, adapters, is_trainable=True).eval()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -47,12 +65,7 @@ def test_only_the_adapters_learn_and_are_saved(kind, tmp_path):
 
     save_policy(wrapped, tmp_path / "adapters")
     assert weights_file(wrapped, tmp_path / "adapters").is_file()
-    # As LeRobot's `make_policy` loads it.
-    config = PreTrainedConfig.from_pretrained(tmp_path / "adapters")
-    assert config.use_peft
-    with tiny_gemma():
-        loaded = get_policy_class(kind).from_pretrained(base, config=config)
-    loaded = PeftModel.from_pretrained(loaded, tmp_path / "adapters", is_trainable=True).eval()
+    loaded = load_as_lerobot(kind, base, tmp_path / "adapters")
     assert loaded.peft_config["default"].base_model_name_or_path == str(base)
     chunk = loaded.predict_action_chunk(dict(batch), noise=noise)
     np.testing.assert_allclose(chunk[:, :PLAYED].numpy(), actions.numpy(), atol=1e-6)
@@ -62,6 +75,117 @@ def test_only_the_adapters_learn_and_are_saved(kind, tmp_path):
     assert not torch.allclose(loaded.predict_action_chunk(dict(batch), noise=noise), chunk)
     load_weights(loaded, tmp_path / "adapters")
     assert torch.equal(loaded.predict_action_chunk(dict(batch), noise=noise), chunk)
+
+
+SMALL = {"act": (make_act, ["linear1", "linear2"]), "diffusion": (make_diffusion, ["cond_encoder.1"])}
+"""Policies that do not say themselves which layers get adapters, and some of their layers."""
+
+
+def make_wrapped(kind, folder):
+    """A small policy with adapters that do something, and what its weights are."""
+    make, layers = SMALL[kind]
+    policy = make()
+    policy.save_pretrained(folder)
+    policy.config.pretrained_path = folder
+    before = {name: param.detach().clone() for name, param in policy.state_dict().items()}
+    wrapped = wrap(policy, PeftConfig(target_modules=layers, r=2, lora_alpha=4)).eval()
+    with torch.no_grad():
+        for name, param in wrapped.named_parameters():
+            if "lora_B" in name:
+                param.normal_(std=0.3)
+    return wrapped, before
+
+
+def assert_only_adapters_moved(wrapped, before, adapters):
+    for name, param in unwrapped(wrapped).state_dict().items():
+        if "lora_" not in name:
+            assert torch.equal(param, before[name.replace(".base_layer", "")]), name
+    moved = {
+        name for name, param in wrapped.named_parameters() if not torch.equal(param, adapters.get(name, param))
+    }
+    assert moved
+    assert all(".lora_" in name for name in moved)
+
+
+def trained(wrapped):
+    return {name: param.detach().clone() for name, param in wrapped.named_parameters() if param.requires_grad}
+
+
+def select(policy, batch, **noise):
+    """The first actions of a new episode (B, n, A), by LeRobot's `select_action`."""
+    policy.reset()
+    steps = policy.config.n_action_steps
+    return torch.stack([policy.select_action(dict(batch), **noise) for _ in range(steps)], 1)
+
+
+@pytest.mark.parametrize("kind", SMALL)
+def test_ppo_trains_adapters_in_policies_without_defaults(kind, tmp_path):
+    wrapped, before = make_wrapped(kind, tmp_path / "base")
+    adapter = make_trainable(wrapped, OPTIONS)
+    batch = {"observation.state": torch.randn(2, 5), "observation.environment_state": torch.randn(2, 6)}
+    noise = {"noise": torch.randn(2, HORIZON, 3, generator=generator())} if kind == "diffusion" else {}
+    with torch.no_grad():
+        actions = adapter.sample_actions(batch, temperature=0, **noise)["actions"]
+        torch.testing.assert_close(actions, select(wrapped, batch, **noise))
+        with wrapped.disable_adapter():
+            assert not torch.allclose(actions, adapter.sample_actions(batch, temperature=0, **noise)["actions"])
+        sample = adapter.sample_actions(batch, generator=generator())
+    evaluated = adapter.evaluate_actions(batch, sample["trace"])
+    torch.testing.assert_close(evaluated["log_prob"], sample["log_prob"], atol=1e-4, rtol=0)
+    (evaluated["log_prob"].sum() + evaluated["value"].sum()).backward()
+    learning = {name for name, param in adapter.named_parameters() if param.grad is not None}
+    own = set(adapter.own_parameters())
+    assert own <= learning
+    # The encoder of ACT's latent has adapters too, which acting does not use.
+    lora = {name for name, _ in adapter.named_parameters() if ".lora_" in name and ".vae_encoder" not in name}
+    assert learning - own == lora
+    assert all(param.grad.any() for name, param in adapter.named_parameters() if name in lora)
+    groups = {id(param) for group in adapter.rl_parameter_groups() for param in group["params"]}
+    assert {name for name, param in adapter.named_parameters() if id(param) in groups} == learning
+    adapter.zero_grad()
+
+    adapters = trained(wrapped)
+    config = PPOConfig(epochs=1, value_warmup_updates=0, minibatch_size=8, ratio="factor", policy_lr=1e-3)
+    processors = PolicyProcessors(*identity_processors())
+    ppo = PPO(adapter, processors, config, np.random.default_rng(0))
+    agent = PPOAgent(ppo, RolloutBuffer(4, 2), generator())
+    seen = {"agent_pos": batch["observation.state"], "environment_state": batch["observation.environment_state"]}
+    seen = {name: column.numpy() for name, column in seen.items()}
+    steps = 4 * adapter.decision_steps
+    for step in range(steps):
+        decided = agent.act(seen, TEXTS)
+        agent.store(
+            seen, TEXTS, decided, decided.action[:, 0], seen, np.full(2, step == steps - 1), np.zeros(2, bool)
+        )
+    assert agent.update()["ratio_max"] == pytest.approx(1, abs=1e-4)
+    assert_only_adapters_moved(wrapped, before, adapters)
+
+    with torch.no_grad():
+        actions = select(wrapped, batch, **noise)
+        save_policy(wrapped, tmp_path / "adapters")
+        loaded = load_as_lerobot(kind, tmp_path / "base", tmp_path / "adapters")
+        torch.testing.assert_close(select(loaded, batch, **noise), actions)
+        # A run that goes on has what is beside the policy as well.
+        resumed = make_trainable(loaded, OPTIONS)
+        resumed.load_own_parameters({name: param.clone() for name, param in adapter.own_parameters().items()})
+        again = resumed.evaluate_actions(batch, sample["trace"])
+        now = adapter.evaluate_actions(batch, sample["trace"])
+    assert not torch.equal(now["value"], evaluated["value"])
+    for name in ("log_prob", "value"):
+        torch.testing.assert_close(again[name], now[name])
+
+
+@pytest.mark.parametrize("kind", SMALL)
+def test_imitation_trains_adapters_only(kind, tmp_path):
+    wrapped, before = make_wrapped(kind, tmp_path)
+    adapters = trained(wrapped)
+    agent = make_imitating(wrapped, PolicyProcessors(*identity_processors()), ema_decay=0.5)
+    metrics = learn(agent)
+    assert metrics["optimizer_steps"] == 1
+    assert metrics["grad_norm"] > 0
+    assert_only_adapters_moved(wrapped, before, adapters)
+    # A checkpoint has the average's adapters, not another copy of what is frozen.
+    assert dict(wrapped.named_parameters()).keys() & agent.state_dict()["learner"].keys() == adapters.keys()
 
 
 def test_a_policy_from_scratch_is_not_wrapped(tmp_path):

@@ -12,6 +12,7 @@ from torch.distributions import Normal
 from cronos_lerobot.agents.adapters.critic import Critic
 from cronos_lerobot.agents.adapters.registry import Adapter, AdapterOptions, register_adapter
 from cronos_lerobot.agents.base import Batch
+from cronos_lerobot.agents.weights import unwrapped
 
 FEATURES = "features"
 """What the critic reads, in a batch that `value_inputs` made."""
@@ -26,7 +27,7 @@ class ACTAdapter(Adapter):
     reads the mean of the encoder's tokens and the vectors of the observation; the value loss does not train ACT.
 
     Args:
-        policy: an ACTPolicy on its device.
+        policy: an ACTPolicy on its device, PEFT's wrapper around it perhaps.
         options: of the noise.
 
     Raises:
@@ -83,8 +84,9 @@ class ACTAdapter(Adapter):
         return {FEATURES: self._forward(batch)[1]}
 
     def rl_parameter_groups(self) -> list[dict[str, Any]]:
-        """All of ACT but the encoder of its latent, which acting does not use; the noise; the critic."""
-        policy = [p for name, p in self.policy.named_parameters() if ".vae_encoder" not in name]
+        """What of ACT is trained, but not the encoder of its latent, which acting does not use; noise; critic."""
+        named = self.policy.named_parameters()
+        policy = [p for name, p in named if p.requires_grad and ".vae_encoder" not in name]
         return [
             {"name": "policy", "params": [*policy, self.log_std]},
             {"name": "value", "params": [*self.critic.parameters()]},
@@ -100,9 +102,11 @@ class ACTAdapter(Adapter):
         if self.config.image_features:
             batch[OBS_IMAGES] = [batch[key] for key in self.config.image_features]
         encoded: list[Tensor] = []
-        handle = self.policy.model.encoder.register_forward_hook(lambda _, __, tokens: encoded.append(tokens))
+        # `model` of PEFT's wrapper is the policy, not its network.
+        network = unwrapped(self.policy).model
+        handle = network.encoder.register_forward_hook(lambda _, __, tokens: encoded.append(tokens))
         try:
-            chunk = self.policy.model(batch)[0]
+            chunk = network(batch)[0]
         finally:
             handle.remove()
         vectors = [batch[name] for name in self._vectors]
