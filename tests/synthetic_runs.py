@@ -15,7 +15,39 @@ STREAMS = 8
 KINDS = ("task_switch", "end_effector_reset", "heuristic_reset", "scene_reset", "divergence", "initial")
 
 
-def write_training_run(folder, *, seed=0, interval=320, successes=(2, 3, 5), updates=8):
+def ppo_metrics(update):
+    return {
+        "approx_kl": 0.01 * update,
+        "entropy": 3.0 - 0.1 * update,
+        "explained_variance": None if update == 1 else 0.1 * update,
+        "clip_fraction": 0.1,
+        "policy_lr": 3e-5,
+    }
+
+
+def imitation_metrics(update):
+    """With a weighting; the first update has too few successes to learn from."""
+    metrics = {"segments": 10.0 * update, "frames": 300.0 * update, "failed_segments": 5.0 * update}
+    metrics |= {"effective_share": 0.5, "optimizer_steps": 0.0 if update == 1 else 100.0}
+    return metrics if update == 1 else metrics | {"loss": 1 / update, "grad_norm": 0.2}
+
+
+def steering_metrics(update):
+    """The first update has too few decisions to learn from."""
+    metrics = {"decisions": 640.0 * update, "optimizer_steps": 0.0 if update == 1 else 64.0}
+    if update == 1:
+        return metrics
+    return metrics | {
+        "critic_loss": 0.1 / update, "critic_grad_norm": 0.4, "actor_loss": -0.1, "actor_grad_norm": 0.1,
+        "value": 0.05 * update, "entropy": 0.3, "choice_abs": 0.5, "alpha": 0.01 / update,
+    }  # fmt: skip
+
+
+AGENTS = {"ppo": ppo_metrics, "imitation": imitation_metrics, "steering": steering_metrics}
+"""What each agent says of an update, by `--algorithm.type`."""
+
+
+def write_training_run(folder, *, seed=0, interval=320, successes=(2, 3, 5), updates=8, agent="ppo"):
     """A run of `updates` updates of 160 steps; `successes` of 4 episodes a task at each of three evaluations."""
     folder.mkdir(parents=True)
     rng = np.random.default_rng(seed)
@@ -41,13 +73,7 @@ def write_training_run(folder, *, seed=0, interval=320, successes=(2, 3, 5), upd
                     "reward_per_segment": 0.5,
                     "diverged": 0,
                 },
-                "agent": {
-                    "approx_kl": 0.01 * update,
-                    "entropy": 3.0 - 0.1 * update,
-                    "explained_variance": None if update == 1 else 0.1 * update,
-                    "clip_fraction": 0.1,
-                    "policy_lr": 3e-5,
-                },
+                "agent": AGENTS[agent](update),
                 "steps_per_s": 500.0 if update % 2 else 1000.0,
                 "time_share": {"env": 0.5, "update": 0.25},
             }
@@ -60,6 +86,7 @@ def write_training_run(folder, *, seed=0, interval=320, successes=(2, 3, 5), upd
         "output_dir": str(folder),
         "num_envs": STREAMS,
         "protocol": {"scene_reset_interval": interval},
+        "algorithm": {"type": agent},
     }
     start = {"command": ["cronos-train"], "versions": {"mujoco": "4.0.0"}, "config": config}
     start["environment"] = "lerobot_env_cronos/kitchen_2x2-v1"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,14 +25,26 @@ SPLIT_LABELS = {"train": "training configurations", "held_out": "held-out config
 INK, GRID = "#333333", "#e4e4e4"
 AGENT_PANELS = (
     ("KL divergence per update [nats]", "approx_kl"),
-    ("entropy [nats]", "entropy"),
+    ("entropy [nats; steering: per dimension]", "entropy"),
     ("explained variance of the value", "explained_variance"),
     ("clip fraction", "clip_fraction"),
     ("learning rate of the policy", "policy_lr"),
     ("loss", "loss"),
     ("gradient norm", "grad_norm"),
     ("successful segments remembered", "segments"),
+    ("failed segments remembered", "failed_segments"),
+    ("frames remembered", "frames"),
+    ("effective share of the weighted frames", "effective_share"),
+    ("decisions remembered", "decisions"),
+    ("loss of the critics", "critic_loss"),
+    ("gradient norm of the critics", "critic_grad_norm"),
+    ("value of remembered decisions", "value"),
+    ("loss of the actor", "actor_loss"),
+    ("gradient norm of the actor", "actor_grad_norm"),
+    ("alpha, the price of the entropy", "alpha"),
+    ("size of the chosen noise (1: the bound)", "choice_abs"),
 )
+"""Title and name of what agents say of an update: PPO's, imitation's, steering's."""
 
 
 def evaluation_figure(groups: list[Group]) -> Figure | None:
@@ -47,7 +59,7 @@ def evaluation_figure(groups: list[Group]) -> Figure | None:
         style_axes(ax, f"{axis.replace('_', ' ')}, all streams")
         ax.set_ylim(0, 1.02)
     axes[0].set_ylabel("evaluation success")
-    _legend(figure, axes[0], groups)
+    _legend(figure, [axes[0]], groups)
     return figure
 
 
@@ -59,7 +71,7 @@ def training_figure(groups: list[Group]) -> Figure | None:
         draw_curve(ax, update_curve(group, lambda update: update["rollout"]["success"]), i, _label(group))
     style_axes(ax, "interaction steps, all streams")
     ax.set(ylabel="success of training segments", ylim=(0, 1.02))
-    _legend(figure, ax, groups)
+    _legend(figure, [ax], groups)
     return figure if ax.lines else None
 
 
@@ -78,7 +90,7 @@ def segments_figure(groups: list[Group]) -> Figure | None:
     style_axes(ax, "segment since the last scene reset (1 is the first after it)")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set(ylabel="success of training segments", ylim=(0, 1.02))
-    _legend(figure, ax, groups)
+    _legend(figure, [ax], groups)
     return figure if ax.lines else None
 
 
@@ -123,7 +135,8 @@ def agent_figure(groups: list[Group]) -> Figure | None:
             draw_curve(ax, curve, i, _label(group), width=1.2)
         style_axes(ax, "")
         ax.set_title(title, fontsize=9, color=INK, loc="left")
-    _legend(figure, axes[0], groups)
+    # Agents differ in their metrics: no panel need have a curve of every group.
+    _legend(figure, axes, groups)
     return figure
 
 
@@ -174,9 +187,11 @@ def _thousands(x: float, _: Any) -> str:
     return f"{x / 1e3:g}k" if abs(x) >= 1e4 else f"{x:g}"
 
 
-def _legend(figure: Figure, ax: Axes, groups: list[Group]) -> None:
+def _legend(figure: Figure, axes: Sequence[Axes], groups: list[Group]) -> None:
     """A legend below the panels, where it covers nothing, if there is anything to tell apart."""
-    handles, labels = ax.get_legend_handles_labels()
+    found = {(str(line.get_label()), line.get_color()): line for ax in axes for line in ax.lines}
+    keys = [(_label(group), COLORS[i % len(COLORS)]) for i, group in enumerate(groups)]
+    labels, handles = [key[0] for key in keys if key in found], [found[key] for key in keys if key in found]
     if not handles or (len(groups) < 2 and len(groups[0].runs) < 2):
         return
     columns = 2 if len(labels) > 3 else max(1, len(labels))
