@@ -13,6 +13,20 @@ from huggingface_hub.utils import validate_repo_id
 from cronos_lerobot.hub.push import Target
 
 
+def check_name(flag: str, name: str) -> None:
+    """Check that a flag names a repository.
+
+    Raises:
+        ValueError: it does not.
+    """
+    try:
+        validate_repo_id(name)
+    except HFValidationError as error:
+        raise ValueError(f"--{flag}={name} is no <owner>/<name>: {error}") from error
+    if name.count("/") != 1:
+        raise ValueError(f"--{flag}={name} is no <owner>/<name>: it lacks the owner")
+
+
 @dataclass
 class PublishConfig:
     """Where to, for all of them."""
@@ -44,12 +58,7 @@ class PublishConfig:
         """
         if not self.repo_id:
             raise ValueError("--repo_id=<owner>/<name> is required, also in a dry run: the card names it")
-        try:
-            validate_repo_id(self.repo_id)
-        except HFValidationError as error:
-            raise ValueError(f"--repo_id={self.repo_id} is no <owner>/<name>: {error}") from error
-        if self.repo_id.count("/") != 1:
-            raise ValueError(f"--repo_id={self.repo_id} is no <owner>/<name>: it lacks the owner")
+        check_name("repo_id", self.repo_id)
         if self.revision and not self.branch:
             raise ValueError("--revision is what a new --branch starts from; there is no --branch")
         if self.dry_run != (self.output_dir is not None):
@@ -122,13 +131,19 @@ class PolicyConfig(PublishConfig):
     """Dataset repository of its recorded streams; by default the --record.repo_id of the run."""
     base_policy: str | None = None
     """Model repository of the policy that training began with; by default the run's --policy.path, if that is
-    one."""
+    one. Adapters (PEFT) of a policy in a folder are published with this repository in its place."""
     results: Path | None = None
     """results.json of cronos-eval, or its folder, for the card."""
     scene: str | None = None
     """Scene of a policy that lerobot-train made, for the card; cronos-train's checkpoints know theirs."""
 
     repo_type: ClassVar[str] = "model"
+
+    def validate(self) -> None:
+        """Check the base's name as well."""
+        super().validate()
+        if self.base_policy is not None:
+            check_name("base_policy", self.base_policy)
 
 
 @dataclass

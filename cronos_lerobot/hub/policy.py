@@ -12,9 +12,12 @@ from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 from matplotlib.figure import Figure
 from safetensors import SafetensorError, safe_open
 
+from cronos_lerobot.agents.steering.steered import STEERING
 from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.hub.cards import render_card
 from cronos_lerobot.hub.config import PolicyConfig
+from cronos_lerobot.hub.eval_flags import cronos_eval_flags, lerobot_eval_flags
+from cronos_lerobot.hub.peft_base import find_base, name_base
 from cronos_lerobot.hub.runs import (
     Checkpoint,
     find_checkpoint,
@@ -39,20 +42,24 @@ def write_policy_repository(config: PolicyConfig, folder: Path) -> str:
     """Write the tree of a policy's repository into `folder`; returns what it is, in words.
 
     Raises:
-        ValueError: --path is missing, or results.json is none.
+        ValueError: --path is missing, the policy is damaged or of another robot, its adapters are of a policy
+            that is not on the Hub, or results.json is none.
         FileNotFoundError: there is no policy, or no results.json.
     """
     if config.path is None:
         raise ValueError("--path=<run folder or checkpoint> is required")
     checkpoint = find_checkpoint(config.path)
+    policy = _read_policy(checkpoint.model)
+    adapters_of = find_base(checkpoint.model, config.base_policy)
     for file in sorted(checkpoint.model.iterdir()):
         if file.is_file():
             shutil.copyfile(file, folder / file.name)
-    policy = _read_policy(checkpoint.model)
+    if adapters_of is not None:
+        name_base(folder, adapters_of)
     run = read_run(checkpoint.run, checkpoint.step) if checkpoint.run else None
     curves = _draw_curves(run, folder) if run else []
     results = read_results(config.results) if config.results else None
-    (folder / "README.md").write_text(_card(config, checkpoint, policy, run, curves, results))
+    (folder / "README.md").write_text(_card(config, checkpoint, policy, adapters_of, run, curves, results))
     steps = f" after {run.last['interaction_steps']} interaction steps" if run else ""
     return f"{policy['type']} policy{steps}"
 
@@ -100,6 +107,7 @@ def _card(
     config: PolicyConfig,
     checkpoint: Checkpoint,
     policy: dict[str, Any],
+    adapters_of: str | None,
     run: TrainingRun | None,
     curves: list[tuple[str, str]],
     results: dict[str, Any] | None,
@@ -107,10 +115,11 @@ def _card(
     trained = json.loads(train_config_path(checkpoint.model).read_text()) if _has_config(checkpoint) else {}
     base = (run.config.get("policy") or {}).get("pretrained_path") if run else None
     recorded = (trained.get("record") or trained.get("dataset") or {}).get("repo_id")
-    base_model = config.base_policy or (str(base) if is_repository(base) else None)
+    base_model = config.base_policy or (str(base) if is_repository(base) else None) or adapters_of
     env = trained.get("env") or {}
     if config.scene and env.get("scene") and config.scene != env["scene"]:
         raise ValueError(f"--scene={config.scene}, but the policy was trained in {env['scene']}")
+    scene = env.get("scene") or config.scene or (results or {}).get("scene")
     return render_card(
         "policy",
         repo_id=config.repo_id,
@@ -123,8 +132,11 @@ def _card(
         is_demonstrations=run is None,
         base_model=base_model,
         base_is_local=base is not None and base_model is None,
-        scene=env.get("scene") or config.scene or (results or {}).get("scene"),
-        obs_type=env.get("obs_type") or _guess_observation(policy),
+        adapters_of=adapters_of,
+        is_steered=(checkpoint.model / STEERING).is_file(),
+        scene=scene,
+        lerobot_eval_flags=lerobot_eval_flags(policy, env, scene),
+        cronos_eval_flags=cronos_eval_flags(policy, env, scene),
         curves=curves,
         results=results,
     )
@@ -132,9 +144,3 @@ def _card(
 
 def _has_config(checkpoint: Checkpoint) -> bool:
     return train_config_path(checkpoint.model).is_file()
-
-
-def _guess_observation(policy: dict[str, Any]) -> str:
-    features = (policy.get("input_features") or {}).values()
-    has_pixels = any(feature.get("type") == "VISUAL" for feature in features)
-    return "pixels_agent_pos" if has_pixels else "environment_state_agent_pos"

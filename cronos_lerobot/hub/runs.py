@@ -16,6 +16,15 @@ from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.report.runs import TrainingRun, describe_protocol, read_training_run
 from cronos_lerobot.training.logging import MANIFEST, METRICS
 
+LEARNED = {
+    "ppo": ("reinforcement learning", "reinforcement-learning"),
+    "ppo_paper": ("reinforcement learning", "reinforcement-learning"),
+    "steering": ("reinforcement learning of the noise that it begins with", "reinforcement-learning"),
+    "imitation": ("imitation of its own successes", "imitation-learning"),
+}
+"""How an agent learns, in words, and the Hub's tag of that."""
+WEIGHTED = "imitation of its own segments, weighted by their {weighting}"
+
 
 @dataclass(frozen=True)
 class Checkpoint:
@@ -77,6 +86,8 @@ def run_facts(run: TrainingRun) -> dict[str, Any]:
         "protocol": protocol,
         "protocol_name": describe_protocol(protocol),
         "algorithm": config["algorithm"]["type"],
+        "learned": _describe_learning(config["algorithm"]),
+        "learned_tag": LEARNED.get(config["algorithm"]["type"], (None, None))[1],
         "num_envs": config["num_envs"],
         "seed": config["seed"],
         "steps": last["interaction_steps"],
@@ -89,6 +100,15 @@ def run_facts(run: TrainingRun) -> dict[str, Any]:
         "command": command_line(run.starts[0]["command"]),
         "num_starts": len(run.starts),
     }
+
+
+def _describe_learning(algorithm: dict[str, Any]) -> str:
+    """How the policy learned, in words, with the agent's name."""
+    words = LEARNED.get(algorithm["type"], ("learning", None))[0]
+    weighting = algorithm.get("weighting", "none")
+    if algorithm["type"] == "imitation" and weighting != "none":
+        words = WEIGHTED.format(weighting=weighting)
+    return f"{words} (agent `{algorithm['type']}`)"
 
 
 def _describe_configurations(benchmark: str | None, protocol: dict[str, Any]) -> str:
@@ -116,14 +136,15 @@ def _by_kind(counts: dict[str, int], takeover_price: int) -> list[tuple[str, int
 
 def describe_observation(env: dict[str, Any]) -> str:
     """What was observed, in words."""
+    # Runs of before there was a choice do not name it.
+    told = "" if env.get("task_observation", "none") == "none" else ", with the task in `observation.state`"
     if env["obs_type"] != "pixels_agent_pos":
-        return "privileged state: the poses of all bodies"
+        return f"privileged state: the poses of all bodies{told}"
     cameras = " and ".join(f"`{name.strip()}`" for name in env["camera_name"].split(","))
     state = ", with the privileged state beside it" if env["privileged_state"] else ""
-    # Runs of before there was a choice do not name it.
     renderer = env.get("renderer", "classic")
     drawn = "" if renderer == "classic" else f", drawn by {renderer}"
-    return f"camera {cameras}, {env['observation_width']} x {env['observation_height']} px{drawn}{state}"
+    return f"camera {cameras}, {env['observation_width']} x {env['observation_height']} px{drawn}{state}{told}"
 
 
 def is_repository(name: Any) -> bool:

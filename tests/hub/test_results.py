@@ -93,7 +93,12 @@ def test_a_note_names_every_way_in_which_an_evaluation_is_another():
         ({}, "camera `front` and `bridge`, 128 x 64 px"),
         ({"renderer": "classic"}, "camera `front` and `bridge`, 128 x 64 px"),
         ({"renderer": "filament"}, "camera `front` and `bridge`, 128 x 64 px, drawn by filament"),
+        ({"task_observation": "none"}, "camera `front` and `bridge`, 128 x 64 px"),
         ({"obs_type": "environment_state_agent_pos"}, "privileged state: the poses of all bodies"),
+        (
+            {"obs_type": "environment_state_agent_pos", "task_observation": "one_hot"},
+            "privileged state: the poses of all bodies, with the task in `observation.state`",
+        ),
     ],
 )
 def test_an_observation_in_words(changes, text):

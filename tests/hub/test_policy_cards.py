@@ -1,0 +1,146 @@
+"""A policy's card: commands that show it what it takes; how it learned, what steers it, what adapters are of."""
+
+import json
+import re
+import shlex
+
+import draccus
+import numpy as np
+import pytest
+import yaml
+from lerobot.configs.types import PolicyFeature
+from lerobot_env_cronos.config import CronosEnvConfig
+from safetensors.numpy import save_file
+
+from cronos_lerobot.agents.imitation.config import ImitationConfig
+from cronos_lerobot.agents.ppo.config import PPOConfig
+from cronos_lerobot.agents.steering.config import SteeringConfig
+from cronos_lerobot.hub import policy as hub_policy
+from cronos_lerobot.hub.config import PolicyConfig
+from cronos_lerobot.hub.eval_flags import lerobot_eval_flags
+from cronos_lerobot.scripts.publish import publish_policy
+from cronos_lerobot.training.config import CronosTrainConfig
+
+STATE = {"obs_type": "environment_state_agent_pos"}
+TOLD = STATE | {"task_observation": "one_hot"}
+
+
+def features_of(env):
+    """What LeRobot writes into the config.json of a policy that takes all that `env` shows."""
+    features = {env.features_map[name]: feature for name, feature in env.features.items() if name != "action"}
+    return {
+        name: {"type": f.type.value, "shape": [f.shape[2], *f.shape[:2]] if len(f.shape) == 3 else list(f.shape)}
+        for name, f in features.items()
+    }
+
+
+def write_checkpoint(root, kind, env, algorithm, **files):
+    """A run of cronos-train with one checkpoint, as far as a card reads it; `files` lie beside the policy."""
+    model = root / "run/checkpoints/000032/pretrained_model"
+    model.mkdir(parents=True)
+    features = {
+        "input_features": features_of(env),
+        "output_features": {"action": {"type": "ACTION", "shape": [7]}},
+    }
+    (model / "config.json").write_text(json.dumps({"type": kind} | features))
+    config = json.dumps(draccus.encode(CronosTrainConfig(env=env, algorithm=algorithm)))
+    (model / "train_config.json").write_text(config)
+    start = {"config": json.loads(config), "environment": "lerobot_env_cronos/kitchen_2x2-v1", "git_commit": None}
+    start |= {"command": ["cronos-train"], "versions": {}}
+    (root / "run/manifest.json").write_text(json.dumps({"starts": [start]}))
+    record = {"kind": "update", "interaction_steps": 32, "interventions": 4, "updates": 1}
+    record |= {"interventions_by_kind": {"scene_reset": 4}}
+    (root / "run/metrics.jsonl").write_text(json.dumps(record) + "\n")
+    tensors = {"weight": np.zeros((2, 2), np.float32)}
+    for name, content in ({"model.safetensors": tensors} | files).items():
+        save_file(content, model / name) if name.endswith("safetensors") else (model / name).write_text(content)
+    return model.parent
+
+
+def dry_run(checkpoint, out, **flags):
+    publish_policy(PolicyConfig(repo_id="me/p", path=checkpoint, dry_run=True, output_dir=out, **flags))
+    return (out / "README.md").read_text()
+
+
+def commands(card):
+    """The `--env` flags of each command for evaluating, by its name."""
+    blocks = re.findall(r"```bash\n((?:cronos|lerobot)-eval .*?)```", card, re.DOTALL)
+    words = [shlex.split(block.replace("\\\n", " ")) for block in blocks]
+    assert all(command[1] == "--policy.path=me/p" for command in words)
+    return {command[0]: [word.removeprefix("--env.") for word in command if "--env." in word] for command in words}
+
+
+def shown_by(flags):
+    """What the environment of these flags shows, as LeRobot's parser reads them."""
+    return features_of(draccus.parse(CronosEnvConfig, args=[f"--{f}" for f in flags if not f.startswith("type=")]))
+
+
+ADAPTER = {
+    "adapter_config.json": json.dumps({"base_model_name_or_path": "/home/me/clone", "revision": "v1", "r": 2}),
+    "adapter_model.safetensors": {"weight": np.zeros(2, np.float32)},
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "env", "algorithm", "files", "flags", "said", "tag"),
+    [
+        ("act", TOLD, ImitationConfig(), {}, {},
+         "imitation of its own successes (agent `imitation`)", "imitation"),
+        ("pi0", {"camera_name": "front,bridge", "observation_width": 96}, PPOConfig(), ADAPTER,
+         {"base_policy": "me/clone"}, "adapters (PEFT) for the policy [me/clone](", "reinforcement"),
+        ("diffusion", TOLD | {"scene": "playroom_2x2"}, SteeringConfig(),
+         {"steering.safetensors": {"actor": np.zeros(2, np.float32)}}, {},
+         "of the noise that it begins with (agent `steering`)", "reinforcement"),
+    ],
+    ids=["told its task", "adapters", "steered"],
+)  # fmt: skip
+def test_a_cards_commands_are_right_for_every_policy(
+    tmp_path, monkeypatch, kind, env, algorithm, files, flags, said, tag
+):
+    monkeypatch.setattr(hub_policy, "FIGURES", {})
+    env = CronosEnvConfig(**env)
+    card = dry_run(write_checkpoint(tmp_path, kind, env, algorithm, **files), tmp_path / "out", **flags)
+    front = yaml.safe_load(card.split("---")[1])
+    assert said in card
+    assert f"{tag}-learning" in front["tags"]
+    assert ("with the task in `observation.state`" in card) == (env.task_observation == "one_hot")
+    given = commands(card)
+    assert shown_by(given["lerobot-eval"]) == features_of(env)
+    is_steered = "steering.safetensors" in files
+    assert list(given) == (["cronos-eval", "lerobot-eval"] if is_steered else ["lerobot-eval"])
+    assert not is_steered or given["cronos-eval"] == ["type=cronos", "task_observation=one_hot"]
+    assert ("play the policy without the actor" in card) == is_steered
+    if files is ADAPTER:
+        adapter = json.loads((tmp_path / "out/adapter_config.json").read_text())
+        assert adapter == {"base_model_name_or_path": "me/clone", "revision": None, "r": 2}
+        assert (front["base_model"], front["base_model_relation"]) == ("me/clone", "adapter")
+
+
+def test_adapters_of_a_policy_that_nobody_else_has_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(hub_policy, "FIGURES", {})
+    checkpoint = write_checkpoint(tmp_path, "pi0", CronosEnvConfig(), PPOConfig(), **ADAPTER)
+    with pytest.raises(ValueError, match=r"adapters of the policy in /home/me/clone, a folder .*--base_policy="):
+        dry_run(checkpoint, tmp_path / "out")
+    assert not list((tmp_path / "out").iterdir()), "the folder can be used again"
+    with pytest.raises(ValueError, match=r"--base_policy=clone is no <owner>/<name>"):
+        dry_run(checkpoint, tmp_path / "out", base_policy="clone")
+    # As it was named where the run was started, and this command is not.
+    adapter = checkpoint / "pretrained_model/adapter_config.json"
+    adapter.write_text(json.dumps({"base_model_name_or_path": "outputs/clone"}))
+    (tmp_path / "outputs/clone").mkdir(parents=True)
+    with pytest.raises(ValueError, match="the policy in outputs/clone"):
+        dry_run(checkpoint, tmp_path / "out")
+    # A repository stays.
+    adapter.write_text(json.dumps({"base_model_name_or_path": "lerobot/pi0", "revision": "v2"}))
+    assert "[lerobot/pi0](" in dry_run(checkpoint, tmp_path / "out")
+    assert (tmp_path / "out/adapter_config.json").read_text() == adapter.read_text()
+
+
+@pytest.mark.parametrize(
+    ("size", "scene", "told"), [(18, None, True), (13, "kitchen_2x2", False), (20, None, True)]
+)
+def test_the_size_of_a_cloned_policys_state_says_whether_it_is_told_its_task(size, scene, told):
+    """13 numbers are the robot's; 2 objects and 3 receptacles with the table make 18, 3 and 4 make 20."""
+    features = {"observation.state": PolicyFeature("STATE", (size,)).__dict__}
+    flags = lerobot_eval_flags({"input_features": features}, {}, scene)
+    assert ("--env.task_observation=one_hot" in flags) == told
