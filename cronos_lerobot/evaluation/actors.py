@@ -9,16 +9,19 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs.factory import make_env_pre_post_processors
+from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import set_seed
-from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 
 from cronos_lerobot.agents.base import Columns, TrainablePolicy
 from cronos_lerobot.agents.chunk_player import make_player
 from cronos_lerobot.agents.history import ObservationHistory, observation_steps
-from cronos_lerobot.agents.processing import PolicyProcessors, observation_columns
-from cronos_lerobot.agents.steering.steered import SteeredPolicy
+from cronos_lerobot.agents.processing import PolicyProcessors, make_processors, observation_columns
+from cronos_lerobot.agents.steering.steered import SteeredPolicy, with_steering
 
 
 class Actor(Protocol):
@@ -187,6 +190,32 @@ def make_actor(
     if isinstance(policy, TrainablePolicy | SteeredPolicy):
         return SamplingPolicy(policy, processors, temperature)
     return SelectingPolicy(policy, processors, env_processors or (_as_it_is, _as_it_is))
+
+
+def load_actor(
+    config: PreTrainedConfig, env: CronosEnvConfig, temperature: float, rename_map: dict[str, str] | None = None
+) -> SamplingPolicy | SelectingPolicy:
+    """Load a checkpoint and return the actor for it, steered if it is a steered one.
+
+    Args:
+        config: the policy's, which says where its checkpoint and its device are.
+        env: the environment that it acts in.
+        temperature: of the sampling, if the policy has one.
+        rename_map: observations to rename for the policy.
+    """
+    renamed = rename_map or {}
+    policy: Any = make_policy(config, env_cfg=env, rename_map=renamed)
+    processors = make_pre_post_processors(
+        config,
+        str(config.pretrained_path),
+        preprocessor_overrides={
+            "device_processor": {"device": str(policy.config.device)},
+            "rename_observations_processor": {"rename_map": renamed},
+        },
+    )
+    env_processors = make_env_pre_post_processors(env_cfg=env, policy_cfg=config)
+    own = make_processors(policy, *processors)
+    return make_actor(with_steering(policy, config.pretrained_path), own, temperature, env_processors)
 
 
 def _as_it_is(batch: Any) -> Any:

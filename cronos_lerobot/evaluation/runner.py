@@ -12,14 +12,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from lerobot.envs.factory import make_env_pre_post_processors
-from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot_env_cronos import CronosEnvConfig, SequentialVectorEnv, check_environment_id, get_scene, gymnasium_id
 from tqdm import tqdm
 
-from cronos_lerobot.agents.processing import make_processors
-from cronos_lerobot.agents.steering.steered import with_steering
-from cronos_lerobot.evaluation.actors import Actor, ExpertActor, make_actor
+from cronos_lerobot.evaluation.actors import Actor, ExpertActor, load_actor
 from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
 from cronos_lerobot.evaluation.config import CronosEvalConfig
 from cronos_lerobot.evaluation.film import film_best_and_worst
@@ -207,19 +203,7 @@ class Evaluation:
         config = self.config
         if config.policy is None:
             return ExpertActor(env)
-        policy: Any = make_policy(config.policy, env_cfg=config.env, rename_map=config.rename_map)
-        processors = make_pre_post_processors(
-            config.policy,
-            str(config.policy.pretrained_path),
-            preprocessor_overrides={
-                "device_processor": {"device": str(policy.config.device)},
-                "rename_observations_processor": {"rename_map": config.rename_map},
-            },
-        )
-        env_processors = make_env_pre_post_processors(env_cfg=config.env, policy_cfg=config.policy)
-        own = make_processors(policy, *processors)
-        policy = with_steering(policy, config.policy.pretrained_path)
-        return make_actor(policy, own, config.eval.temperature, env_processors)
+        return load_actor(config.policy, self.env_config, config.eval.temperature, config.rename_map)
 
     def _close(self) -> None:
         if "_env_and_actor" in self.__dict__:
