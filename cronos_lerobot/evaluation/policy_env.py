@@ -66,21 +66,32 @@ def check_observations(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
         )
 
 
+def task_observation_of(policy: PreTrainedConfig, env: CronosEnvConfig) -> str:
+    """How a policy is told its task in the environment's scene, by the size of the state that it takes.
+
+    As the environment has it, if the policy takes no state, or one of a size that the scene never gives.
+    """
+    state = (policy.input_features or {}).get(OBS_STATE)
+    if state is not None:
+        for told in (env.task_observation, *TASK_OBSERVATIONS):
+            if (_state_size(OBS_STATE, env.scene, env, told),) == tuple(state.shape):
+                return told
+    return env.task_observation
+
+
 def check_task_observation(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
     """Check that a policy is told its task in the state if it was so in training, and only then.
 
     Raises:
         ValueError: it is not so; the sentence has the flag.
     """
-    state = (policy.input_features or {}).get(OBS_STATE)
-    if state is None or tuple(state.shape) == tuple(env.features["agent_pos"].shape):
-        return
-    for other in TASK_OBSERVATIONS:
-        if (_state_size(OBS_STATE, env.scene, env, other),) == tuple(state.shape):
-            raise ValueError(
-                f"the policy takes {OBS_STATE} of {state.shape[0]} numbers, as with --env.task_observation={other}"
-                f": give it here, too; the environment has --env.task_observation={env.task_observation}"
-            )
+    told = task_observation_of(policy, env)
+    if told != env.task_observation:
+        raise ValueError(
+            f"the policy takes {OBS_STATE} of {_state_size(OBS_STATE, env.scene, env, told)} numbers, as with "
+            f"--env.task_observation={told}: give it here, too; the environment has "
+            f"--env.task_observation={env.task_observation}"
+        )
 
 
 def _state_size(name: str, scene: str, env: CronosEnvConfig, task_observation: str) -> int:
