@@ -8,6 +8,12 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig
 
 STATE = {"obs_type": "environment_state_agent_pos"}
+TOLD = STATE | {"task_observation": "one_hot"}
+"""For policies that read no instruction."""
+TINY_ACT = {
+    "chunk_size": 6, "n_action_steps": 4, "dim_model": 16, "n_heads": 2, "dim_feedforward": 32,
+    "n_encoder_layers": 1, "n_decoder_layers": 1, "use_vae": False, "pretrained_backbone_weights": None,
+}  # fmt: skip
 
 
 def save_policy(folder: Path, kind: str, env_options: dict, **options) -> Path:

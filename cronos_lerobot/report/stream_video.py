@@ -15,18 +15,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from lerobot_env_cronos.expert.expert import ScriptedExpert
+from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 from tqdm import tqdm
 
-from cronos_lerobot.agents.base import ActionSample
-from cronos_lerobot.agents.processing import PolicyProcessors, make_processors, observation_columns
-from cronos_lerobot.evaluation.policy_env import observations_of, trained_scene
+from cronos_lerobot.agents.base import ActionSample, plain_sample
+from cronos_lerobot.evaluation.actors import Actor, load_actor
+from cronos_lerobot.evaluation.config import SuitesConfig
+from cronos_lerobot.evaluation.policy_env import (
+    check_observations,
+    observations_of,
+    task_observation_of,
+    trained_scene,
+)
+from cronos_lerobot.evaluation.policy_source import find_policy
 from cronos_lerobot.film.encode import write_gif, write_mp4
 from cronos_lerobot.film.overlay import Status, draw_status
 from cronos_lerobot.protocol.config import ProtocolConfig
@@ -45,8 +50,14 @@ NOTICE_STEPS = 8
 class Spectator:
     """An agent of Algorithm 1 that acts and never learns."""
 
+    def seed(self, seed: int) -> None:
+        """Start all randomness of its actions anew."""
+
     def begin_segment(self) -> None:
-        """A new task begins."""
+        """A new task begins in every stream."""
+
+    def forget(self, ids: np.ndarray) -> None:
+        """What streams `ids` (k,) see from now on has nothing to do with what they saw before."""
 
     def choose(self, o_t: dict[str, Any], tau: list[str]) -> np.ndarray:
         """Actions (n, 7) in physical units."""
@@ -54,9 +65,7 @@ class Spectator:
 
     def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
         """See `Agent`."""
-        action = self.choose(o_t, tau)
-        zeros = np.zeros(len(action), np.float32)
-        return ActionSample(action, zeros, zeros)
+        return plain_sample(self.choose(o_t, tau))
 
     def store(
         self,
@@ -68,7 +77,8 @@ class Spectator:
         cut_t: np.ndarray,
         diverged_t: np.ndarray,
     ) -> None:
-        """Keep nothing."""
+        """Keep nothing, and forget what was planned where the trace is cut."""
+        self.forget(np.flatnonzero(cut_t))
 
     def update(self) -> dict[str, float]:
         """Learn nothing."""
@@ -91,20 +101,36 @@ class ExpertSpectator(Spectator):
 
 
 class PolicySpectator(Spectator):
-    """Any LeRobot policy, at its own sampling temperature."""
+    """A policy as `cronos-eval` plays it: each stream has its own plan, which ends where the stream is cut.
 
-    def __init__(self, policy: Any, processors: PolicyProcessors) -> None:
-        self._policy, self._processors = policy.eval(), processors
+    Args:
+        actor: acts in all streams at once. One with a single memory for all of them keeps it until all are cut.
+    """
+
+    def __init__(self, actor: Actor) -> None:
+        self._actor = actor
+        self._rng = np.random.default_rng(0)
+        # How many streams there are is not known until they are seen.
+        self._streams = np.arange(0)
+
+    def seed(self, seed: int) -> None:
+        """Start the sampling anew; policies without `sample_actions` draw from torch's global generators."""
+        self._actor.seed(seed)
+        self._rng = np.random.default_rng(seed)
 
     def begin_segment(self) -> None:
         """Forget action chunks and the like."""
-        self._policy.reset()
+        self.forget(self._streams)
 
-    @torch.inference_mode()
+    def forget(self, ids: np.ndarray) -> None:
+        """Forget those of streams `ids`."""
+        self._actor.begin(ids, self._streams)
+
     def choose(self, o_t: dict[str, Any], tau: list[str]) -> np.ndarray:
         """The policy's actions."""
-        batch = self._processors.batch(observation_columns(o_t), tau)
-        return self._processors.physical_actions(self._policy.select_action(batch))
+        self._streams = np.arange(len(tau))
+        uniform = self._rng.random((len(tau), len(ACTION_NAMES)), dtype=np.float32)
+        return self._actor.act(o_t, tau, uniform, self._streams)
 
 
 def film_stream(
@@ -117,8 +143,9 @@ def film_stream(
         agent: acts in it.
         protocol: task switches and resets; nothing is learned.
         num_segments: how long.
-        seed: draws the first configuration, those of scene resets, and a random task order.
+        seed: draws the first configuration, those of scene resets, a random task order, and the actions.
     """
+    agent.seed(seed)
     rng = NamedGenerators(seed).for_numpy
     task_set = TaskSet.of(env.scene, protocol)
     loop = task_set.new_loop(env.num_envs)
@@ -152,20 +179,26 @@ def make_spectator(
 ) -> tuple[CronosEnvConfig, PolicySpectator]:
     """Load a policy; returns the environment that it expects, and the agent that acts by it.
 
+    It acts as in `cronos-eval`, a steered checkpoint steered, but at its own sampling temperature, if it has one.
+
     Args:
         policy_path: checkpoint or Hub id.
         device: of the policy.
         scene: None for the one of its training.
+
+    Raises:
+        ValueError: there is no such checkpoint, or no environment of the scene shows it what it takes.
     """
-    policy_config = PreTrainedConfig.from_pretrained(policy_path)
-    policy_config.pretrained_path, policy_config.device = Path(policy_path), device
-    where = {"scene": scene} if scene else trained_scene(policy_config.pretrained_path)
+    folder = find_policy(policy_path).folder
+    policy_config = PreTrainedConfig.from_pretrained(folder)
+    policy_config.pretrained_path, policy_config.device = folder, device
+    where = {"scene": scene} if scene else trained_scene(folder)
     env_config = CronosEnvConfig(**observations_of(policy_config), **where)
-    policy = make_policy(policy_config, env_cfg=env_config)
-    processors = make_pre_post_processors(
-        policy_config, policy_path, preprocessor_overrides={"device_processor": {"device": device}}
-    )
-    return env_config, PolicySpectator(policy, make_processors(policy, *processors))
+    told = task_observation_of(policy_config, env_config)
+    env_config = dataclasses.replace(env_config, task_observation=told)
+    check_observations(policy_config, env_config)
+    temperature = getattr(policy_config, "temperature", SuitesConfig.temperature)
+    return env_config, PolicySpectator(load_actor(policy_config, env_config, temperature))
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -195,7 +228,6 @@ def main() -> None:
     """Film a stream as the command line says."""
     args = make_parser().parse_args()
     register_third_party_plugins()
-    set_seed(args.seed)
     protocol = ProtocolConfig(
         scene_reset_interval=args.scene_reset_interval,
         end_effector_reset=not args.no_end_effector_reset,

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import STEPS_PER_TASK, CronosVectorEnv, load_benchmark
 from lerobot_env_cronos.simulation.simulation import NUM_ARM_JOINTS
 from lerobot_env_cronos.statistics import wilson_interval
@@ -61,7 +60,7 @@ def run_second_tasks(env: CronosVectorEnv, agent: Spectator, split: str, seed: i
     first, configuration = ids // num_configurations % len(tasks), ids % num_configurations
     env.scene_reset(ids, configuration, split=split)
     env.set_task(ids, [tasks[i] for i in first])
-    set_seed(seed)
+    agent.seed(seed)
     _run_task(env, agent, "first task")
     state = env.get_state()
     arm_qpos = env.simulation.qpos[:, :NUM_ARM_JOINTS].copy()
@@ -76,7 +75,7 @@ def run_second_tasks(env: CronosVectorEnv, agent: Spectator, split: str, seed: i
             env.end_effector_reset(ids)
         env.set_task(ids, [tasks[(i + 1) % len(tasks)] for i in first])
         complete = env.is_success.copy()
-        set_seed(seed)
+        agent.seed(seed)
         success, grasped = _run_task(env, agent, f"bodies {bodies}, arm {arm}")
         outcomes.append(SecondTask(bodies, arm, success, complete, grasped))
     return outcomes
@@ -88,6 +87,7 @@ def _run_task(env: CronosVectorEnv, agent: Spectator, name: str) -> tuple[np.nda
     observation, success, grasped = env.observe(), np.zeros(env.num_envs, bool), env.is_grasped.copy()
     for _ in trange(STEPS_PER_TASK, desc=name, unit="step", leave=False, disable=None):
         observation, _, _, _, info = env.step(agent.choose(observation, env.instructions))
+        agent.forget(np.flatnonzero(info["diverged"]))
         success |= info["is_success"]
         grasped |= info["is_grasped"]
     return success, grasped

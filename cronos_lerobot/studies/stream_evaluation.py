@@ -18,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.statistics import wilson_interval
 from PIL import Image
@@ -121,8 +120,9 @@ def run_streams(
         agent: acts in them.
         protocol: task switches and resets.
         num_segments: length of every stream.
-        seed: draws the first configurations, those of scene resets, and a random task order.
+        seed: draws the first configurations, those of scene resets, a random task order, and the actions.
     """
+    agent.seed(seed)
     rng = NamedGenerators(seed).for_numpy
     task_set = TaskSet.of(env.scene, protocol)
     loop = task_set.new_loop(env.num_envs)
@@ -215,7 +215,6 @@ def main() -> None:
     """Print a row per segment and one per kind of start, and write them to a CSV."""
     args = _parse_args()
     register_third_party_plugins()
-    set_seed(args.seed)
     env_config, agent = make_spectator(args.policy_path, args.device, args.scene)
     env = CronosVectorEnv(args.num_streams, env_config.scene, **env_config.gym_kwargs)
     protocol = ProtocolConfig(

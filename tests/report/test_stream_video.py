@@ -1,21 +1,35 @@
 """Films of streams: as many frames as control steps, resets where they belong, files that play."""
 
+from types import SimpleNamespace
+
 import av
 import numpy as np
 import pytest
-from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
+import torch
+from dummies import DummyEnv, DummyPolicy, identity_processors
+from lerobot.policies import get_policy_class, make_policy, make_policy_config, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from lerobot_env_cronos.scene.scenes import SCENES
 from PIL import Image
+from tiny_checkpoints import STATE, TINY_ACT, TOLD, save_policy
 
+from cronos_lerobot.agents.adapters.registry import make_steerable
+from cronos_lerobot.agents.processing import PolicyProcessors
+from cronos_lerobot.agents.steering.steered import STEERING, SteeredPolicy, SteeringShape
+from cronos_lerobot.evaluation.actors import SamplingPolicy, SelectingPolicy
 from cronos_lerobot.film.encode import write_gif, write_mp4
 from cronos_lerobot.film.overlay import FAILURE, SUCCESS, Status, draw_status
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.interventions import Intervention
+from cronos_lerobot.protocol.loop_state import Step
+from cronos_lerobot.protocol.resets import make_resets
+from cronos_lerobot.protocol.rf_mtrl import rf_mtrl
+from cronos_lerobot.protocol.task_orders import TaskSet, make_task_order
 from cronos_lerobot.report import stream_video
-from cronos_lerobot.report.stream_video import ExpertSpectator, film_stream, make_spectator
+from cronos_lerobot.report.stream_video import ExpertSpectator, PolicySpectator, film_stream, make_spectator
 from cronos_lerobot.report.task_pictures import draw_sheet, render_tasks
+from cronos_lerobot.training.seeding import NamedGenerators
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +62,98 @@ def test_a_policy_acts_in_the_scene_of_its_training_and_sees_what_it_knows(tmp_p
     assert {name: getattr(env_config, name) for name in options} == options
     assert (env_config.scene, env_config.obs_type) == ("playroom_2x2", "pixels_agent_pos")
     assert make_spectator(str(tmp_path), scene="kitchen_3x3")[0].scene == "kitchen_3x3"
+
+
+def test_a_policy_that_reads_no_instruction_is_told_the_task_in_its_state(tmp_path):
+    checkpoint = save_policy(tmp_path, "act", TOLD, **TINY_ACT)
+    env_config, agent = make_spectator(str(checkpoint))
+    assert (env_config.task_observation, env_config.obs_type) == ("one_hot", STATE["obs_type"])
+    env = CronosVectorEnv(1, env_config.scene, **env_config.gym_kwargs | {"render_size": (60, 80)})
+    protocol = ProtocolConfig(task_switch_interval=6, update_interval=6, scene_reset_interval=None)
+    frames = list(film_stream(env, agent, protocol, num_segments=2))
+    env.close()
+    assert [frame.shape for frame in frames] == [(60, 80, 3)] * 12
+    with pytest.raises(ValueError, match=r"the policy takes observation\.state of 18 numbers, kitchen_3x3 gives"):
+        make_spectator(str(checkpoint), scene="kitchen_3x3")
+
+
+class Planner(torch.nn.Module):
+    """Plans to do the number of the plan three times."""
+
+    config = SimpleNamespace(type="planner", use_amp=False)
+    plans = 0
+
+    def reset(self):
+        pass
+
+    def predict_action_chunk(self, batch):
+        self.plans += 1
+        return torch.full((len(batch["task"]), 3, 7), float(self.plans))
+
+
+def test_a_plan_ends_where_its_stream_is_cut_and_nowhere_else():
+    """Three streams, of which the last one diverges in its second step; a segment ends after five."""
+    env = DummyEnv(3, diverge_at={(1, 2)})
+    agent = PolicySpectator(SelectingPolicy(Planner(), PolicyProcessors(*identity_processors()), (dict, dict)))
+    protocol = ProtocolConfig(task_switch_interval=5, update_interval=5, scene_reset_interval=None)
+    rng = NamedGenerators(0).for_numpy
+    tasks = TaskSet.of(env.scene, protocol)
+    order = make_task_order("heuristic", rng("task_order"), tasks)
+    loop, resets = tasks.new_loop(3), make_resets(protocol, rng)
+    events = rf_mtrl(env, tasks.all, agent, order, resets, protocol, loop, total_steps=3 * 7)
+    played = [event.action.action[:, 0].tolist() for event in events if isinstance(event, Step)]
+    # The third plan is that of the two that go on, made when theirs are played; the fourth that of the new task.
+    assert np.transpose(played[:7]).tolist() == [
+        [1, 1, 1, 3, 3, 4, 4],
+        [1, 1, 1, 3, 3, 4, 4],
+        [1, 1, 2, 2, 2, 4, 4],
+    ]
+
+
+def test_a_seed_decides_the_actions_of_a_policy_that_samples():
+    agent = PolicySpectator(SamplingPolicy(DummyPolicy(), PolicyProcessors(*identity_processors()), 0.6))
+    observation, instructions = DummyEnv(8).observe(), ["go to 1.0"] * 8
+
+    def played(seed):
+        agent.seed(seed)
+        return np.stack([agent.choose(observation, instructions) for _ in range(2)])
+
+    first = played(1)
+    np.testing.assert_array_equal(played(1), first)
+    assert (played(2) != first).any()
+    assert (first[0] != first[1]).any()
+
+
+def test_a_steered_checkpoint_is_played_steered(tmp_path):
+    options = {"hidden_width": 16, "hidden_depth": 1, "flow_width": 16, "flow_depth": 1}
+    save_policy(tmp_path, "pocketvla", STATE, head="flow", chunk_size=4, n_action_steps=2, **options)
+    policy = get_policy_class("pocketvla").from_pretrained(tmp_path)
+    steerable = make_steerable(policy)
+    env = CronosVectorEnv(2, **STATE)
+    observation, instructions = env.observe(), env.instructions
+    env.close()
+    columns = {"observation.state": "agent_pos", "observation.environment_state": "environment_state"}
+    raw = {name: torch.from_numpy(observation[key]).float() for name, key in columns.items()}
+    before, after = make_pre_post_processors(policy.config, str(tmp_path))
+    batch = before(raw | {"task": instructions})
+    shape = SteeringShape(steerable.observe(batch)[1].shape[1], "policy", 1.5, True, 8)
+    steered = SteeredPolicy(steerable, shape)
+    with torch.no_grad():
+        # Whatever it sees, it chooses the greatest noise: tanh(20) = 1, with a deviation of e^-5 before tanh.
+        steered.actor.head.bias[:7], steered.actor.head.bias[7:] = 20.0, -5.0
+        expected = after(policy.predict_action_chunk(batch, noise=torch.full((2, 4, 7), 1.5)).flatten(0, 1))
+    assert not plays(tmp_path, observation, instructions, expected)
+    steered.save_pretrained(tmp_path)
+    assert (tmp_path / STEERING).is_file()
+    assert plays(tmp_path, observation, instructions, expected)
+
+
+def plays(folder, observation, instructions, expected):
+    """Whether a checkpoint plays the first two steps of `expected`, chunks of four for two streams, (8, 7)."""
+    _, agent = make_spectator(str(folder))
+    agent.seed(3)
+    played = [agent.choose(observation, instructions) for _ in range(2)]
+    return np.allclose(np.stack(played, 1), expected.reshape(2, 4, 7)[:, :2], rtol=0, atol=1e-5)
 
 
 def test_one_frame_for_each_control_step(film):

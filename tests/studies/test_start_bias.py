@@ -15,13 +15,17 @@ class Watchful(ExpertSpectator):
 
     def __init__(self, env):
         super().__init__(env)
-        self.env, self.starts = env, []
+        self.env, self.starts, self.forgotten = env, [], []
 
     def begin_segment(self):
         super().begin_segment()
         simulation = self.env.simulation
         self.starts.append((simulation.qpos[:, :NUM_ARM_JOINTS].copy(), simulation.body_poses()[..., :3].copy()))
         self.tasks = list(self.env.tasks)
+
+    def forget(self, ids):
+        if len(ids):
+            self.forgotten.append((len(self.starts), ids.tolist()))
 
     def choose(self, o_t, tau):
         action = super().choose(o_t, tau)
@@ -32,9 +36,21 @@ class Watchful(ExpertSpectator):
         return action
 
 
+class SaysDiverged(CronosVectorEnv):
+    """Says once that stream 2 has diverged, in the middle of the second task."""
+
+    steps = 0
+
+    def step(self, actions):
+        *rest, info = super().step(actions)
+        self.steps += 1
+        info["diverged"][2] = self.steps == 80 + 7
+        return *rest, info
+
+
 @pytest.fixture(scope="module")
 def watched():
-    env = CronosVectorEnv(4, obs_type="environment_state_agent_pos")
+    env = SaysDiverged(4, obs_type="environment_state_agent_pos")
     agent = Watchful(env)
     outcomes = run_second_tasks(env, agent, "held_out")
     return env, agent, outcomes
@@ -61,6 +77,11 @@ def test_the_next_task_of_the_cycle_is_given_and_the_expert_does_it(watched):
     assert [(o.bodies, o.arm) for o in outcomes] == list(CONDITIONS)
     for (*_, k, n, _low, _high, complete, never), outcome in zip(rows(outcomes), outcomes, strict=True):
         assert (k, n, complete, never) == (4, 4, 0, 0), outcome
+
+
+def test_the_plan_of_a_stream_that_diverges_is_forgotten(watched):
+    _, agent, _ = watched
+    assert agent.forgotten == [(2, [2])]
 
 
 def test_seeds_are_counted_together_but_not_conditions():

@@ -2,9 +2,10 @@
 
 import numpy as np
 from lerobot_env_cronos import CronosVectorEnv
+from tiny_checkpoints import TINY_ACT, TOLD, save_policy
 
 from cronos_lerobot.protocol.config import ProtocolConfig
-from cronos_lerobot.report.stream_video import ExpertSpectator, Spectator
+from cronos_lerobot.report.stream_video import ExpertSpectator, Spectator, make_spectator
 from cronos_lerobot.studies.stream_evaluation import (
     Start,
     StreamOutcomes,
@@ -102,6 +103,22 @@ def test_streams_in_which_the_policy_did_nothing_are_stuck_and_drawn():
     assert (status.succeeded, status.outcomes, status.message) == (False, [True, False, False], "begins complete")
     # Three streams are fewer than the rows there could be.
     assert draw_stuck(env, outcomes).size == (4 * 326 + 6, 3 * 246 + 6)
+
+
+def test_a_policy_with_chunks_that_is_told_the_task_in_its_state(tmp_path):
+    env_config, agent = make_spectator(str(save_policy(tmp_path, "act", TOLD, **TINY_ACT)))
+    env = CronosVectorEnv(2, env_config.scene, **env_config.gym_kwargs)
+    protocol = ProtocolConfig(task_switch_interval=6, update_interval=6, scene_reset_interval=None)
+    outcomes = run_streams(env, agent, protocol, 2)
+    assert outcomes.success.shape == (2, 2)
+    # It is told different tasks, and so acts differently in streams that see the same otherwise.
+    observation = env.observe()
+    state = observation["agent_pos"]
+    state[1, :13], observation["environment_state"][1] = state[0, :13], observation["environment_state"][0]
+    agent.begin_segment()
+    first, second = agent.choose(observation, env.instructions)
+    assert (state[0] != state[1]).any()
+    assert np.abs(first - second).max() > 1e-6
 
 
 def test_positions_are_those_at_the_end_of_each_segment():
