@@ -39,8 +39,8 @@ class Actor(Protocol):
         """Start all randomness that is not handed to `act` anew."""
         ...
 
-    def begin(self, ids: np.ndarray, running: np.ndarray) -> None:
-        """A new task begins in environments `ids` (k,), of those that are `running`."""
+    def begin(self, ids: np.ndarray) -> None:
+        """A new task begins in environments `ids` (k,)."""
         ...
 
     def act(
@@ -80,7 +80,7 @@ class SamplingPolicy:
         """See `Actor`."""
         self._generator.manual_seed(seed)
 
-    def begin(self, ids: np.ndarray, running: np.ndarray) -> None:
+    def begin(self, ids: np.ndarray) -> None:
         """What was decided for another task is not played, what was seen in it forgotten."""
         self._history.begin(ids)
         for i in ids:
@@ -117,7 +117,7 @@ class SelectingPolicy:
     It may queue chunks of actions or look back, with a memory of its own for each environment. The few policies
     whose plans depend on the plans before them (`make_player`) have one memory for the whole batch, which LeRobot
     can only clear for all at once: their chains start together, and it is cleared whenever a new task begins in
-    all chains that still run, at every switch with `advance=window`.
+    one of them. With `advance=window` that is when it does in all.
 
     Args:
         policy: on its device.
@@ -138,10 +138,9 @@ class SelectingPolicy:
         """Seed the global generators, from which LeRobot's policies draw."""
         set_seed(seed)
 
-    def begin(self, ids: np.ndarray, running: np.ndarray) -> None:
-        """Forget chunks and history, of all at once only if the task is new for all."""
-        if self.is_per_environment or len(ids) == len(running):
-            self._player.begin(ids.tolist())
+    def begin(self, ids: np.ndarray) -> None:
+        """Forget chunks and history; a memory for the whole batch is forgotten for all."""
+        self._player.begin(ids.tolist())
 
     @torch.inference_mode()
     def act(
@@ -165,7 +164,7 @@ class ExpertActor:
     def seed(self, seed: int) -> None:
         """It is deterministic."""
 
-    def begin(self, ids: np.ndarray, running: np.ndarray) -> None:
+    def begin(self, ids: np.ndarray) -> None:
         """Look at the scene anew."""
         self._expert.reset(ids)
 

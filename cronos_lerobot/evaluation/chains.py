@@ -156,7 +156,7 @@ class ChainRunner:
             running = self._everyone[~self.env.done]
             if not len(running):
                 return [self._results[i] for i in range(len(chains))]
-            self.actor.begin(began, running)
+            self.actor.begin(began)
             step = self.env.apply(self._choose(running))
             for index in self._record(step, running):
                 on_end(self._results[index])

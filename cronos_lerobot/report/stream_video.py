@@ -124,7 +124,7 @@ class PolicySpectator(Spectator):
 
     def forget(self, ids: np.ndarray) -> None:
         """Forget those of streams `ids`."""
-        self._actor.begin(ids, self._streams)
+        self._actor.begin(ids)
 
     def choose(self, o_t: dict[str, Any], tau: list[str]) -> np.ndarray:
         """The policy's actions."""

@@ -138,6 +138,6 @@ def test_an_evaluation_remembers_each_environment_by_itself():
     actor = SamplingPolicy(policy, PolicyProcessors(*identity_processors()), 1.0)
     for t, x in enumerate((1, 2, 3, 4, 5)):
         if t == 3:
-            actor.begin(np.array([1]), np.array([0, 1]))
+            actor.begin(np.array([1]))
         actor.act(at(x, 100 + x), ["a", "b"], np.zeros((2, 7), np.float32), np.array([0, 1]))
     assert policy.asked == [[[1, 1, 1], [101, 101, 101]], [[104, 104, 104]], [[3, 4, 5]]]

@@ -124,6 +124,6 @@ def test_decisions_of_several_actions_are_played_by_each_environment_for_itself(
     assert act([0, 1, 2], [0, 10, 20]) == [0, 10, 20]
     assert act([0, 2], [5, 25]) == [1, 21]
     # A new task begins in 2 and 1 has been waiting; 0 plays on.
-    actor.begin(np.array([2]), np.array([0, 1, 2]))
+    actor.begin(np.array([2]))
     assert act([0, 1, 2], [6, 16, 26]) == [2, 11, 26]
     assert act([0, 1, 2], [7, 17, 27]) == [7, 12, 27]

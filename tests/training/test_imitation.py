@@ -294,9 +294,9 @@ def test_an_evaluation_keeps_the_environments_apart():
         answer = actor.act({"agent_pos": state}, ["go"] * len(ids), np.zeros((len(ids), 7)), np.array(ids))
         return answer[:, 0].tolist()
 
-    actor.begin(np.array([0, 1]), np.array([0, 1]))
+    actor.begin(np.array([0, 1]))
     assert act([1, 2], [0, 1]) == [1, 2]
-    actor.begin(np.array([1]), np.array([0, 1]))
+    actor.begin(np.array([1]))
     assert act([3, 4], [0, 1]) == [1, 4]
     assert act([5], [1]) == [4]
     assert act([6, 7], [0, 1]) == [1, 4]
