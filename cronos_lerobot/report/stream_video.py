@@ -104,7 +104,7 @@ class PolicySpectator(Spectator):
     """A policy as `cronos-eval` plays it: each stream has its own plan, which ends where the stream is cut.
 
     Args:
-        actor: acts in all streams at once. One with a single memory for all of them keeps it until all are cut.
+        actor: acts in all streams at once. One with a single memory for all of them forgets it for all.
     """
 
     def __init__(self, actor: Actor) -> None:
