@@ -102,9 +102,12 @@ class SlurmCluster:
         deadline = time.monotonic() + 30
         while "idle" not in self.ask("sinfo", "--noheader", "--format=%t"):
             if time.monotonic() > deadline:
-                logs = "\n".join(path.read_text()[-2000:] for path in self.folder.glob("*.log"))
-                raise RuntimeError(f"Slurm's node does not come up:\n{logs}")
+                raise RuntimeError(f"Slurm's node does not come up:\n{self.logs()}")
             time.sleep(0.2)
+
+    def logs(self) -> str:
+        """The ends of its logs, for a test that fails."""
+        return "\n".join(path.read_text()[-4000:] for path in sorted(self.folder.glob("*.log")))
 
     def ask(self, *command: str) -> str:
         """What a command of Slurm answers."""

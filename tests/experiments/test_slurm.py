@@ -192,7 +192,7 @@ def test_a_job_that_its_time_limit_stops_goes_on_and_ends_as_an_unbroken_one(clu
         # element's Python is there to be warned.
         states, _, tape = follow([counting], tmp_path, time="1", warning_s=20)
     said = [path.read_text() for path in sorted((tmp_path / "slurm/logs").rglob("*.out"))]
-    assert states == {"count": "done"}, "\n".join(said)
+    assert states == {"count": "done"}, "\n".join([*said, cluster.logs()])
     record = read_record(counting)
     assert record["starts"] >= 2, json.dumps(record)
     assert (tmp_path / "count/tape").read_text().split() == [str(n) for n in range(1, 401)]
