@@ -16,7 +16,7 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,18 +27,20 @@ from cronos_lerobot.experiments.jobs import Job
 from cronos_lerobot.experiments.plan import LAST_POLICY, resume_command
 from cronos_lerobot.experiments.progress import train_progress
 from cronos_lerobot.experiments.runner import DONE, Runner
+from cronos_lerobot.report.runs import TrainingRun, read_training_run
 from cronos_lerobot.studies.every_policy_report import (
     Cost,
     Ended,
     draw_gains,
+    make_cost,
     make_cost_table,
+    make_end,
     make_table,
     merge,
-    read_cost,
-    read_end,
     read_gains,
     write_gains,
 )
+from cronos_lerobot.training.logging import METRICS
 
 OBSERVATION = (
     "--env.type=cronos",
@@ -204,25 +206,26 @@ def run_folder(run: Run, folder: Path) -> Path:
     return folder / "runs" / run.name
 
 
-def find_runs(folder: Path) -> list[Run]:
+def read_runs(folder: Path) -> dict[Run, TrainingRun]:
     """Runs of the study that have begun in a folder, whatever was asked for this time."""
-    names = (path.name.split("_") for path in sorted((folder / "runs").glob("*_*_*_*")) if path.is_dir())
-    return [Run(kind, agent, int(interval), int(seed)) for kind, agent, interval, seed in names if kind in KINDS]
+    begun = {}
+    for path in sorted(path.parent for path in (folder / "runs").glob(f"*_*_*_*/{METRICS}")):
+        kind, agent, interval, seed = path.name.split("_")
+        begun[Run(kind, agent, int(interval), int(seed))] = read_training_run(path)
+    return begun
 
 
-def read_ends(runs: Sequence[Run], folder: Path) -> list[Ended]:
-    """Those runs of the folder that are over."""
-    found = (
-        read_end(run_folder(run, folder), run.kind, run.agent, run.interval, run.seed, run.steps) for run in runs
-    )
+def find_ends(begun: Mapping[Run, TrainingRun]) -> list[Ended]:
+    """Those that are over."""
+    found = (make_end(read, run.kind, run.agent, run.interval, run.seed, run.steps) for run, read in begun.items())
     return [end for end in found if end]
 
 
-def read_costs(runs: Sequence[Run], folder: Path) -> dict[tuple[str, str], list[Cost]]:
-    """By policy and agent, of the runs that have begun."""
+def find_costs(begun: Mapping[Run, TrainingRun]) -> dict[tuple[str, str], list[Cost]]:
+    """By policy and agent."""
     costs: dict[tuple[str, str], list[Cost]] = {}
-    for run in runs:
-        if cost := read_cost(run_folder(run, folder)):
+    for run, read in begun.items():
+        if cost := make_cost(read):
             costs.setdefault((run.kind, run.agent), []).append(cost)
     return costs
 
@@ -252,13 +255,13 @@ def main() -> None:
             sys.exit("\ninterrupted: the same command goes on from here")
         done = all(state == DONE for state in states.values())
     others = [end for path in args.merge for end in read_gains(path)]
-    begun = find_runs(args.output_dir)
-    ends = merge(read_ends(begun, args.output_dir), others, list(KINDS))
+    begun = read_runs(args.output_dir)
+    ends = merge(find_ends(begun), others, list(KINDS))
     if ends:
         args.output_dir.mkdir(parents=True, exist_ok=True)
         write_gains(ends, args.output_dir / "gains.csv")
         draw_gains(ends).savefig(args.output_dir / "gains.png", dpi=150)
-    print(make_table(ends), make_cost_table(read_costs(begun, args.output_dir)), sep="\n\n")
+    print(make_table(ends), make_cost_table(find_costs(begun)), sep="\n\n")
     if not done:
         sys.exit(1)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,12 +12,12 @@ from matplotlib.figure import Figure
 
 from cronos_lerobot.protocol.metrics import Summary, summarise
 from cronos_lerobot.report.figures import COLORS, INK, style_axes
+from cronos_lerobot.report.runs import TrainingRun
 from cronos_lerobot.report.tables import write_csv
-from cronos_lerobot.training.logging import METRICS
 
 AGENTS = {"ppo": COLORS[0], "imitation": COLORS[1], "steering": COLORS[2]}
-MARKERS = {80: "o", 320: "s"}
-"""By T."""
+INTERVALS = {80: ("80", "o"), 320: ("320 + EER", "s")}
+"""Name and marker of each T; EER are end-effector resets."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +27,7 @@ class Ended:
     policy: str
     agent: str
     interval: int
-    """T [control steps], with end-effector resets where it is not 80."""
+    """T [control steps]."""
     seed: int
     steps: int
     """Interaction steps."""
@@ -59,14 +58,11 @@ class Gain:
         return summary
 
 
-def read_end(folder: Path, policy: str, agent: str, interval: int, seed: int, steps: int) -> Ended | None:
-    """Read the first and the last evaluation of a run; None before it is over."""
-    path = folder / METRICS
-    lines = path.read_text().splitlines() if path.is_file() else []
-    evaluations = [record for record in map(json.loads, lines) if record["kind"] == "evaluation"]
-    if not evaluations or evaluations[-1]["interaction_steps"] < steps:
+def make_end(run: TrainingRun, policy: str, agent: str, interval: int, seed: int, steps: int) -> Ended | None:
+    """What a run came to, from its first to its last evaluation; None before it is over."""
+    if not run.evaluations or run.evaluations[-1]["interaction_steps"] < steps:
         return None
-    first, last = evaluations[0], evaluations[-1]
+    first, last = run.evaluations[0], run.evaluations[-1]
     success = first["success"], last["success"]
     return Ended(policy, agent, interval, seed, steps, last["interventions"], *success, last["n"])
 
@@ -128,14 +124,10 @@ def make_table(runs: Iterable[Ended]) -> str:
         after = " ".join(f"{one.after:.3f}".lstrip("0") for one in gain.runs)
         interventions = round(np.mean([one.interventions for one in gain.runs]))
         lines.append(
-            f"| {run.policy} | {run.agent} | {_resets(run)} | {run.steps:,} | {interventions:,} "
+            f"| {run.policy} | {run.agent} | {INTERVALS[run.interval][0]} | {run.steps:,} | {interventions:,} "
             f"| {gain.before:.3f} | {after} | {_gain_cell(gain.gain)} |"
         )
     return "\n".join(lines)
-
-
-def _resets(run: Ended) -> str:
-    return f"{run.interval}{'' if run.interval == min(MARKERS) else ' + EER'}"
 
 
 def _gain_cell(gain: Summary) -> str:
@@ -155,16 +147,13 @@ class Cost:
     """Time of a step over that of its physics: what a faster or a busier machine changes least."""
 
 
-def read_cost(folder: Path) -> Cost | None:
-    """Read the time that updates took, but for the first, which starts things; None before there is a second."""
-    path = folder / METRICS
-    lines = path.read_text().splitlines() if path.is_file() else []
-    updates = [record for record in map(json.loads, lines) if record["kind"] == "update"]
-    steps = np.diff([update["interaction_steps"] for update in updates])
+def make_cost(run: TrainingRun) -> Cost | None:
+    """What updates cost, but for the first, which starts things; None before there is a second."""
+    steps = np.diff([update["interaction_steps"] for update in run.updates])
     if len(steps) == 0:
         return None
-    seconds = steps / [update["steps_per_s"] for update in updates[1:]]
-    physics = seconds @ [update["time_share"]["physics"] for update in updates[1:]]
+    seconds = steps / [update["steps_per_s"] for update in run.updates[1:]]
+    physics = seconds @ [update["time_share"]["physics"] for update in run.updates[1:]]
     return Cost(float(steps.sum() / seconds.sum()), float(seconds.sum() / physics))
 
 
@@ -189,21 +178,18 @@ def draw_gains(runs: Sequence[Ended]) -> Figure:
     lines = gains(runs)
     figure = Figure(figsize=(8, 0.34 * len(lines) + 1.2), layout="constrained")
     ax = figure.subplots()
-    policies = list(dict.fromkeys(line.runs[0].policy for line in lines))
-    for i, line in enumerate(lines):
-        run, gain = line.runs[0], line.gain
-        y, color = i + 0.7 * policies.index(run.policy), AGENTS[run.agent]
+    firsts = [line.runs[0] for line in lines]
+    policies = list(dict.fromkeys(run.policy for run in firsts))
+    heights = [i + 0.7 * policies.index(run.policy) for i, run in enumerate(firsts)]
+    for run, line, y in zip(firsts, lines, heights, strict=True):
+        gain, color = line.gain, AGENTS[run.agent]
         ax.plot([line.before] * 2, [y - 0.4, y + 0.4], color="#8a8a8a", linewidth=2)
         ax.plot([line.before, line.before + gain.mean], [y, y], color=color, linewidth=1, alpha=0.4)
         ax.plot([one.after for one in line.runs], [y] * len(line.runs), ".", color=color, alpha=0.6, markersize=5)
         bars = None if gain.ci95 is None else [[gain.mean - gain.ci95[0]], [gain.ci95[1] - gain.mean]]
-        ax.errorbar(
-            line.before + gain.mean, y, xerr=bars, fmt=MARKERS[run.interval], color=color, markersize=6, capsize=3
-        )
-    ax.set_yticks(
-        [i + 0.7 * policies.index(line.runs[0].policy) for i, line in enumerate(lines)],
-        [f"{line.runs[0].policy}, {line.runs[0].agent}, T = {_resets(line.runs[0])}" for line in lines],
-    )
+        marker = INTERVALS[run.interval][1]
+        ax.errorbar(line.before + gain.mean, y, xerr=bars, fmt=marker, color=color, markersize=6, capsize=3)
+    ax.set_yticks(heights, [f"{run.policy}, {run.agent}, T = {INTERVALS[run.interval][0]}" for run in firsts])
     ax.invert_yaxis()
     style_axes(ax, "success before (grey) and after, with the gain's 95 % interval")
     ax.xaxis.set_major_formatter("{x:.2f}")

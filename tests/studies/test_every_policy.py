@@ -8,11 +8,11 @@ from pathlib import Path
 
 from cronos_lerobot.studies.every_policy import (
     KINDS,
-    find_runs,
+    find_costs,
+    find_ends,
     make_jobs,
     make_runs,
-    read_costs,
-    read_ends,
+    read_runs,
     run_folder,
 )
 from cronos_lerobot.studies.every_policy_report import (
@@ -64,7 +64,7 @@ def test_the_table_has_the_gain_over_the_seeds(tmp_path):
         write_run(tmp_path, run, 0.5, after)
     # One that is not over has no line of its own.
     write_run(tmp_path, imitation[0], 0.5, 0.9, steps=51_200)
-    lines = make_table(read_ends(runs, tmp_path)).splitlines()
+    lines = make_table(find_ends(read_runs(tmp_path))).splitlines()
     assert len(lines) == 3
     # 0.2 +- 4.303 * 0.1 / sqrt(3), t of two degrees of freedom.
     half = 4.302653 * 0.1 / 3**0.5
@@ -72,13 +72,12 @@ def test_the_table_has_the_gain_over_the_seeds(tmp_path):
     assert 0.2 - half < 0
     assert lines[2] == f"| act | ppo | 80 | 204,800 | 2,560 | 0.500 | .600 .700 .800 | {gain} |"
     write_run(tmp_path, imitation[1], 0.5, 0.55)
-    begun = find_runs(tmp_path)
-    assert set(begun) == {*ppo, *imitation[:2]}
-    assert read_ends(begun, tmp_path) == read_ends(sorted(runs, key=lambda run: run.name), tmp_path)
-    assert make_table(read_ends(runs, tmp_path)).splitlines()[3].endswith("| .550 | +0.050 |")
+    assert set(read_runs(tmp_path)) == {*ppo, *imitation[:2]}
+    ends = merge(find_ends(read_runs(tmp_path)), [], list(KINDS))
+    assert make_table(ends).splitlines()[3].endswith("| .550 | +0.050 |")
     write_run(tmp_path, imitation[2], 0.5, 0.56)
     # An interval above zero is bold: 0.055 +- 12.706 * 0.005 is not, 0.055 +- 12.706 * 0.0005 is.
-    ends = read_ends(imitation, tmp_path)
+    ends = [end for end in find_ends(read_runs(tmp_path)) if end.agent == "imitation"]
     assert "**" not in make_table(ends)
     ends = [replace(end, after=after) for end, after in zip(ends, (0.5545, 0.5555), strict=True)]
     assert make_table(ends).endswith("| **+0.055 [+0.049, +0.061]** |")
@@ -126,7 +125,7 @@ def test_cost_is_time_over_the_time_of_physics(tmp_path):
             for i, (speed, p) in enumerate(speeds[run.seed])
         ]
         (path / "metrics.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
-    table = make_cost_table(read_costs(runs, tmp_path))
+    table = make_cost_table(find_costs(read_runs(tmp_path)))
     assert table.splitlines()[2] == "| flow | ppo | 100 to 133 | 2.0 to 3.0 |"
 
 
