@@ -165,7 +165,7 @@ class CronosEvalConfig:
         if self.policy is None:
             derived["obs_type"] = "environment_state_agent_pos"
         else:
-            derived = observations_of(self.policy)
+            derived = observations_of(self.policy.input_features or {})
             if env.benchmark is None:
                 derived |= trained_scene(self.policy.pretrained_path)
         for name, value in derived.items():

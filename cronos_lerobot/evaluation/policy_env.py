@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from lerobot_env_cronos import CronosEnvConfig
@@ -15,11 +16,13 @@ from lerobot_env_cronos.scene.model import CAMERAS
 from lerobot_env_cronos.scene.scenes import SCENES
 from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS
 
+Features = Mapping[str, PolicyFeature]
 
-def observations_of(policy: PreTrainedConfig) -> dict[str, Any]:
-    """Fields of `CronosEnvConfig` that show a policy what it takes."""
-    images = policy.image_features
-    takes_state = OBS_ENV_STATE in (policy.input_features or {})
+
+def observations_of(features: Features) -> dict[str, Any]:
+    """Fields of `CronosEnvConfig` that show a policy what it takes, its `input_features`."""
+    images = {name: feature for name, feature in features.items() if feature.type is FeatureType.VISUAL}
+    takes_state = OBS_ENV_STATE in features
     if not images:
         return {"obs_type": "environment_state_agent_pos"} if takes_state else {}
     derived: dict[str, Any] = {"obs_type": "pixels_agent_pos", "privileged_state": takes_state}
@@ -66,13 +69,12 @@ def check_observations(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
         )
 
 
-def task_observation_of(policy: PreTrainedConfig, env: CronosEnvConfig) -> str:
-    """How a policy is told its task in the environment's scene, by the size of the state that it takes.
+def task_observation_of(features: Features, env: CronosEnvConfig) -> str:
+    """How a policy is told its task in the environment's scene, by the size of the state in its `input_features`.
 
     As the environment has it, if the policy takes no state, or one of a size that the scene never gives.
     """
-    state = (policy.input_features or {}).get(OBS_STATE)
-    if state is not None:
+    if (state := features.get(OBS_STATE)) is not None:
         for told in (env.task_observation, *TASK_OBSERVATIONS):
             if (_state_size(OBS_STATE, env.scene, env, told),) == tuple(state.shape):
                 return told
@@ -85,7 +87,7 @@ def check_task_observation(policy: PreTrainedConfig, env: CronosEnvConfig) -> No
     Raises:
         ValueError: it is not so; the sentence has the flag.
     """
-    told = task_observation_of(policy, env)
+    told = task_observation_of(policy.input_features or {}, env)
     if told != env.task_observation:
         raise ValueError(
             f"the policy takes {OBS_STATE} of {_state_size(OBS_STATE, env.scene, env, told)} numbers, as with "

@@ -192,9 +192,10 @@ def make_spectator(
     folder = find_policy(policy_path).folder
     policy_config = PreTrainedConfig.from_pretrained(folder)
     policy_config.pretrained_path, policy_config.device = folder, device
+    features = policy_config.input_features or {}
     where = {"scene": scene} if scene else trained_scene(folder)
-    env_config = CronosEnvConfig(**observations_of(policy_config), **where)
-    told = task_observation_of(policy_config, env_config)
+    env_config = CronosEnvConfig(**observations_of(features), **where)
+    told = task_observation_of(features, env_config)
     env_config = dataclasses.replace(env_config, task_observation=told)
     check_observations(policy_config, env_config)
     temperature = getattr(policy_config, "temperature", SuitesConfig.temperature)
