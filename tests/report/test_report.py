@@ -11,7 +11,6 @@ from lerobot_env_cronos.scene.scenes import SCENES
 from synthetic_runs import INSTRUCTIONS, read_csv, write_evaluation, write_training_run
 
 from cronos_lerobot.report.comparisons import compare_training
-from cronos_lerobot.report.figures import agent_figure
 from cronos_lerobot.report.page import write_report
 from cronos_lerobot.report.runs import describe_protocol, find_runs, group_runs
 from cronos_lerobot.report.series import evaluation_curve, segment_history, segment_rates
@@ -350,47 +349,6 @@ def test_tasks_of_lerobot_eval_are_those_of_the_scene(tmp_path):
     write_evaluation(tmp_path / "e")
     (evaluation,) = make_report([tmp_path / "e"], scene="playroom_2x2").evaluations
     assert list(evaluation.successes) == [task.instruction for task in SCENES["playroom_2x2"].tasks]
-
-
-@pytest.mark.parametrize("intervals", [(160,), (160, 320), (160, 320, 640)])
-def test_groups_of_any_number_are_drawn(tmp_path, intervals):
-    # Each with another agent, and so with other diagnostics.
-    for interval, agent in zip(intervals, ("ppo", "imitation", "steering"), strict=False):
-        write_training_run(tmp_path / f"runs/{interval}", interval=interval, agent=agent)
-    page = write_report(make_report([tmp_path / "runs"]), tmp_path / "report").read_text()
-    assert page.count("<img") == 5
-    updates = read_csv(tmp_path / "report/updates.csv")
-    assert [row.get("agent/frames") for row in updates[8:10]] == ["300.0", "600.0"][: len(updates) - 8]
-    assert [row.get("agent/alpha") for row in updates[16:18]] == ["", "0.005"][: len(updates) - 16]
-
-
-def test_every_agent_has_panels_of_its_own(tmp_path):
-    for agent in ("imitation", "steering"):
-        write_training_run(tmp_path / agent, agent=agent)
-    figure = agent_figure(group_runs(find_runs([tmp_path]).training))
-    # No panel is of both agents, and the legend names both.
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["type=imitation", "type=steering"]
-    drawn = {ax.get_title(loc="left"): [line.get_ydata().tolist() for line in ax.lines] for ax in figure.axes}
-    eighths = range(1, 9)
-    assert drawn["successful segments remembered"] == [[10.0 * i for i in eighths]]
-    assert drawn["failed segments remembered"] == [[5.0 * i for i in eighths]]
-    # The first update had nothing to learn from.
-    assert drawn["loss"] == [[1 / i for i in eighths][1:]]
-    assert drawn["loss of the critics"] == [[0.1 / i for i in eighths][1:]]
-    assert drawn["value of remembered decisions"] == [[0.05 * i for i in eighths][1:]]
-    assert len(drawn["alpha, the price of the entropy"][0]) == 7
-    assert "KL divergence per update [nats]" not in drawn
-
-
-def test_run_without_evaluations_or_finished_updates(tmp_path):
-    run = write_training_run(tmp_path / "run")
-    lines = (run / "metrics.jsonl").read_text().splitlines()
-    (run / "metrics.jsonl").write_text("\n".join(line for line in lines if '"update"' in line))
-    page = write_report(make_report([run]), tmp_path / "no_evaluation").read_text()
-    assert page.count("<img") == 4
-    (run / "metrics.jsonl").write_text(lines[0])
-    page = write_report(make_report([run]), tmp_path / "no_update").read_text()
-    assert page.count("<img") == 1
 
 
 def test_terminal_table_has_n_and_intervals(report_folder):
