@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -288,19 +289,46 @@ def test_an_evaluation_keeps_the_environments_apart():
 
     actor = SelectingPolicy(Planner(), PolicyProcessors(*identity_processors()), (dict, dict))
     assert actor.is_per_environment
-
-    def act(numbers, ids):
-        state = np.array([[number, 0] for number in numbers], np.float32)
-        answer = actor.act({"agent_pos": state}, ["go"] * len(ids), np.zeros((len(ids), 7)), np.array(ids))
-        return answer[:, 0].tolist()
-
     actor.begin(np.array([0, 1]))
-    assert act([1, 2], [0, 1]) == [1, 2]
+    assert ask(actor, [1, 2], [0, 1]) == [1, 2]
     actor.begin(np.array([1]))
-    assert act([3, 4], [0, 1]) == [1, 4]
-    assert act([5], [1]) == [4]
-    assert act([6, 7], [0, 1]) == [1, 4]
-    assert act([8, 9], [0, 1]) == [8, 9]
+    assert ask(actor, [3, 4], [0, 1]) == [1, 4]
+    assert ask(actor, [5], [1]) == [4]
+    assert ask(actor, [6, 7], [0, 1]) == [1, 4]
+    assert ask(actor, [8, 9], [0, 1]) == [8, 9]
+
+
+def test_an_evaluation_clears_one_memory_for_all_whenever_a_task_begins():
+    class Rememberer(torch.nn.Module):
+        """Plays the numbers that it saw first since it was reset."""
+
+        config = SimpleNamespace(type="act", temporal_ensemble_coeff=0.01, use_amp=False)
+        remembered = None
+
+        def reset(self):
+            self.remembered = None
+
+        def select_action(self, batch):
+            if self.remembered is None:
+                self.remembered = batch["observation.state"][:, :1].expand(-1, 7)
+            return self.remembered
+
+    actor = SelectingPolicy(Rememberer(), PolicyProcessors(*identity_processors()), (dict, dict))
+    assert not actor.is_per_environment
+    actor.begin(np.array([0, 1]))
+    assert ask(actor, [1, 2], [0, 1]) == [1, 2]
+    assert ask(actor, [3, 4], [0, 1]) == [1, 2]
+    actor.begin(np.array([], int))
+    assert ask(actor, [5, 6], [0, 1]) == [1, 2]
+    actor.begin(np.array([1]))
+    assert ask(actor, [7, 8], [0, 1]) == [7, 8]
+
+
+def ask(actor, numbers, ids):
+    """First numbers of the actions in environments `ids` that show these numbers."""
+    state = np.array([[number, 0] for number in numbers], np.float32)
+    answer = actor.act({"agent_pos": state}, ["go"] * len(ids), np.zeros((len(ids), 7)), np.array(ids))
+    return answer[:, 0].tolist()
 
 
 class TwoOptimizersConfig(ClonedConfig):
