@@ -61,6 +61,10 @@ class StartConfig:
     misplaced_objects: bool = False
     """The task's object lies on another receptacle, where another task has put it; beside `occupied_receptacles`
     it is either, with equal chances for each task that may have come before."""
+    earlier_tasks: int = 1
+    """Where a demonstration begins after another task, how many may have been done: one to so many, with equal
+    chances, the last of them as above and those before it any others. From two on all objects may lie on
+    receptacles, and two on one, as in a stream that goes on without a scene reset."""
     leaning_share: float = 0.0
     """Share of the layouts in which one object has fallen over the edge of another body, from 0 to 1."""
     share: float = 1.0
@@ -77,9 +81,21 @@ class StartConfig:
             raise ValueError(
                 f"start.num_configurations must be 1 to {NUM_CONFIGURATIONS}, got {self.num_configurations}"
             )
+        if self.earlier_tasks < 1:
+            raise ValueError(f"start.earlier_tasks must be at least 1, got {self.earlier_tasks}")
+        if self.earlier_tasks > 1 and not self.is_after_another:
+            raise ValueError(
+                f"start.earlier_tasks={self.earlier_tasks} needs start.occupied_receptacles,"
+                " start.misplaced_objects or start.arm_pose=after_task: without them nothing was done before"
+            )
         for name in ("share", "leaning_share"):
             if not 0 <= (value := getattr(self, name)) <= 1:
                 raise ValueError(f"start.{name} must be between 0 and 1, got {value}")
+
+    @property
+    def is_after_another(self) -> bool:
+        """Whether demonstrations begin where another task ended."""
+        return self.occupied_receptacles or self.misplaced_objects or self.arm_pose == "after_task"
 
 
 @dataclass
@@ -108,11 +124,12 @@ class DemoConfig:
 
 @dataclass
 class _Episode:
-    """One attempt of a stream. A `prelude` task is carried out, unrecorded, before the task itself."""
+    """One attempt of a stream. Its `preludes` are carried out, unrecorded, before the task itself."""
 
     task: Task
     configuration: int
-    prelude: Task | None
+    preludes: list[Task]
+    """Those that are not done yet, the next one first."""
     at_home: bool
     rng: np.random.Generator
     settling: bool = True
@@ -183,7 +200,7 @@ class DemoCollector:
             self._start_idle_streams(num_episodes)
 
     def _perturb(self, labels: np.ndarray) -> np.ndarray:
-        recording = np.array([episode is not None and not episode.prelude for episode in self._episodes])
+        recording = np.array([episode is not None and not episode.preludes for episode in self._episodes])
         executed = self._misses.apply(labels, recording)
         executed = self._noise.apply(executed, recording)
         for stream, episode in enumerate(self._episodes):
@@ -201,18 +218,18 @@ class DemoCollector:
         episode.steps += 1
         resting = info["is_success"][stream] and not info["is_grasped"][stream]
         episode.released = episode.released + 1 if resting else 0
-        if not episode.prelude:
+        if not episode.preludes:
             for key, column in columns.items():
                 episode.frames.setdefault(key, []).append(column[stream].copy())
         succeeded = episode.released > self.config.steps_after_release
         if info["diverged"][stream]:
             self._end(stream, episode, succeeded=False, keep=False)
-        elif succeeded and episode.prelude:
+        elif succeeded and episode.preludes:
             self._end_prelude(stream, episode)
         elif succeeded:
             self._end(stream, episode, succeeded=True, keep=True)
         elif episode.steps >= self.config.max_steps:
-            self._end(stream, episode, succeeded=False, keep=self.config.keep_failures and not episode.prelude)
+            self._end(stream, episode, succeeded=False, keep=self.config.keep_failures and not episode.preludes)
 
     def _end(self, stream: int, episode: _Episode, *, succeeded: bool, keep: bool) -> None:
         self._episodes[stream] = None
@@ -236,10 +253,13 @@ class DemoCollector:
 
     def _end_prelude(self, stream: int, episode: _Episode) -> None:
         ids = np.array([stream])
+        del episode.preludes[0]
+        if episode.preludes:
+            self._begin_prelude(ids, episode)
+            return
         if self.config.start.arm_pose == "home" or episode.at_home:
             self.env.end_effector_reset(ids)
         self._begin_task(ids, episode)
-        episode.prelude = None
 
     def _start_idle_streams(self, num_episodes: int) -> None:
         """Give every idle stream an episode of the task that has the fewest, until enough are under way."""
@@ -265,18 +285,23 @@ class DemoCollector:
         else:
             number = -1
             self.env.place_bodies(ids, FREE_LAYOUTS[start.layouts](self.env.scene, rng)[None])
-        episode = _Episode(task, number, prelude=None, at_home=rng.random() >= start.share, rng=rng)
+        episode = _Episode(task, number, preludes=[], at_home=rng.random() >= start.share, rng=rng)
         if start.leaning_share and rng.random() < start.leaning_share:
             drop_against_another(self.env, stream, rng)
-        after_another = start.occupied_receptacles or start.misplaced_objects or start.arm_pose == "after_task"
         # An object that lies on the table from the start would leave nothing to show of its reset task.
-        if task.receptacle is None or (after_another and not episode.at_home):
-            episode.prelude = self._prelude(task, rng)
-            self.env.set_task(ids, [episode.prelude])
-            self.expert.reset(ids)
+        if task.receptacle is None or (start.is_after_another and not episode.at_home):
+            earlier = [] if episode.at_home else self._earlier(task, rng)
+            episode.preludes = [*earlier, self._prelude(task, rng)]
+            self._begin_prelude(ids, episode)
         else:
             self._begin_task(ids, episode)
         return episode
+
+    def _earlier(self, task: Task, rng: np.random.Generator) -> list[Task]:
+        """What was done before the last task before; never the task itself, which would be found complete."""
+        most = self.config.start.earlier_tasks
+        others = [other for other in self.env.scene.tasks if other != task]
+        return [others[i] for i in rng.integers(len(others), size=rng.integers(most))] if most > 1 else []
 
     def _prelude(self, task: Task, rng: np.random.Generator) -> Task:
         """What was done before: another object put onto the target receptacle, or the task's own onto another one.
@@ -296,6 +321,11 @@ class DemoCollector:
             if (other.object == task.object, other.receptacle == task.receptacle) in (wanted or {(False, False)})
         ]
         return choices[rng.integers(len(choices))]
+
+    def _begin_prelude(self, ids: np.ndarray, episode: _Episode) -> None:
+        self.env.set_task(ids, episode.preludes[:1])
+        self.expert.reset(ids)
+        episode.steps, episode.released = 0, 0
 
     def _begin_task(self, ids: np.ndarray, episode: _Episode) -> None:
         if self.config.start.arm_pose == "random" and not episode.at_home:

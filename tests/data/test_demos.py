@@ -210,6 +210,34 @@ def test_starts_with_either_an_occupied_receptacle_or_a_misplaced_object(env, tm
     assert 0 < sum(on) < 8
 
 
+def test_starts_after_several_tasks_have_all_objects_on_receptacles(env, tmp_path):
+    start = StartConfig(misplaced_objects=True, occupied_receptacles=True, earlier_tasks=3)
+    dataset, _ = collect(env, tmp_path / "d", DemoConfig(start=start), 12)
+    bodies, on_receptacles, on_one = env.scene.bodies, 0, 0
+    for episode, (task,) in zip(episodes_of(dataset), dataset.meta.episodes["tasks"], strict=True):
+        (task,) = [t for t in env.scene.tasks if t.instruction == task]
+        xy = episode["observation.environment_state"][0].reshape(len(bodies), -1)[:, :2]
+        objects, places = (
+            np.array([xy[bodies.index(name)] for name in names])
+            for names in (env.scene.objects, env.scene.receptacles)
+        )
+        near = np.linalg.norm(objects[:, None] - places, axis=-1) < 0.07
+        assert not near[env.scene.objects.index(task.object), env.scene.receptacles.index(task.receptacle)]
+        assert near.any()
+        on_receptacles += near.any(axis=1).all()
+        on_one += near.all(axis=0).any()
+        assert episode["next.success"][-1]
+    # Never after one task alone.
+    assert on_receptacles > on_one > 0
+
+
+def test_tasks_done_before_want_something_done_before():
+    with pytest.raises(ValueError, match=r"start\.earlier_tasks=2 needs start\.occupied_receptacles, "):
+        StartConfig(earlier_tasks=2)
+    with pytest.raises(ValueError, match=r"start\.earlier_tasks must be at least 1, got 0"):
+        StartConfig(earlier_tasks=0)
+
+
 def test_layouts_over_the_reach(env, tmp_path):
     dataset, _ = collect(env, tmp_path / "d", DemoConfig(start=StartConfig(layouts="reach")), 8)
     assert dataset.meta.episodes["cronos.configuration"] == [-1] * 8
