@@ -55,6 +55,7 @@ _WIDE_FLAGS = (
     "--start.arm_pose=after_task",
     "--start.occupied_receptacles=true",
     "--start.misplaced_objects=true",
+    "--start.earlier_tasks=3",
     "--start.share=0.5",
 )
 BASE_KINDS: dict[str, tuple[str, ...]] = {
@@ -63,8 +64,8 @@ BASE_KINDS: dict[str, tuple[str, ...]] = {
     WIDE_RESETS: (*_WIDE_FLAGS, "--reset_tasks=true"),
 }
 """Kinds of base policies by where their demonstrations begin, as flags of `cronos-record-demos`: in the training
-configurations; wherever the arm can do the tasks, every second where another task left the arm, and another object
-on the target or the object itself on another receptacle; the same with reset tasks among them."""
+configurations; wherever the arm can do the tasks, every second after one to three other tasks: where they left the
+arm, other objects on the target, the object itself on another receptacle; the same with reset tasks among them."""
 
 
 @dataclass(frozen=True)

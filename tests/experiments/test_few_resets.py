@@ -66,6 +66,7 @@ def test_commands(tmp_path):
         "--start.layouts=reach",
         "--start.arm_pose=after_task",
         "--start.misplaced_objects=true",
+        "--start.earlier_tasks=3",
         "--start.share=0.5",
         "--noise.share=0.75",
     }
