@@ -13,7 +13,6 @@ import os
 import shutil
 import sys
 import tempfile
-import threading
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -24,7 +23,7 @@ HEAD = (
     "# A run that its time limit stops\n\n"
     "Printed by `python tests/experiments/slurm_transcript.py --output=docs/slurm_transcript.md`, which starts a"
     " Slurm of one node on this machine (two CPU cores) and runs every command. Slurm holds a requeued job back"
-    " for two minutes; here it is told not to (`scontrol update JobId=... StartTime=now`). The last lines of each"
+    " for two minutes; here for two seconds (`scontrol update JobId=... StartTime=now`). The last lines of each"
     " output are shown. [cluster.md](cluster.md) explains the commands.\n"
 )
 SAME = """python -c '
@@ -64,15 +63,6 @@ def story(scale: str, time_limit: str, warning_s: int) -> tuple[Act, ...]:
     )
 
 
-def hurry(cluster: SlurmCluster, ended: threading.Event) -> None:
-    """Start what Slurm holds back."""
-    while not ended.wait(0.5):
-        for line in cluster.ask("squeue", "--noheader", "--format=%i %T %r").splitlines():
-            number, state, reason = line.split(maxsplit=2)
-            if (state, reason) == ("PENDING", "BeginTime"):
-                cluster.ask("scontrol", "update", f"JobId={number}", "StartTime=now")
-
-
 def main() -> None:
     """Run the story and write it down."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -84,22 +74,16 @@ def main() -> None:
     if lacks := missing():
         sys.exit(f"not here: {', '.join(lacks)}; .ci/system-packages tests installs them")
     folder = Path(tempfile.mkdtemp(prefix="slurm-"))
-    ended = threading.Event()
     # The commands, and what the cluster starts, are those of this Python.
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     try:
         (folder / "slurm").mkdir()
         with SlurmCluster(folder / "slurm") as cluster:
             (folder / "here").mkdir()
-            hurrying = threading.Thread(target=hurry, args=(cluster, ended))
-            hurrying.start()
             environment["SLURM_CONF"] = os.environ["SLURM_CONF"]
-            try:
-                acts = story(args.scale, args.time, args.warning_s)
+            acts = story(args.scale, args.time, args.warning_s)
+            with cluster.sparing_the_wait():
                 parts = [perform(act, folder / "here", environment) for act in acts]
-            finally:
-                ended.set()
-                hurrying.join()
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     args.output.write_text("\n".join([HEAD, *parts]))

@@ -4,8 +4,6 @@ import json
 import shutil
 import signal
 import tempfile
-import threading
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -13,7 +11,7 @@ from slurm_cluster import SlurmCluster, missing
 
 from cronos_lerobot.experiments.follow import Follower
 from cronos_lerobot.experiments.jobs import BASE, EVALUATION, RUN, Job, read_record, write_record
-from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, Task, plan_arrays, read_submitted, squeue
+from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, Task, plan_arrays, read_submitted
 
 needs_slurm = pytest.mark.skipif(
     bool(missing()), reason=f"no Slurm here ({', '.join(missing())}): Debian has it in slurm-wlm and munge"
@@ -163,31 +161,10 @@ def counting_job(folder, number):
     return Job(counting.name, command, counting.output, resume=lambda: list(command))
 
 
-@contextmanager
-def hurrying(cluster, also=lambda: None):
-    """Slurm holds a requeued job back for two minutes, unless it is told not to."""
-    ended = threading.Event()
-
-    def hurry():
-        while not ended.wait(0.5):
-            also()
-            for number, (state, reason) in squeue().items():
-                if state == "PENDING" and reason == "BeginTime":
-                    cluster.ask("scontrol", "update", f"JobId={number}", "StartTime=now")
-
-    thread = threading.Thread(target=hurry)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
-
-
 @needs_slurm
 def test_a_job_that_its_time_limit_stops_goes_on_and_ends_as_an_unbroken_one(cluster, tmp_path):
     counting = counting_job(tmp_path, 400)
-    with hurrying(cluster):
+    with cluster.sparing_the_wait():
         # Slurm looks at limits every half minute and warns as much earlier: 10 to 40 s after the start, when the
         # element's Python is there to be warned.
         states, _, tape = follow([counting], tmp_path, time="1", warning_s=20)
@@ -214,7 +191,7 @@ def test_a_preempted_job_waits_to_be_requeued_and_goes_on(cluster, tmp_path):
             sent.append("requeued")
             cluster.ask("scontrol", "requeue", number)
 
-    with hurrying(cluster, preempt):
+    with cluster.sparing_the_wait(preempt):
         states, _, _ = follow([counting], tmp_path, time="10")
     assert (states, sent[1:]) == ({"count": "done"}, ["requeued"])
     assert read_record(counting)["starts"] == 2
