@@ -117,7 +117,7 @@ class SlurmCluster:
 
     @contextmanager
     def sparing_the_wait(self, also: Callable[[], object] = lambda: None) -> Iterator[None]:
-        """Requeued jobs start after two seconds, where Slurm would wait for two minutes; `also` is called meanwhile.
+        """Requeued jobs start after two seconds, for which Slurm takes two minutes; `also` is called meanwhile.
 
         In the second in which a job was stopped, its node takes a new start for the old one: "already killed".
         """
