@@ -5,16 +5,38 @@ import pytest
 from ppo_samples import make_ppo, reward_for_up, rollout
 
 from cronos_lerobot.agents.ppo.config import PPOConfig
-from cronos_lerobot.agents.ppo.learning_rate import adapted_lr
+from cronos_lerobot.agents.ppo.learning_rate import adapted_lr, target_kl
 
 
 def test_adaptive_learning_rate():
-    config = PPOConfig(target_kl=0.04, lr_factor=2.0, policy_lr_min=3e-5, policy_lr_max=3e-4)
-    assert adapted_lr(1e-4, 0.09, config) == pytest.approx(5e-5)
-    assert adapted_lr(1e-4, 0.05, config) == 1e-4
-    assert adapted_lr(1e-4, 0.01, config) == pytest.approx(2e-4)
-    assert adapted_lr(4e-5, 0.09, config) == 3e-5
-    assert adapted_lr(2e-4, 0.01, config) == 3e-4
+    config = PPOConfig(lr_factor=2.0, policy_lr_min=3e-5, policy_lr_max=3e-4)
+    assert adapted_lr(1e-4, 0.09, 0.04, config) == pytest.approx(5e-5)
+    assert adapted_lr(1e-4, 0.05, 0.04, config) == 1e-4
+    assert adapted_lr(1e-4, 0.01, 0.04, config) == pytest.approx(2e-4)
+    assert adapted_lr(4e-5, 0.09, 0.04, config) == 3e-5
+    assert adapted_lr(2e-4, 0.01, 0.04, config) == 3e-4
+
+
+def test_target_kl_falls_in_equal_ratios_over_the_run():
+    config = PPOConfig(target_kl=0.08, target_kl_end=0.01)
+    assert [target_kl(config, update, 4) for update in range(4)] == pytest.approx([0.08, 0.04, 0.02, 0.01])
+    assert target_kl(config, 7, 4) == pytest.approx(0.01)
+    assert target_kl(config, 0, 1) == target_kl(config, 3, None) == 0.08
+    assert target_kl(PPOConfig(target_kl=0.08), 3, 4) == 0.08
+    with pytest.raises(ValueError, match=r"target_kl_end=0.01 needs algorithm.target_kl"):
+        PPOConfig(target_kl=None, lr_schedule="fixed", target_kl_end=0.01)
+
+
+def test_a_smaller_target_stops_an_update_sooner():
+    options = {"epochs": 20, "policy_lr": 1e-2, "policy_lr_max": 1.0, "kl_stop_factor": 1.0, "target_kl": 0.1}
+    steady, falling = (make_ppo(target_kl_end=end, num_updates=2, **options) for end in (None, 1e-4))
+    epochs = []
+    for ppo in steady, falling:
+        first, second = (ppo.update(rollout(ppo, reward_for_up)) for _ in range(2))
+        assert [first["target_kl"], second["target_kl"]] == pytest.approx([0.1, ppo.config.target_kl_end or 0.1])
+        epochs.append((first["policy_epochs"], second["policy_epochs"]))
+    assert epochs[0][0] == epochs[1][0]
+    assert epochs[0][1] > epochs[1][1]
 
 
 def test_lr_rises_while_the_policy_hardly_moves():

@@ -10,12 +10,28 @@ from torch.optim import Optimizer
 from cronos_lerobot.agents.ppo.config import PPOConfig
 
 
-def adapted_lr(lr: float, kl: float, config: PPOConfig) -> float:
+def target_kl(config: PPOConfig, update: int, num_updates: int | None) -> float | None:
+    """Return the KL divergence [nats] that an update aims at, or None.
+
+    From `target_kl` to `target_kl_end` in equal ratios.
+
+    Args:
+        config: see PPOConfig.
+        update: number of updates before it.
+        num_updates: of the whole run; those beyond it stay at the end. Without it the target does not change.
+    """
+    first, last = config.target_kl, config.target_kl_end
+    if first is None or last is None or num_updates is None:
+        return first
+    share = min(update / max(num_updates - 1, 1), 1.0)
+    return first * (last / first) ** share
+
+
+def adapted_lr(lr: float, kl: float, target: float, config: PPOConfig) -> float:
     """Return a smaller learning rate if `kl` is above twice the target, a larger one if below half of it."""
-    assert config.target_kl is not None
-    if kl > 2 * config.target_kl:
+    if kl > 2 * target:
         return lowered_lr(lr, config)
-    if kl < config.target_kl / 2:
+    if kl < target / 2:
         return min(lr * config.lr_factor, config.policy_lr_max)
     return lr
 
@@ -39,6 +55,7 @@ class AdaptiveLR:
     def __init__(self, optimizer: Optimizer, config: PPOConfig) -> None:
         self._optimizer = optimizer
         self._config = config
+        self._target: float | None = None
         self._moved = False
         self._told = False
 
@@ -52,8 +69,9 @@ class AdaptiveLR:
         for group in self._groups():
             group["lr"] = lr
 
-    def begin_update(self) -> None:
-        """Nothing has moved the policy yet in this update."""
+    def begin_update(self, target: float | None) -> None:
+        """Nothing has moved the policy yet in this update, which aims at this KL divergence."""
+        self._target = target
         self._moved = False
 
     def after_step(self, grad_norm: float) -> None:
@@ -62,8 +80,8 @@ class AdaptiveLR:
 
     def see(self, when: str, kl: float | None) -> None:
         """Adapt to the KL divergence seen after a step (`kl_step`) or in an update (`kl_update`), if any was."""
-        if self._config.lr_schedule == when and self._moved and kl is not None:
-            self.value = adapted_lr(self.value, kl, self._config)
+        if self._config.lr_schedule == when and self._moved and kl is not None and self._target is not None:
+            self.value = adapted_lr(self.value, kl, self._target, self._config)
 
     def stopped_early(self) -> None:
         """The update moved the policy too far."""

@@ -16,7 +16,7 @@ from torch import Tensor
 from cronos_lerobot.agents.base import Columns, check_trainable
 from cronos_lerobot.agents.ppo.base_policy import BasePolicy
 from cronos_lerobot.agents.ppo.config import PPOConfig
-from cronos_lerobot.agents.ppo.learning_rate import AdaptiveLR
+from cronos_lerobot.agents.ppo.learning_rate import AdaptiveLR, target_kl
 from cronos_lerobot.agents.ppo.losses import (
     approximate_kl,
     bounded_log_ratio,
@@ -64,6 +64,7 @@ class PPO:
         processes: each learns from its own rollout, in minibatches of its own; they take every optimizer step
             together, with the mean of their gradients. Their rollouts have the same size.
         self_imitation: what is cloned in each optimizer step that trains the policy.
+        num_updates: of the whole run, for what changes over it; None if that is not known.
 
     Raises:
         TypeError: the policy is not trainable.
@@ -78,6 +79,7 @@ class PPO:
         rng: np.random.Generator,
         processes: Processes | None = None,
         self_imitation: SelfImitation | None = None,
+        num_updates: int | None = None,
     ) -> None:
         check_trainable(policy)
         self.policy = policy
@@ -86,6 +88,7 @@ class PPO:
         self.rng = rng
         self.processes = processes or Processes()
         self.num_updates = 0
+        self._planned_updates = num_updates
         lrs = {"policy": config.policy_lr, "value": config.value_lr}
         self._max_norms = {"policy": config.max_grad_norm, "value": config.value_max_grad_norm}
         self._params: dict[str, list[Tensor]] = {"policy": [], "value": []}
@@ -125,6 +128,8 @@ class PPO:
             buffer.normalize_advantages(rollout["advantages"].mean(), rollout["advantages"].std())
         if self.self_imitation is not None:
             described |= self.self_imitation.begin_update(self.num_updates)
+        if self.target_kl is not None:
+            described["target_kl"] = self.target_kl
         metrics = UpdateMetrics()
         warming_up = self.num_updates < config.value_warmup_updates
         epochs = 0 if warming_up else self._train_policy(buffer, metrics)
@@ -132,6 +137,11 @@ class PPO:
         self.num_updates += 1
         described |= metrics.result(self.processes)
         return described | {"policy_epochs": epochs, "policy_lr": self.policy_lr, "value_lr": config.value_lr}
+
+    @property
+    def target_kl(self) -> float | None:
+        """The KL divergence [nats] that the next update aims at."""
+        return target_kl(self.config, self.num_updates, self._planned_updates)
 
     @property
     def policy_lr(self) -> float:
@@ -147,7 +157,7 @@ class PPO:
         config, steps = self.config, 0
         steps_per_epoch = -(-self._num_own(buffer) // (config.minibatch_size * config.grad_accumulation))
         seen: list[float] = []
-        self.lr.begin_update()
+        self.lr.begin_update(self.target_kl)
         for _ in range(config.epochs):
             seen = []
             for group in self._groups(buffer):
@@ -286,7 +296,7 @@ class PPO:
     @property
     def _kl_limit(self) -> float:
         """The KL divergence beyond which the policy's training in an update stops."""
-        target, factor = self.config.target_kl, self.config.kl_stop_factor
+        target, factor = self.target_kl, self.config.kl_stop_factor
         return math.inf if target is None or factor is None else factor * target
 
     def _tensor(self, array: np.ndarray) -> Tensor:
