@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 PRELOADED = (
     "lerobot.scripts.lerobot_train", "lerobot.scripts.lerobot_eval", "lerobot.rl.algorithms.configs",
@@ -44,17 +44,39 @@ def run_forked(
         check: raise a CalledProcessError if it fails.
     """
     words = [str(word) for word in command]
-    server = _server()
-    assert server.stdin is not None
-    assert server.stdout is not None
-    request = {"command": words, "environment": dict(os.environ if env is None else env), "folder": os.getcwd()}
-    server.stdin.write(json.dumps(request) + "\n")
-    server.stdin.flush()
-    answer = json.loads(server.stdout.readline())
+    environment = dict(os.environ if env is None else env)
+    answer = _ask({"command": words, "environment": environment, "folder": os.getcwd()})
     done = subprocess.CompletedProcess(words, answer["code"], answer["stdout"], answer["stderr"])
     if check:
         done.check_returncode()
     return done
+
+
+class ForkedPopen:
+    """As `subprocess.Popen(command, stdout=log, stderr=STDOUT, env=env, start_new_session=True)`.
+
+    The child inherits no file of this process but its log's: `pass_fds` has no effect.
+    """
+
+    def __init__(self, command: Sequence[Any], *, stdout: IO[bytes], env: Mapping[str, str], **_: Any) -> None:
+        request = {"command": [str(word) for word in command], "environment": dict(env), "folder": os.getcwd()}
+        self.pid = _ask(request | {"log": stdout.name})["pid"]
+        self.returncode: int | None = None
+
+    def poll(self) -> int | None:
+        """The exit code, None while it runs."""
+        if self.returncode is None:
+            self.returncode = _ask({"poll": self.pid})["code"]
+        return self.returncode
+
+
+def _ask(request: Mapping[str, Any]) -> dict[str, Any]:
+    server = _server()
+    assert server.stdin is not None
+    assert server.stdout is not None
+    server.stdin.write(json.dumps(request) + "\n")
+    server.stdin.flush()
+    return json.loads(server.stdout.readline())
 
 
 @cache
@@ -121,6 +143,18 @@ def _serve() -> None:
     print("ready", flush=True)
     for line in sys.stdin:
         request = json.loads(line)
+        if "poll" in request:
+            pid, status = os.waitpid(request["poll"], os.WNOHANG)
+            print(json.dumps({"code": os.waitstatus_to_exitcode(status) if pid else None}), flush=True)
+            continue
+        if "log" in request:
+            child = os.fork()
+            if not child:
+                os.setsid()
+                log = os.open(request["log"], os.O_WRONLY | os.O_APPEND)
+                _run_child(request, (log, log))
+            print(json.dumps({"pid": child}), flush=True)
+            continue
         with tempfile.NamedTemporaryFile() as stdout, tempfile.NamedTemporaryFile() as stderr:
             child = os.fork()
             if not child:

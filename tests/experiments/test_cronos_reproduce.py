@@ -5,10 +5,12 @@ import shutil
 import subprocess
 import sys
 import textwrap
+import types
 
 import pytest
+from forked_commands import ForkedPopen
 
-from cronos_lerobot.experiments import definitions
+from cronos_lerobot.experiments import definitions, runner
 from cronos_lerobot.experiments.definitions import Base
 from cronos_lerobot.experiments.plan import base_jobs
 from cronos_lerobot.experiments.specs import base_policy
@@ -18,6 +20,8 @@ ROWS = ("t80", "t1280_eer_cl_hsr")
 
 
 def test_two_rows_of_table1_end_to_end(tmp_path, monkeypatch, capsys):
+    # How a runner starts, stops and asks its children is tested with real ones, of a line each.
+    monkeypatch.setattr(runner, "subprocess", types.SimpleNamespace(**vars(subprocess) | {"Popen": ForkedPopen}))
     flags = ["table1", "--scale=smoke", f"--root={tmp_path}", "--rows", *ROWS, "--jobs=2"]
     call(monkeypatch, *flags)
     assert "jobs: 4 done" in capsys.readouterr().out

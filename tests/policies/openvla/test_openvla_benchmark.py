@@ -7,7 +7,7 @@ import torch
 from lerobot_policy_openvla.arithmetic import update_bytes, work_of
 from lerobot_policy_openvla.benchmark import architecture_of_size, main
 from lerobot_policy_openvla.benchmark_report import report
-from lerobot_policy_openvla.checkpoint import empty_network
+from lerobot_policy_openvla.network_loading import empty_network
 from openvla_samples import make_batch, make_policy, take
 from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 

@@ -1,10 +1,12 @@
 """Action tokens, statistics, prompts, images and the token distribution, against numbers worked out by hand."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
 import torch
+from forked_commands import run_forked
 from lerobot_policy_openvla.action_statistics import ActionStatisticsProcessorStep, choose_statistics
 from lerobot_policy_openvla.action_tokens import ActionTokenizer
 from lerobot_policy_openvla.architecture import Architecture
@@ -183,3 +185,13 @@ def test_instructions_of_the_samples_differ_in_length(published):
     """Or the other tests would not try padding."""
     tokenizer = PromptTokenizer(published, 1)
     assert len({len(tokenizer(task)) for task in TASKS}) == 2
+
+
+def test_commands_without_it_do_not_wait_for_timm():
+    code = """
+import sys, lerobot_policy_openvla as plugin
+assert not {"timm", "wandb"} & sys.modules.keys()
+assert plugin.OpenVLAPolicy.config_class is plugin.OpenVLAConfig
+assert "timm" in sys.modules
+"""
+    run_forked([sys.executable, "-c", code], check=True)

@@ -7,6 +7,8 @@ from typing import Any
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 HALF = (0.5, 0.5, 0.5)
+ATTENTION = ("sdpa", "eager", "flash_attention_2")
+"""Ways of computing the language model's attention."""
 
 SUPPORTED = {
     "model_type": "openvla",

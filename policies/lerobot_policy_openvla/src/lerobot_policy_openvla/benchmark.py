@@ -28,10 +28,10 @@ from lerobot_policy_openvla.architecture import HALF, IMAGENET_MEAN, IMAGENET_ST
 from lerobot_policy_openvla.arithmetic import parameter_bytes, rollout_bytes, update_bytes, work_of
 from lerobot_policy_openvla.benchmark_report import report, report_of_formulas
 from lerobot_policy_openvla.building import finish_network, resolve_dtype
-from lerobot_policy_openvla.checkpoint import empty_network
 from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
 from lerobot_policy_openvla.network import OpenVLANetwork
+from lerobot_policy_openvla.network_loading import empty_network
 from lerobot_policy_openvla.sequence import score_actions
 
 H100_FLOPS, H100_BYTES = 989e12, 3.35e12

@@ -8,9 +8,10 @@ import torch
 
 from lerobot_policy_openvla.adapters import add_lora, linear_names, load_adapter
 from lerobot_policy_openvla.architecture import Architecture
-from lerobot_policy_openvla.checkpoint import load_network, read_checkpoint
+from lerobot_policy_openvla.checkpoint import read_checkpoint
 from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
 from lerobot_policy_openvla.network import OpenVLANetwork
+from lerobot_policy_openvla.network_loading import load_network
 from lerobot_policy_openvla.prompt import PromptTokenizer
 from lerobot_policy_openvla.quantization import quantize
 

@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-from accelerate import init_empty_weights
-from accelerate.utils import set_module_tensor_to_device
 from huggingface_hub import snapshot_download
 from safetensors import safe_open
-from torch import Tensor
 
 from lerobot_policy_openvla.architecture import Architecture
-from lerobot_policy_openvla.network import OpenVLANetwork, depth_of
 
 CONFIG, PREPROCESSOR = "config.json", "preprocessor_config.json"
 STATISTICS = "dataset_statistics.json"
@@ -26,11 +19,6 @@ WEIGHTS, WEIGHTS_INDEX = "model.safetensors", "model.safetensors.index.json"
 NETWORK_PREFIX = "network."
 """Where the network is in a policy's model.safetensors."""
 FILES = ["*.json", "*.safetensors"]
-UNUSED = re.compile(
-    r"vision_backbone\.(fused_)?featurizer\.(norm|fc_norm|head|attn_pool)\.|.*rotary_emb\.inv_freq$"
-)
-"""Published tensors that come after what the network looks at, or that are computed."""
-VISION_BLOCK = re.compile(r"vision_backbone\.(featurizer|fused_featurizer)\.blocks\.(\d+)\.")
 
 
 @dataclass(frozen=True)
@@ -64,13 +52,13 @@ def read_checkpoint(name: str, revision: str | None = None) -> Checkpoint:
         ValueError: it is not an OpenVLA, or has only adapters.
     """
     folder = fetch(name, revision)
-    config = _read_json(folder / CONFIG)
+    config = read_json(folder / CONFIG)
     if config.get("type") == "openvla":
         if not config.get("architecture") or not holds_network(folder):
             raise ValueError(f"{name} holds adapters, not a whole network; use it as --policy.path.")
         statistics = {config["action_statistics"]["key"]: config["action_statistics"]}
         return Checkpoint(folder, Architecture.from_dict(config["architecture"]), statistics, NETWORK_PREFIX)
-    preprocessor = _read_json(folder / PREPROCESSOR) if (folder / PREPROCESSOR).is_file() else None
+    preprocessor = read_json(folder / PREPROCESSOR) if (folder / PREPROCESSOR).is_file() else None
     architecture = Architecture.from_published(config, preprocessor)
     statistics = tuned_statistics(folder) or _actions(config.get("norm_stats", {}))
     return Checkpoint(folder, architecture, statistics, "")
@@ -85,7 +73,7 @@ def tuned_statistics(folder: Path) -> dict[str, dict[str, Any]] | None:
         ValueError: the file has other contents.
     """
     path = folder / STATISTICS
-    return _actions(_read_json(path), str(path)) if path.is_file() else None
+    return _actions(read_json(path), str(path)) if path.is_file() else None
 
 
 def _actions(published: dict[str, Any], source: str = "norm_stats in config.json") -> dict[str, dict[str, Any]]:
@@ -108,67 +96,17 @@ def tensor_names(path: Path) -> list[str]:
         return list(file.keys())
 
 
-def empty_network(architecture: Architecture, attention: str) -> OpenVLANetwork:
-    """Return a network whose parameters take no memory yet."""
-    with init_empty_weights(include_buffers=False):
-        return OpenVLANetwork(architecture, attention)
-
-
-def load_network(
-    checkpoint: Checkpoint, attention: str, dtype: torch.dtype, device: str | torch.device
-) -> OpenVLANetwork:
-    """Return the checkpoint's network in evaluation mode.
-
-    One tensor at a time goes from the files to the device, so there is never a second copy in memory.
-
-    Raises:
-        ValueError: names or shapes in the files are not those of the network.
-    """
-    network = empty_network(checkpoint.architecture, attention)
-    missing = dict(network.state_dict())
-    for name, tensor in _tensors(checkpoint):
-        if _is_unused(name, network):
-            continue
-        expected = missing.pop(name, None)
-        if expected is None or expected.shape != tensor.shape:
-            shape = "no such tensor" if expected is None else tuple(expected.shape)
-            raise ValueError(f"{checkpoint.folder} has {name} {tuple(tensor.shape)}, the network has {shape}.")
-        set_module_tensor_to_device(network, name, device, tensor, dtype=dtype)
-    if missing:
-        raise ValueError(f"{checkpoint.folder} lacks {len(missing)} tensors: {sorted(missing)[:5]} ...")
-    return network.to(device).eval()
-
-
-def _tensors(checkpoint: Checkpoint) -> Iterator[tuple[str, Tensor]]:
-    for path in _weight_files(checkpoint.folder):
-        with safe_open(path, framework="pt") as file:
-            for key in file.keys():  # noqa: SIM118  (it is not a dict)
-                if key.startswith(checkpoint.prefix):
-                    yield timm_name(key.removeprefix(checkpoint.prefix)), file.get_tensor(key)
-
-
-def _weight_files(folder: Path) -> list[Path]:
-    if (folder / WEIGHTS_INDEX).is_file():
-        shards = _read_json(folder / WEIGHTS_INDEX)["weight_map"].values()
-        return [folder / shard for shard in sorted(set(shards))]
-    if (folder / WEIGHTS).is_file():
-        return [folder / WEIGHTS]
-    raise FileNotFoundError(f"{folder} has neither {WEIGHTS} nor {WEIGHTS_INDEX}.")
-
-
 def timm_name(name: str) -> str:
     """The published name of a tensor -> ours: the layer scales of the towers are called `gamma` in timm."""
     return name.replace(".scale_factor", ".gamma") if name.startswith("vision_backbone.") else name
 
 
-def _is_unused(name: str, network: OpenVLANetwork) -> bool:
-    if block := VISION_BLOCK.match(name):
-        tower = getattr(network.vision_backbone, block[1])
-        return int(block[2]) >= depth_of(tower)
-    return UNUSED.match(name) is not None
+def read_json(path: Path) -> dict[str, Any]:
+    """Return what a file of JSON says.
 
-
-def _read_json(path: Path) -> dict[str, Any]:
+    Raises:
+        FileNotFoundError: there is no such file.
+    """
     if not path.is_file():
         raise FileNotFoundError(f"There is no {path.name} in {path.parent}.")
     return json.loads(path.read_text())

@@ -9,8 +9,8 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 
 from lerobot_policy_openvla.action_statistics import choose_statistics
+from lerobot_policy_openvla.architecture import ATTENTION
 from lerobot_policy_openvla.checkpoint import fetch, read_checkpoint, tuned_statistics
-from lerobot_policy_openvla.network import ATTENTION
 
 Dtype = Literal["auto", "bfloat16", "float32"]
 Quantization = Literal["none", "int8", "nf4"]

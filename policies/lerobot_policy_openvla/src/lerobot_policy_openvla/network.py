@@ -15,8 +15,6 @@ from transformers import LlamaConfig, LlamaForCausalLM
 
 from lerobot_policy_openvla.architecture import Architecture
 
-ATTENTION = ("sdpa", "eager", "flash_attention_2")
-
 
 def depth_of(tower: Any) -> int:
     """Blocks of a timm vision transformer."""
