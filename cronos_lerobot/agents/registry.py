@@ -37,8 +37,6 @@ class AgentContext:
     checkpoint holds them and continues them."""
     torch_rng: Callable[[str], torch.Generator]
     """Returns the torch generator of a name, on the policy's device, in the same way."""
-    num_updates: int | None = None
-    """Of the whole run, for what changes over it; None if that is not known."""
     observation_shapes: dict[str, tuple[int, ...]] = field(default_factory=dict)
     """Of what the environment shows, without the batch, by LeRobot's names; none if they are not known."""
     processes: Processes = field(default_factory=Processes)

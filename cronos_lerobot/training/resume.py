@@ -38,7 +38,7 @@ _TABLE = {
         FOLLOWED: "epochs value_epochs value_warmup_updates minibatch_size grad_accumulation clip ratio "
         "denoising_discount gamma "
         "gae_lambda normalize_advantage entropy_coef value_coef value_loss huber_delta value_clip policy_lr "
-        "value_lr lr_schedule target_kl target_kl_end kl_stop_factor lr_factor policy_lr_min policy_lr_max "
+        "value_lr lr_schedule target_kl kl_decay_updates kl_stop_factor lr_factor policy_lr_min policy_lr_max "
         "max_grad_norm "
         "self_imitation.coef self_imitation.batch_size self_imitation.max_age self_imitation.tail_steps "
         "self_imitation.memory_gib "

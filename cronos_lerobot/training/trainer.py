@@ -111,7 +111,6 @@ class Trainer:
                 task_switch_interval=self.config.protocol.task_switch_interval,
                 rng=lambda name: self.generators.for_numpy(own(name)),
                 torch_rng=lambda name: self.generators.for_torch(own(name)),
-                num_updates=self.config.total_steps // self.config.steps_per_update,
                 observation_shapes=_shapes(self.config.env),
                 processes=self.processes,
                 stopwatch=self.stopwatch,

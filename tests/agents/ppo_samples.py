@@ -11,11 +11,10 @@ from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
 from cronos_lerobot.agents.processing import PolicyProcessors
 
 
-def make_ppo(seed=0, policy=None, num_updates=None, **options):
+def make_ppo(seed=0, policy=None, **options):
     options = {"minibatch_size": 64, "value_warmup_updates": 0} | options
     policy = policy or DummyPolicy(seed=seed)
-    processors, rng = PolicyProcessors(*identity_processors()), np.random.default_rng(seed)
-    return PPO(policy, processors, PPOConfig(**options), rng, num_updates=num_updates)
+    return PPO(policy, PolicyProcessors(*identity_processors()), PPOConfig(**options), np.random.default_rng(seed))
 
 
 def rollout(ppo, reward, rows=16, streams=8):

@@ -17,23 +17,21 @@ def test_adaptive_learning_rate():
     assert adapted_lr(2e-4, 0.01, 0.04, config) == 3e-4
 
 
-def test_target_kl_falls_in_equal_ratios_over_the_run():
-    config = PPOConfig(target_kl=0.08, target_kl_end=0.01)
-    assert [target_kl(config, update, 4) for update in range(4)] == pytest.approx([0.08, 0.04, 0.02, 0.01])
-    assert target_kl(config, 7, 4) == pytest.approx(0.01)
-    assert target_kl(config, 0, 1) == target_kl(config, 3, None) == 0.08
-    assert target_kl(PPOConfig(target_kl=0.08), 3, 4) == 0.08
-    with pytest.raises(ValueError, match=r"target_kl_end=0.01 needs algorithm.target_kl"):
-        PPOConfig(target_kl=None, lr_schedule="fixed", target_kl_end=0.01)
+def test_target_kl_halves_after_so_many_updates():
+    config = PPOConfig(target_kl=0.08, kl_decay_updates=4)
+    assert [target_kl(config, updates) for updates in (0, 1, 4, 12)] == pytest.approx([0.08, 0.064, 0.04, 0.02])
+    assert target_kl(PPOConfig(target_kl=0.08), 12) == 0.08
+    with pytest.raises(ValueError, match=r"kl_decay_updates=4 needs algorithm.target_kl"):
+        PPOConfig(target_kl=None, lr_schedule="fixed", kl_decay_updates=4)
 
 
 def test_a_smaller_target_stops_an_update_sooner():
     options = {"epochs": 20, "policy_lr": 1e-2, "policy_lr_max": 1.0, "kl_stop_factor": 1.0, "target_kl": 0.1}
-    steady, falling = (make_ppo(target_kl_end=end, num_updates=2, **options) for end in (None, 1e-4))
     epochs = []
-    for ppo in steady, falling:
+    for decay, second_target in (None, 0.1), (0.001, 0.1 / 1001):
+        ppo = make_ppo(kl_decay_updates=decay, **options)
         first, second = (ppo.update(rollout(ppo, reward_for_up)) for _ in range(2))
-        assert [first["target_kl"], second["target_kl"]] == pytest.approx([0.1, ppo.config.target_kl_end or 0.1])
+        assert [first["target_kl"], second["target_kl"]] == pytest.approx([0.1, second_target])
         epochs.append((first["policy_epochs"], second["policy_epochs"]))
     assert epochs[0][0] == epochs[1][0]
     assert epochs[0][1] > epochs[1][1]

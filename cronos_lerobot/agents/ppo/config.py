@@ -57,7 +57,7 @@ RANGES = {
     "policy_lr": FROM_0,
     "value_lr": FROM_0,
     "target_kl": ABOVE_0,
-    "target_kl_end": ABOVE_0,
+    "kl_decay_updates": ABOVE_0,
     "kl_stop_factor": ABOVE_0,
     "lr_factor": Interval(1),
     "policy_lr_min": FROM_0,
@@ -158,9 +158,9 @@ class PPOConfig(RLAlgorithmConfig):
     update to keep the KL divergence of an update near target_kl."""
     target_kl: float | None = 0.05
     """KL divergence [nats] between the policies before and after an update that is aimed at; null if none."""
-    target_kl_end: float | None = None
-    """The target of the run's last update: every update has the same share of the one before it. null stays at
-    target_kl."""
+    kl_decay_updates: float | None = None
+    """Updates after which the target has halved: it is target_kl / (1 + updates / kl_decay_updates), for steps
+    along a noisy gradient must become shorter to settle (Robbins and Monro, 1951). null keeps target_kl."""
     kl_stop_factor: float | None = 2.0
     """The policy's training in an update stops once a step sees a KL above this times target_kl, and an adaptive
     learning rate falls; null never stops it."""
@@ -225,8 +225,8 @@ class PPOConfig(RLAlgorithmConfig):
             )
         if self.target_kl is None and self.lr_schedule != "fixed":
             raise ValueError(f"algorithm.lr_schedule={self.lr_schedule} needs algorithm.target_kl.")
-        if self.target_kl is None and self.target_kl_end is not None:
-            raise ValueError(f"algorithm.target_kl_end={self.target_kl_end} needs algorithm.target_kl.")
+        if self.target_kl is None and self.kl_decay_updates is not None:
+            raise ValueError(f"algorithm.kl_decay_updates={self.kl_decay_updates} needs algorithm.target_kl.")
         if self.policy_lr_min > self.policy_lr_max:
             raise ValueError(
                 f"algorithm.policy_lr_min must be at most policy_lr_max={self.policy_lr_max}, got "

@@ -39,7 +39,7 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
     mine = context.streams
     # Every process draws its own minibatches and actions.
     rng, cloned = context.rng("minibatches"), _self_imitation(context)
-    ppo = PPO(policy, context.processors, config, rng, context.processes, cloned, context.num_updates)
+    ppo = PPO(policy, context.processors, config, rng, context.processes, cloned)
     steps = decision_steps(policy, context.task_switch_interval)
     buffer = RolloutBuffer(context.update_interval // steps, mine.stop - mine.start)
     return PPOAgent(ppo, buffer, context.torch_rng("actions"), context.stopwatch, mine)

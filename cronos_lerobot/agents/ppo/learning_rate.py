@@ -10,21 +10,11 @@ from torch.optim import Optimizer
 from cronos_lerobot.agents.ppo.config import PPOConfig
 
 
-def target_kl(config: PPOConfig, update: int, num_updates: int | None) -> float | None:
-    """Return the KL divergence [nats] that an update aims at, or None.
-
-    From `target_kl` to `target_kl_end` in equal ratios.
-
-    Args:
-        config: see PPOConfig.
-        update: number of updates before it.
-        num_updates: of the whole run; those beyond it stay at the end. Without it the target does not change.
-    """
-    first, last = config.target_kl, config.target_kl_end
-    if first is None or last is None or num_updates is None:
-        return first
-    share = min(update / max(num_updates - 1, 1), 1.0)
-    return first * (last / first) ** share
+def target_kl(config: PPOConfig, updates: int) -> float | None:
+    """Return the KL divergence [nats] that the update after `updates` others aims at, or None; see PPOConfig."""
+    if config.target_kl is None or config.kl_decay_updates is None:
+        return config.target_kl
+    return config.target_kl / (1 + updates / config.kl_decay_updates)
 
 
 def adapted_lr(lr: float, kl: float, target: float, config: PPOConfig) -> float:

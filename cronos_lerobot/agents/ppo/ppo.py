@@ -64,7 +64,6 @@ class PPO:
         processes: each learns from its own rollout, in minibatches of its own; they take every optimizer step
             together, with the mean of their gradients. Their rollouts have the same size.
         self_imitation: what is cloned in each optimizer step that trains the policy.
-        num_updates: of the whole run, for what changes over it; None if that is not known.
 
     Raises:
         TypeError: the policy is not trainable.
@@ -79,7 +78,6 @@ class PPO:
         rng: np.random.Generator,
         processes: Processes | None = None,
         self_imitation: SelfImitation | None = None,
-        num_updates: int | None = None,
     ) -> None:
         check_trainable(policy)
         self.policy = policy
@@ -88,7 +86,6 @@ class PPO:
         self.rng = rng
         self.processes = processes or Processes()
         self.num_updates = 0
-        self._planned_updates = num_updates
         lrs = {"policy": config.policy_lr, "value": config.value_lr}
         self._max_norms = {"policy": config.max_grad_norm, "value": config.value_max_grad_norm}
         self._params: dict[str, list[Tensor]] = {"policy": [], "value": []}
@@ -141,7 +138,7 @@ class PPO:
     @property
     def target_kl(self) -> float | None:
         """The KL divergence [nats] that the next update aims at."""
-        return target_kl(self.config, self.num_updates, self._planned_updates)
+        return target_kl(self.config, self.num_updates)
 
     @property
     def policy_lr(self) -> float:
