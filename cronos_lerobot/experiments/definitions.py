@@ -35,8 +35,11 @@ class Row:
     """heuristic or random."""
     num_configurations: int = 64
     """Training configurations, 64 or 1."""
+    stages: tuple[tuple[int, int], ...] = ()
+    """Another curriculum: up to how many steps of a run with the paper's steps, and T until then; scaled as the
+    steps."""
     tag: str = ""
-    """What else tells the row from the others, one word; needed with `flags`."""
+    """What else tells the row from the others, one word; needed with `stages` and `flags`."""
     flags: tuple[str, ...] = ()
     """More flags of `cronos-train`."""
     budgets: tuple[tuple[str, int], ...] = ()

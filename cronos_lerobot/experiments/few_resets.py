@@ -22,6 +22,8 @@ INTERVAL = 1280
 """T of the rows with few resets: a sixteenth of the resets of T = 80."""
 BUDGET = 1016
 """B, a sixteenth of those of T = 80 in 1.3 M steps; staggered resets every 1280 steps spend as many."""
+EARLY, EARLY_RESETS = 320, 960
+"""T as long as `early` resets at all, as in the paper's curriculum, and resets of all streams by then."""
 
 
 @dataclass(frozen=True)
@@ -34,17 +36,21 @@ class Plug:
     """Flags that are numbers of interventions in a run of the paper's steps."""
     interval: int | None = INTERVAL
     """T beside it; None where it spends the budget itself."""
+    stages: tuple[tuple[int, int], ...] = ()
+    """See `Row`."""
 
 
 PLUGS: dict[str, Plug] = {
     "critic": Plug(("--protocol.task_order=critic",)),
     "staggered": Plug(("--protocol.reset_phase=staggered",)),
     "asked": Plug(("--protocol.scene_reset=critic",), (("--protocol.reset_budget", BUDGET),), interval=None),
+    "early": Plug((), interval=None, stages=((EARLY_RESETS * EARLY, EARLY),)),
+    "decay": Plug(("--algorithm.kl_decay_updates=10",)),
     "memory": Plug(("--algorithm.self_imitation.coef=0.05",)),
     "takeover": Plug(("--protocol.takeover_after=2",), (("--protocol.takeover_budget", BUDGET),), interval=None),
 }
 """By the names that rows have."""
-TOGETHER = ("critic", "staggered")
+TOGETHER = ("staggered", "early", "decay")
 """The plugs of the row that has the best of them."""
 
 
@@ -54,6 +60,7 @@ def plugged(*names: str, interval: int | None = INTERVAL) -> Row:
     return Row(
         interval if all(plug.interval for plug in plugs) else None,
         end_effector_reset=True,
+        stages=tuple(stage for plug in plugs for stage in plug.stages),
         tag="_".join(names),
         flags=tuple(flag for plug in plugs for flag in plug.flags),
         budgets=tuple(budget for plug in plugs for budget in plug.budgets),
@@ -80,13 +87,16 @@ AIDS = (
 METHOD = plugged(*TOGETHER)
 TAUGHT = plugged("takeover", "memory")
 """An expert's segments are cloned only where successes are kept."""
-SCREENED = (*AIDS, *(plugged(name) for name in PLUGS), TAUGHT, METHOD)
+TUNED = Row(80, tag="decay", flags=PLUGS["decay"].flags)
+"""What settles the policy of few resets may settle that of T = 80."""
+SCREENED = (*AIDS, *(plugged(name) for name in PLUGS), TAUGHT, plugged("critic", "staggered"), METHOD, TUNED)
 
 METHOD_BY_BUDGET = (
-    *(plugged(*TOGETHER, interval=interval) for interval in (1280, 5120, 20480)),
-    plugged("critic", interval=None),
+    METHOD,
+    *(replace(METHOD, stages=((n * EARLY, EARLY),), tag=f"{METHOD.tag}_{n}") for n in (240, 64)),
+    plugged("decay", interval=None),
 )
-"""Staggered in 1.3 M steps of 64 streams these are 1,016, 254 and 63 resets, and none."""
+"""With 960, 240, 64 resets and none."""
 PAPER_BY_BUDGET = tuple(
     Row(interval, end_effector_reset=True, heuristic_reset=True) for interval in (1280, 5120, 10240, None)
 )
@@ -112,7 +122,7 @@ for _experiment in (
     Experiment(
         "few_resets_best",
         "Learning with few resets, evaluated in full",
-        tuple(map(wide, (EPISODIC, PLAIN, BEST, METHOD))),
+        tuple(map(wide, (EPISODIC, TUNED, PLAIN, BEST, METHOD))),
         splits=BOTH,
         evaluations=(CheckpointEvaluation("independent", ("held_out",)), CheckpointEvaluation("sequential", BOTH)),
         budgets=_BUDGETS,
@@ -121,10 +131,10 @@ for _experiment in (
     Experiment(
         "few_resets_budgets",
         "Success against the budget of interventions",
-        (wide(EPISODIC), wide(BEST), *_BY_BUDGET[0], *_BY_BUDGET[1]),
+        (wide(EPISODIC), wide(TUNED), wide(BEST), *_BY_BUDGET[0], *_BY_BUDGET[1]),
         budgets=(64, 254, 1000),
         by_base=True,
-        joined=(("critic + staggered", _names(_BY_BUDGET[0])), ("EER, HSR", _names(_BY_BUDGET[1]))),
+        joined=(("staggered + early + decay", _names(_BY_BUDGET[0])), ("EER, HSR", _names(_BY_BUDGET[1]))),
     ),
     *(
         Experiment(

@@ -89,9 +89,10 @@ def train_flags(spec: RunSpec) -> list[str]:
         f"--protocol.end_effector_reset={str(row.end_effector_reset).lower()}",
         f"--protocol.task_order={row.task_order}",
     ]
-    if row.curriculum:
-        until = scale.steps[spec.paper_steps] // 2
-        flags.append(f"--protocol.curriculum={json.dumps([[until, CURRICULUM_INTERVAL]])}")
+    stages = [(spec.paper_steps // 2, CURRICULUM_INTERVAL)] if row.curriculum else row.stages
+    if stages:
+        curriculum = [[spec.scaled(until), interval] for until, interval in stages]
+        flags.append(f"--protocol.curriculum={json.dumps(curriculum)}")
     for name in ("learned_reset", "heuristic_reset"):
         if getattr(row, name):
             flags.append(f"--protocol.{name}=true")

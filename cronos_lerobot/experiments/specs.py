@@ -60,9 +60,9 @@ class RunSpec:
         wanted = map(self.scaled, PAPER_BUDGETS.get(self.paper_steps, ()))
         return sorted({budget for budget in wanted if budget})
 
-    def scaled(self, interventions: int) -> int:
-        """A number of interventions in a run of the paper's steps, in this one."""
-        return interventions * self.options.scale.steps[self.paper_steps] // self.paper_steps
+    def scaled(self, number: int) -> int:
+        """A number of steps or interventions in a run of the paper's steps, in this one."""
+        return number * self.options.scale.steps[self.paper_steps] // self.paper_steps
 
     @property
     def base(self) -> Base:

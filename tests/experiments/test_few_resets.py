@@ -53,8 +53,9 @@ def test_each_plug_stands_alone_and_together_on_both_bases():
     assert len(set(names)) == len(names)
     narrow = [name for name in names if "wide" not in name]
     assert narrow[:5] == ["t80", "t1280_eer", "t1280_eer_cl", "t1280_eer_cl_lsr", "t1280_eer_cl_hsr"]
-    assert [name.split("_")[-1] for name in narrow[5:-2]] == list(PLUGS)
-    assert narrow[-2:] == ["tnone_eer_takeover_memory", "t1280_eer_critic_staggered"]
+    assert [name.split("_")[-1] for name in narrow[5:-4]] == list(PLUGS)
+    assert narrow[-4:-2] == ["tnone_eer_takeover_memory", "t1280_eer_critic_staggered"]
+    assert narrow[-2:] == ["tnone_eer_staggered_early_decay", "t80_decay"]
     wides = [f"{name}_wide_resets" if "lsr" in name else f"{name}_wide" for name in narrow]
     assert names == narrow + wides
     # The narrow rows of the paper are Table 1's own runs.
@@ -74,10 +75,14 @@ def test_commands(tmp_path):
     }
     assert wanted < set(jobs[f"{base}/demos"].command)
     assert "--reset_tasks=true" in jobs[f"{base.replace('widedemos', 'wide_resetsdemos')}/demos"].command
-    run = jobs["kitchen_2x2_state_small/t1280_eer_critic_staggered_wide_307k/seed1"]
+    run = jobs["kitchen_2x2_state_small/tnone_eer_staggered_early_decay_wide_307k/seed1"]
     assert run.needs == (f"{base}/clone",)
-    assert {"--protocol.task_order=critic", "--protocol.reset_phase=staggered"} < set(run.command)
-    assert sum(flag.startswith("--protocol.task_order") for flag in run.command) == 1
+    # 960 x 320 x 307,200 / 1,300,000
+    early = {"--protocol.curriculum=[[72593, 320]]", "--protocol.scene_reset_interval=null"}
+    assert early | {"--protocol.reset_phase=staggered", "--algorithm.kl_decay_updates=10"} < set(run.command)
+    critic = jobs["kitchen_2x2_state_small/t1280_eer_critic_wide_307k/seed1"].command
+    assert "--protocol.task_order=critic" in critic
+    assert sum(flag.startswith("--protocol.task_order") for flag in critic) == 1
     asked = jobs["kitchen_2x2_state_small/tnone_eer_asked_307k/seed1"].command
     # 1,016 x 307,200 / 1,300,000
     assert {"--protocol.scene_reset_interval=null", "--protocol.reset_budget=240"} < set(asked)
@@ -157,13 +162,13 @@ def test_rows_of_the_paper_are_grey_and_the_same_on_both_bases(drawn):
 
 def test_ends_are_joined_by_budget(tmp_path):
     options = options_of("few_resets_budgets", tmp_path / "root")
-    for row, wins in (("t1280_eer_critic_staggered_wide", 7), ("t5120_eer_critic_staggered_wide", 5)):
-        make_run(options, "few_resets_budgets", row, 1, (2, 4, wins))
+    for end, wins, interval in (("", 7, 320), ("_240", 5, 1280)):
+        row = f"tnone_eer_staggered_early_decay{end}_wide"
+        make_run(options, "few_resets_budgets", row, 1, (2, 4, wins), interval=interval)
     experiment = EXPERIMENTS["few_resets_budgets"]
     (ax, _) = interventions_figure(collect(experiment, experiment.rows, options)).axes
-    (line,) = [line for line in ax.lines if line.get_label() == "critic + staggered, by budget"]
-    # Made-up runs of T = 5120 have no reset in 1280 steps of each stream.
-    np.testing.assert_allclose(line.get_xdata(), [0, 8])
+    (line,) = [line for line in ax.lines if line.get_label() == "staggered + early + decay, by budget"]
+    np.testing.assert_allclose(line.get_xdata(), [8, 32])
     np.testing.assert_allclose(line.get_ydata(), [5 / 8, 7 / 8])
 
 
