@@ -50,7 +50,7 @@ PLUGS: dict[str, Plug] = {
     "takeover": Plug(("--protocol.takeover_after=2",), (("--protocol.takeover_budget", BUDGET),), interval=None),
 }
 """By the names that rows have."""
-TOGETHER = ("staggered", "early", "decay")
+TOGETHER = ("staggered", "decay")
 """The plugs of the row that has the best of them."""
 
 
@@ -89,14 +89,14 @@ TAUGHT = plugged("takeover", "memory")
 """An expert's segments are cloned only where successes are kept."""
 TUNED = Row(80, tag="decay", flags=PLUGS["decay"].flags)
 """What settles the policy of few resets may settle that of T = 80."""
-SCREENED = (*AIDS, *(plugged(name) for name in PLUGS), TAUGHT, plugged("critic", "staggered"), METHOD, TUNED)
+PAIRS = (TAUGHT, plugged("critic", "staggered"), plugged("staggered", "early", "decay"))
+SCREENED = (*AIDS, *(plugged(name) for name in PLUGS), *PAIRS, METHOD, TUNED)
 
 METHOD_BY_BUDGET = (
-    METHOD,
-    *(replace(METHOD, stages=((n * EARLY, EARLY),), tag=f"{METHOD.tag}_{n}") for n in (240, 64)),
+    *(plugged(*TOGETHER, interval=interval) for interval in (1280, 5120, 20480)),
     plugged("decay", interval=None),
 )
-"""With 960, 240, 64 resets and none."""
+"""Staggered in 1.3 M steps of 64 streams these are 1,016, 254 and 63 resets, and none."""
 PAPER_BY_BUDGET = tuple(
     Row(interval, end_effector_reset=True, heuristic_reset=True) for interval in (1280, 5120, 10240, None)
 )
@@ -134,7 +134,7 @@ for _experiment in (
         (wide(EPISODIC), wide(TUNED), wide(BEST), *_BY_BUDGET[0], *_BY_BUDGET[1]),
         budgets=(64, 254, 1000),
         by_base=True,
-        joined=(("staggered + early + decay", _names(_BY_BUDGET[0])), ("EER, HSR", _names(_BY_BUDGET[1]))),
+        joined=(("staggered + decay", _names(_BY_BUDGET[0])), ("EER, HSR", _names(_BY_BUDGET[1]))),
     ),
     *(
         Experiment(

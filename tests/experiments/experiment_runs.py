@@ -17,12 +17,13 @@ RESETS = {80: 128, 320: 32, 1280: 8}
 """Scene resets of 8 streams in 1280 steps each."""
 
 
-def make_run(options, name, row, seed, successes, status="done", updates=8, interval=None):
+def make_run(options, name, row, seed, successes, status="done", updates=8):
     """A run whose evaluations had so many successes of 8, in each of the four tasks."""
     specs = run_specs(EXPERIMENTS[name], options)
     (spec,) = [s for s in specs if (s.row.name, s.seed) == (row, seed)]
-    interval = interval or spec.row.interval
-    write_training_run(spec.train_folder, seed=seed, interval=interval, successes=successes, updates=updates)
+    write_training_run(
+        spec.train_folder, seed=seed, interval=spec.row.interval, successes=successes, updates=updates
+    )
     job = train_job(spec, None)
     record = {"command": list(job.command), "status": status, "seconds": 1.0, "starts": 1}
     write_record(job, record | {"made_by": made_by(job)})

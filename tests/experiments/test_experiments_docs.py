@@ -64,4 +64,11 @@ def test_every_flag_is_there():
 
 def test_plugs():
     words = [row[0] for row in table_rows("word in a row's name")]
-    assert words == [*PLUGS, "takeover_memory", "critic_staggered", "_".join(TOGETHER), "wide"]
+    assert words == [
+        *PLUGS,
+        "takeover_memory",
+        "critic_staggered",
+        "staggered_early_decay",
+        "_".join(TOGETHER),
+        "wide",
+    ]
