@@ -22,8 +22,8 @@ INTERVAL = 1280
 """T of the rows with few resets: a sixteenth of the resets of T = 80."""
 BUDGET = 1016
 """B, a sixteenth of those of T = 80 in 1.3 M steps; staggered resets every 1280 steps spend as many."""
-EARLY, EARLY_RESETS = 320, 960
-"""T as long as `early` resets at all, as in the paper's curriculum, and resets of all streams by then."""
+EARLY, EARLY_RESETS, LATE = 320, 768, 5120
+"""Of `early`: T at first, as in the paper's curriculum; resets of all streams by then; T after them."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Plug:
     budgets: tuple[tuple[str, int], ...] = ()
     """Flags that are numbers of interventions in a run of the paper's steps."""
     interval: int | None = INTERVAL
-    """T beside it; None where it spends the budget itself."""
+    """T beside it, if that of no other plug is longer; None where it spends the budget itself."""
     stages: tuple[tuple[int, int], ...] = ()
     """See `Row`."""
 
@@ -44,21 +44,22 @@ PLUGS: dict[str, Plug] = {
     "critic": Plug(("--protocol.task_order=critic",)),
     "staggered": Plug(("--protocol.reset_phase=staggered",)),
     "asked": Plug(("--protocol.scene_reset=critic",), (("--protocol.reset_budget", BUDGET),), interval=None),
-    "early": Plug((), interval=None, stages=((EARLY_RESETS * EARLY, EARLY),)),
+    "early": Plug((), interval=LATE, stages=((EARLY_RESETS * EARLY, EARLY),)),
     "decay": Plug(("--algorithm.kl_decay_updates=10",)),
     "memory": Plug(("--algorithm.self_imitation.coef=0.05",)),
     "takeover": Plug(("--protocol.takeover_after=2",), (("--protocol.takeover_budget", BUDGET),), interval=None),
 }
 """By the names that rows have."""
-TOGETHER = ("staggered", "decay")
+TOGETHER = ("staggered", "early", "decay")
 """The plugs of the row that has the best of them."""
 
 
-def plugged(*names: str, interval: int | None = INTERVAL) -> Row:
-    """The row with these plugs, end-effector resets and T = `interval`, or none where a plug spends the budget."""
+def plugged(*names: str, interval: int | None = None) -> Row:
+    """The row with these plugs, end-effector resets and T: `interval`, the plugs' own, or none beside a budget."""
     plugs = [PLUGS[name] for name in names]
+    intervals = [plug.interval for plug in plugs if plug.interval]
     return Row(
-        interval if all(plug.interval for plug in plugs) else None,
+        interval or max(intervals) if len(intervals) == len(plugs) else None,
         end_effector_reset=True,
         stages=tuple(stage for plug in plugs for stage in plug.stages),
         tag="_".join(names),
@@ -89,14 +90,16 @@ TAUGHT = plugged("takeover", "memory")
 """An expert's segments are cloned only where successes are kept."""
 TUNED = Row(80, tag="decay", flags=PLUGS["decay"].flags)
 """What settles the policy of few resets may settle that of T = 80."""
-PAIRS = (TAUGHT, plugged("critic", "staggered"), plugged("staggered", "early", "decay"))
+PAIRS = (TAUGHT, plugged("critic", "staggered"), plugged("staggered", "decay"))
 SCREENED = (*AIDS, *(plugged(name) for name in PLUGS), *PAIRS, METHOD, TUNED)
 
 METHOD_BY_BUDGET = (
-    *(plugged(*TOGETHER, interval=interval) for interval in (1280, 5120, 20480)),
-    plugged("decay", interval=None),
+    METHOD,
+    replace(METHOD, interval=4 * LATE, stages=((EARLY_RESETS // 4 * EARLY, EARLY),)),
+    plugged("staggered", "decay", interval=4 * LATE),
+    replace(plugged("decay"), interval=None),
 )
-"""Staggered in 1.3 M steps of 64 streams these are 1,016, 254 and 63 resets, and none."""
+"""In 1.3 M steps of 64 streams these are 970, 252 and 63 resets, and none."""
 PAPER_BY_BUDGET = tuple(
     Row(interval, end_effector_reset=True, heuristic_reset=True) for interval in (1280, 5120, 10240, None)
 )
@@ -134,7 +137,7 @@ for _experiment in (
         (wide(EPISODIC), wide(TUNED), wide(BEST), *_BY_BUDGET[0], *_BY_BUDGET[1]),
         budgets=(64, 254, 1000),
         by_base=True,
-        joined=(("staggered + decay", _names(_BY_BUDGET[0])), ("EER, HSR", _names(_BY_BUDGET[1]))),
+        joined=((" + ".join(TOGETHER), _names(_BY_BUDGET[0])), ("EER, HSR", _names(_BY_BUDGET[1]))),
     ),
     *(
         Experiment(

@@ -68,7 +68,7 @@ def test_plugs():
         *PLUGS,
         "takeover_memory",
         "critic_staggered",
-        "staggered_early_decay",
+        "staggered_decay",
         "_".join(TOGETHER),
         "wide",
     ]

@@ -1,9 +1,9 @@
 """The experiments of few resets: what their rows do, and the figure of success against interventions."""
 
-import draccus
 import numpy as np
 import pytest
 from experiment_runs import TINY, make_run
+from flags import parse_flags
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base
 from cronos_lerobot.experiments.few_resets import PLUGS, plugged, wide
@@ -45,7 +45,7 @@ def test_every_run_is_one_that_cronos_train_takes(tmp_path):
         # Rows that differ in their base policy alone, or that experiments share, are parsed once.
         commands |= {tuple(flag for flag in job.command[1:] if not flag.startswith(FOLDERS)) for job in runs}
     for flags in commands:
-        draccus.parse(CronosTrainConfig, args=[*flags, f"--output_dir={tmp_path / 'run'}"])
+        parse_flags(CronosTrainConfig, [*flags, f"--output_dir={tmp_path / 'run'}"])
 
 
 def test_each_plug_stands_alone_and_together_on_both_bases():
@@ -55,8 +55,8 @@ def test_each_plug_stands_alone_and_together_on_both_bases():
     assert narrow[:5] == ["t80", "t1280_eer", "t1280_eer_cl", "t1280_eer_cl_lsr", "t1280_eer_cl_hsr"]
     assert [name.split("_")[-1] for name in narrow[5:-5]] == list(PLUGS)
     assert narrow[-5:] == [
-        "tnone_eer_takeover_memory", "t1280_eer_critic_staggered", "tnone_eer_staggered_early_decay",
-        "t1280_eer_staggered_decay", "t80_decay",
+        "tnone_eer_takeover_memory", "t1280_eer_critic_staggered", "t1280_eer_staggered_decay",
+        "t5120_eer_staggered_early_decay", "t80_decay",
     ]  # fmt: skip
     wides = [f"{name}_wide_resets" if "lsr" in name else f"{name}_wide" for name in narrow]
     assert names == narrow + wides
@@ -77,10 +77,10 @@ def test_commands(tmp_path):
     }
     assert wanted < set(jobs[f"{base}/demos"].command)
     assert "--reset_tasks=true" in jobs[f"{base.replace('widedemos', 'wide_resetsdemos')}/demos"].command
-    run = jobs["kitchen_2x2_state_small/tnone_eer_staggered_early_decay_wide_307k/seed1"]
+    run = jobs["kitchen_2x2_state_small/t5120_eer_staggered_early_decay_wide_307k/seed1"]
     assert run.needs == (f"{base}/clone",)
-    # 960 x 320 x 307,200 / 1,300,000
-    early = {"--protocol.curriculum=[[72593, 320]]", "--protocol.scene_reset_interval=null"}
+    # 768 x 320 x 307,200 / 1,300,000
+    early = {"--protocol.curriculum=[[58074, 320]]", "--protocol.scene_reset_interval=5120"}
     assert early | {"--protocol.reset_phase=staggered", "--algorithm.kl_decay_updates=10"} < set(run.command)
     critic = jobs["kitchen_2x2_state_small/t1280_eer_critic_wide_307k/seed1"].command
     assert "--protocol.task_order=critic" in critic
@@ -95,6 +95,7 @@ def test_commands(tmp_path):
 def test_budgets_of_a_plug_need_no_interval_and_one_cannot_have_one():
     assert plugged("asked", interval=1280).interval is None
     assert plugged("critic", interval=5120).interval == 5120
+    assert plugged("staggered", "early").interval == 5120
     assert wide(plugged("critic")).name == "t1280_eer_critic_wide"
 
 
@@ -165,11 +166,11 @@ def test_rows_of_the_paper_are_grey_and_the_same_on_both_bases(drawn):
 def test_ends_are_joined_by_budget(tmp_path):
     options = options_of("few_resets_budgets", tmp_path / "root")
     for interval, wins in ((1280, 7), (5120, 5)):
-        row = f"t{interval}_eer_staggered_decay_wide"
+        row = f"t{interval}_eer_hsr_wide"
         make_run(options, "few_resets_budgets", row, 1, (2, 4, wins))
     experiment = EXPERIMENTS["few_resets_budgets"]
     (ax, _) = interventions_figure(collect(experiment, experiment.rows, options)).axes
-    (line,) = [line for line in ax.lines if line.get_label() == "staggered + decay, by budget"]
+    (line,) = [line for line in ax.lines if line.get_label() == "EER, HSR, by budget"]
     # Made-up runs of T = 5120 have no reset in 1280 steps of each stream.
     np.testing.assert_allclose(line.get_xdata(), [0, 8])
     np.testing.assert_allclose(line.get_ydata(), [5 / 8, 7 / 8])

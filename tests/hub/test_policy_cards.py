@@ -8,6 +8,7 @@ import draccus
 import numpy as np
 import pytest
 import yaml
+from flags import parse_flags
 from lerobot.configs.types import PolicyFeature
 from lerobot_env_cronos.config import CronosEnvConfig
 from safetensors.numpy import save_file
@@ -72,7 +73,7 @@ def commands(card):
 
 def shown_by(flags):
     """What the environment of these flags shows, as LeRobot's parser reads them."""
-    return features_of(draccus.parse(CronosEnvConfig, args=[f"--{f}" for f in flags if not f.startswith("type=")]))
+    return features_of(parse_flags(CronosEnvConfig, [f"--{f}" for f in flags if not f.startswith("type=")]))
 
 
 ADAPTER = {

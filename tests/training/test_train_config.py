@@ -1,8 +1,8 @@
 import sys
 
-import draccus
 import pytest
 from dummies import DummyPolicyConfig
+from flags import parse_flags
 from lerobot_env_cronos import CronosEnvConfig
 
 from cronos_lerobot.agents.ppo.config import PaperPPOConfig, PPOConfig
@@ -11,7 +11,7 @@ from cronos_lerobot.training.config import CronosTrainConfig
 
 
 def parse(*arguments):
-    return draccus.parse(CronosTrainConfig, args=list(arguments))
+    return parse_flags(CronosTrainConfig, arguments)
 
 
 def test_flags_of_the_protocol_and_the_algorithm():
