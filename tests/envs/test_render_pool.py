@@ -68,6 +68,16 @@ def test_a_killed_process_is_an_error_and_not_a_wait(simulation, pool):
         pool.render(simulation.qpos)
 
 
+def test_it_closes_over_a_request_that_a_killed_process_never_read(pool):
+    process = pool._processes[1]
+    process.kill()
+    process.wait()
+    process.stdin.write(b"a request")
+    pool.close()
+    assert process.stdin.closed
+    assert all(other.returncode is not None for other in pool._processes)
+
+
 def test_a_process_that_cannot_draw_says_why(simulation, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "no such platform")
     model = simulation.render_model

@@ -6,6 +6,7 @@ two threads of a process ask. Two processes on two cores draw twice as much.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -106,7 +107,8 @@ def _stop(processes: list[subprocess.Popen], errors: IO[bytes], opened_by: int) 
         assert process.stdin is not None
         assert process.stdout is not None
         process.kill()
-        process.stdin.close()
+        with contextlib.suppress(BrokenPipeError):  # A request that was never read is flushed here.
+            process.stdin.close()
         process.stdout.close()
         process.wait()
     errors.close()
