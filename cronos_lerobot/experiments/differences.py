@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
 
-from cronos_lerobot.evaluation.outcomes import Outcomes
+from cronos_lerobot.evaluation.outcomes import Outcomes, read_outcomes
 from cronos_lerobot.experiments.results import ExperimentResult, RowResult
 from cronos_lerobot.report.compared_sides import Side, last_evaluation
 from cronos_lerobot.report.paired import Difference
@@ -38,12 +38,19 @@ class RowDifference:
 
 def compare_rows(result: ExperimentResult) -> list[RowDifference]:
     """Every two finished rows that were evaluated on the same episodes, the later against the earlier one."""
-    finished = [(row, outcomes) for row in result.rows if (outcomes := _outcomes(row))]
-    return [
-        _compare(*reference, *row)
-        for reference, row in combinations(finished, 2)
-        if len({frozenset(one.lengths) for one in (*reference[1], *row[1])}) == 1
-    ]
+    finished = [row for row in result.rows if row.finished]
+    found = (compare(row, reference) for reference, row in combinations(finished, 2))
+    return [one for one in found if one]
+
+
+def compare(
+    row: RowResult, reference: RowResult, suite: str = "independent", split: str = "train"
+) -> RowDifference | None:
+    """A row against another at the end of their runs; None unless all of them ran the same episodes."""
+    sides = [_outcomes(one, suite, split) for one in (reference, row)]
+    if not all(sides) or len({frozenset(one.lengths) for side in sides for one in side}) > 1:
+        return None
+    return _compare(reference, sides[0], row, sides[1])
 
 
 def to_first(result: ExperimentResult, found: Sequence[RowDifference]) -> list[RowDifference]:
@@ -61,10 +68,13 @@ def _compare(reference: RowResult, before: list[Outcomes], row: RowResult, after
     return RowDifference(row, reference, difference, seeds, first.pairs)
 
 
-def _outcomes(row: RowResult) -> list[Outcomes]:
+def _outcomes(row: RowResult, suite: str, split: str) -> list[Outcomes]:
+    """How each episode ended, of the finished runs that tell: their own evaluation, or else cronos-eval's."""
     found = []
     for seed in row.finished:
+        own = (suite, split) == ("independent", "train")
+        folder = seed.spec.evaluation_folder(suite, split, seed.spec.steps)
         # A run may have none, or have been evaluated when episodes were not kept.
-        with suppress(ValueError):
-            found.append(last_evaluation(seed.run))
+        with suppress(ValueError, FileNotFoundError):
+            found.append(last_evaluation(seed.run) if own else read_outcomes(folder))
     return found

@@ -9,28 +9,34 @@ from pathlib import Path
 from typing import Any
 
 from cronos_lerobot.experiments import plots, tables
+from cronos_lerobot.experiments.columns import (
+    Columns,
+    budget_columns,
+    claim_columns,
+    difference_columns,
+    main_columns,
+    order_columns,
+    quarter_columns,
+    segment_columns,
+    sequential_columns,
+)
 from cronos_lerobot.experiments.definitions import Experiment, Row
 from cronos_lerobot.experiments.differences import RowDifference, compare_rows, to_first
 from cronos_lerobot.experiments.intervention_plots import interventions_figure
 from cronos_lerobot.experiments.jobs import this_commit
+from cronos_lerobot.experiments.orders import MARGIN, Order, paper_orders
 from cronos_lerobot.experiments.results import (
-    APART,
-    AtBudget,
     ExperimentResult,
     RowResult,
     collect,
     paper_results,
 )
 from cronos_lerobot.experiments.specs import Options, base_policy
-from cronos_lerobot.protocol.metrics import Summary
-from cronos_lerobot.report.paired import ALPHA, holm
-from cronos_lerobot.report.statistics import Rate
+from cronos_lerobot.report.paired import ALPHA
 from cronos_lerobot.report.tables import write_csv
 from cronos_lerobot.training.logging import METRICS
 
 DPI = 150
-MISSING = "–"
-NOT_APPLICABLE = "not applicable"
 
 
 def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options, folder: Path) -> str:
@@ -65,10 +71,12 @@ def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options,
             (folder / f"{file}.png").write_bytes(buffer.getvalue())
             drawn.append(f"{file}.png")
     summary = _settings(result) | {"rows": data[name], "claims": tables.claim_rows(result)}
-    summary |= {"differences": data[f"{name}_differences"]}
+    orders = paper_orders(result)
+    summary |= {"differences": data[f"{name}_differences"], "orders": tables.order_rows(orders)}
+    summary["hours"] = round(sum(seed.seconds for row in result.rows for seed in row.seeds) / 3600, 2)
     summary |= {"segments": data[f"{name}_segments"], "sequential": data[f"{name}_sequential"]}
     (folder / f"{name}.json").write_text(json.dumps(summary, indent=2))
-    page = markdown(result, differences, drawn)
+    page = markdown(result, differences, orders, drawn)
     (folder / f"{name}.md").write_text(page)
     return f"{page}\nWritten to {folder}"
 
@@ -99,19 +107,26 @@ def _settings(result: ExperimentResult) -> dict[str, Any]:
     }
 
 
-def markdown(result: ExperimentResult, differences: Sequence[RowDifference], figures: Sequence[str]) -> str:
+def markdown(
+    result: ExperimentResult,
+    differences: Sequence[RowDifference],
+    orders: Sequence[Order],
+    figures: Sequence[str],
+) -> str:
     """The page: what was run, the table, what the paper's text says, the figures, what is missing."""
-    lines = [*_introduction(result), "", *_table(_main_columns(result)), "", NOTES, "", PPO_NOTES]
+    lines = [*_introduction(result), "", *_table(main_columns(result)), "", NOTES, "", PPO_NOTES]
     if result.experiment.source:
         lines += _about_the_paper(result)
-    if difference_columns := _difference_columns(to_first(result, differences)):
-        lines += [*_section("Which rows differ", difference_columns), "", DIFFERENCE_NOTES]
-    if budget_columns := _budget_columns(result):
-        lines += [*_section("Success after so many interventions", budget_columns), *_budget_notes(result)]
-    lines += _section("What the text says", _claim_columns(tables.claim_rows(result)))
-    lines += _section("Sequences of tasks", _sequential_columns(tables.sequential_rows(result)))
-    lines += _section("Success while training, by segment since the last scene reset", _segment_columns(result))
-    lines += _section("Success while training, by quarter of the run", _quarter_columns(result))
+    if separated := difference_columns(to_first(result, differences)):
+        lines += [*_section("Which rows differ", separated), "", DIFFERENCE_NOTES]
+    if spent := budget_columns(result):
+        lines += [*_section("Success after so many interventions", spent), *_budget_notes(result)]
+    lines += _section("What the text says", claim_columns(tables.claim_rows(result)))
+    if orders:
+        lines += [*_section("What the text says of two rows", order_columns(orders)), "", ORDER_NOTES]
+    lines += _section("Sequences of tasks", sequential_columns(tables.sequential_rows(result)))
+    lines += _section("Success while training, by segment since the last scene reset", segment_columns(result))
+    lines += _section("Success while training, by quarter of the run", quarter_columns(result))
     for file in figures:
         lines += ["", f"![{file}]({file})"]
     lines += _unfinished(result)
@@ -136,6 +151,11 @@ DIFFERENCE_NOTES = (
 BUDGET_NOTES = (
     "A number without a mark is measured, by the evaluation at the first policy update at which so many"
     " interventions had been counted; ~ is interpolated between two evaluations."
+)
+ORDER_NOTES = (
+    "Differences as above, of the first row minus the second, on the episodes or chains that are named; holds: yes"
+    f" or no where p < {ALPHA}, not adjusted, or where two rows that are said to do alike have an interval within"
+    f" {MARGIN} of zero."
 )
 PPO_NOTES = (
     "A scale is that of steps, streams and seeds. The learning algorithm is `ppo`, with this project's settings,"
@@ -170,82 +190,6 @@ def _about_the_paper(result: ExperimentResult) -> list[str]:
     return lines
 
 
-Columns = dict[str, list[str]]
-
-
-def _main_columns(result: ExperimentResult) -> Columns:
-    rows = tables.main_rows(result)
-    columns: Columns = {"T": [str(row["T"] or MISSING) for row in rows]}
-    for aid in ("EER", "CL", "LSR", "HSR"):
-        if any(row[aid] for row in rows):
-            columns[aid] = [tables.TICK[row[aid]] for row in rows]
-    titles = (("base", "demonstrations"), ("task_order", "order"), ("configurations", "configurations"))
-    for name, title in titles:
-        if len({row[name] for row in rows}) > 1:
-            columns[title] = [str(row[name]).replace("_", " ") for row in rows]
-    if any(row.row.tag for row in result.rows):
-        columns["row"] = [row.row.tag or MISSING for row in result.rows]
-    for split in result.experiment.splits:
-        suffix = "" if len(result.experiment.splits) == 1 else f", {split.replace('_', '-')}"
-        summaries = [row.success(split) for row in result.rows]
-        columns[f"success{suffix}"] = [_cell(summary) for summary in summaries]
-        columns[f"95 %{suffix}"] = [_interval(summary) for summary in summaries]
-        columns[f"n{suffix}"] = [str(row[f"n_{split}"] or MISSING) for row in rows]
-        for name in APART:
-            columns[f"{name.replace('_', ' ')}{suffix}"] = [_number(row[f"{name}_{split}"], 0) for row in rows]
-    columns["seeds"] = [f"{row['seeds']}/{row['seeds_wanted']}" for row in rows]
-    if any(row["paper_mean"] is not None for row in rows):
-        columns["paper"] = [f"{row['paper_mean']:.3f} ± {row['paper_std']:.3f}" for row in rows]
-    columns["base"] = [_number(row["base_success_mean"], 3) for row in rows]
-    columns["interventions"] = [_number(row["interventions_mean"], 0) for row in rows]
-    columns["D / steps"] = [_cell(row.gap("interaction_steps")) for row in result.rows]
-    columns["C / interventions"] = [_cell(row.gap("interventions")) for row in result.rows]
-    shared = rows[0]["shared_budget"] if rows else None
-    if shared:
-        title = f"C up to {shared:,}"
-        columns[title] = [_cell(row.gap("interventions", up_to=shared)) for row in result.rows]
-    return columns
-
-
-def _difference_columns(found: Sequence[RowDifference]) -> Columns:
-    if not found:
-        return {}
-    ps = [one.difference.p for one in found]
-    adjusted = holm([1.0 if p is None else p for p in ps])
-    return {
-        "": [one.row.row.label for one in found],
-        "reference": [one.reference.row.label for one in found],
-        "difference": [f"{one.difference.value:+.3f}" for one in found],
-        "95 %": [_signed_interval(one.difference.ci95) for one in found],
-        "p": [MISSING if p is None else f"{p:.2g}" for p in ps],
-        "p (Holm)": [f"{p:.2g}" for p in adjusted],
-        "of": ["trainings" if one.of_trainings else "these policies" for one in found],
-        "verdict": [_verdict(one.difference.value, p) for one, p in zip(found, adjusted, strict=True)],
-    }
-
-
-def _signed_interval(ends: tuple[float, float] | None) -> str:
-    return MISSING if ends is None else f"[{ends[0]:+.3f}, {ends[1]:+.3f}]"
-
-
-def _verdict(difference: float, p: float) -> str:
-    if p >= ALPHA:
-        return "not separated"
-    return "better" if difference > 0 else "worse"
-
-
-def _budget_columns(result: ExperimentResult) -> Columns:
-    rows = [row for row in result.rows if row.finished]
-    if not rows:
-        return {}
-    columns: Columns = {"": [row.row.label for row in rows]}
-    return columns | {f"{n:,}": [_at(row.success_at(n)) for row in rows] for n in tables.budgets(result)}
-
-
-def _at(found: AtBudget) -> str:
-    return NOT_APPLICABLE if found.reason else "~" * bool(found.between and found.summary) + _cell(found.summary)
-
-
 def _budget_notes(result: ExperimentResult) -> list[str]:
     """What is measured, and for each cell that is not, why or between what it is interpolated."""
     lines = []
@@ -258,66 +202,6 @@ def _budget_notes(result: ExperimentResult) -> list[str]:
                 low, high = found.between
                 lines.append(f"- {row.row.label} at {budget:,}: a straight line between {low:,} and {high:,}.")
     return ["", BUDGET_NOTES, *([""] if lines else []), *lines]
-
-
-def _claim_columns(claims: list[dict[str, Any]]) -> Columns:
-    if not claims:
-        return {}
-    digits = [2 if claim["paper"] < 1 else 0 for claim in claims]
-    return {
-        "": [claim["claim"] for claim in claims],
-        "paper": [_number(claim["paper"], n) for claim, n in zip(claims, digits, strict=True)],
-        "here": [_ours(claim, n) for claim, n in zip(claims, digits, strict=True)],
-    }
-
-
-def _ours(claim: dict[str, Any], digits: int) -> str:
-    if claim["not_applicable"]:
-        return f"{NOT_APPLICABLE}: {claim['not_applicable']}"
-    return "~" * claim["interpolated"] + _number(claim["ours"], digits)
-
-
-def _sequential_columns(rows: list[dict[str, Any]]) -> Columns:
-    if not rows:
-        return {}
-    columns: Columns = {"": [row["row"] for row in rows], "split": [row["split"] for row in rows]}
-    columns["orderings"] = [row["orderings"] for row in rows]
-    measures = [key.removesuffix("_mean") for key in rows[0] if key.endswith("_mean")]
-    for measure in measures:
-        columns[measure.replace("_", " ")] = [
-            _plus_minus(row[f"{measure}_mean"], row[f"{measure}_std"]) for row in rows
-        ]
-    columns["chains"] = [str(row["n"]) for row in rows]
-    columns["found complete"] = [str(row["found_complete"]) for row in rows]
-    columns["never grasped"] = [str(row["never_grasped"]) for row in rows]
-    columns["seeds"] = [str(row["seeds"]) for row in rows]
-    return columns
-
-
-def _segment_columns(result: ExperimentResult) -> Columns:
-    rates = {(row["row"], row["segment"]): row["success"] for row in tables.segment_rows(result)}
-    if not rates:
-        return {}
-    rows = [row for row in result.rows if row.seeds]
-    columns: Columns = {"": [row.row.label for row in rows]}
-    for segment in sorted({segment for _, segment in rates}):
-        columns[str(segment + 1)] = [_number(rates.get((row.row.name, segment)), 2) for row in rows]
-    return columns
-
-
-def _quarter_columns(result: ExperimentResult) -> Columns:
-    rates: dict[tuple[str, bool], dict[int, Rate]] = {}
-    for row in tables.task_rows(result):
-        quarters = rates.setdefault((row["row"], row["is_reset_task"]), {})
-        quarters[row["quarter"]] = quarters.get(row["quarter"], Rate(0, 0)) + Rate(row["successes"], row["n"])
-    if not rates:
-        return {}
-    labels = {row.row.name: row.row.label for row in result.rows}
-    columns: Columns = {"": [labels[name] + ", reset tasks" * is_reset for name, is_reset in rates]}
-    for quarter in sorted({quarter for quarters in rates.values() for quarter in quarters}):
-        found = [quarters.get(quarter) for quarters in rates.values()]
-        columns[str(quarter)] = [_number(rate.value if rate else None, 2) for rate in found]
-    return columns
 
 
 def _unfinished(result: ExperimentResult) -> list[str]:
@@ -362,19 +246,3 @@ def _table(columns: Columns) -> list[str]:
     titles = list(columns)
     lines = [titles, ["---"] * len(titles), *(list(cells) for cells in zip(*columns.values(), strict=True))]
     return [f"| {' | '.join(line)} |" for line in lines]
-
-
-def _cell(summary: Summary | None) -> str:
-    return str(summary) if summary else MISSING
-
-
-def _plus_minus(mean: float | None, std: float | None) -> str:
-    return MISSING if mean is None else f"{mean:.3f}" if std is None else f"{mean:.3f} ± {std:.3f}"
-
-
-def _interval(summary: Summary | None) -> str:
-    return f"[{summary.ci95[0]:.3f}, {summary.ci95[1]:.3f}]" if summary and summary.ci95 else MISSING
-
-
-def _number(value: float | None, digits: int) -> str:
-    return MISSING if value is None else f"{value:,.{digits}f}"

@@ -14,7 +14,7 @@ import numpy as np
 
 from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.experiments.definitions import INTERVENTIONS, CheckpointEvaluation, Experiment, Row
-from cronos_lerobot.experiments.jobs import Job, changes, other_commits, status
+from cronos_lerobot.experiments.jobs import Job, changes, other_commits, read_record, status
 from cronos_lerobot.experiments.plan import base_evaluation_jobs, checkpoint_evaluations, train_job
 from cronos_lerobot.experiments.runner import DONE
 from cronos_lerobot.experiments.specs import Options, RunSpec, run_specs
@@ -68,6 +68,8 @@ class SeedResult:
     """Of its job, see `jobs.status`."""
     evaluations: dict[tuple[str, str], dict[int, dict[str, Any]]] = field(default_factory=dict)
     """What cronos-eval found: by suite and split, then by checkpoint [interaction steps], the base policy at 0."""
+    seconds: float = 0.0
+    """That its training took, all starts together."""
 
     @property
     def finished(self) -> bool:
@@ -205,6 +207,7 @@ def _read_seed(spec: RunSpec, result: ExperimentResult) -> SeedResult | None:
         return None
     try:
         seed = SeedResult(spec, read_training_run(spec.train_folder), status(job))
+        seed.seconds = read_record(job).get("seconds", 0.0)
     except ValueError as error:
         result.changed.append(f"{spec.name}: {error}")
         return None

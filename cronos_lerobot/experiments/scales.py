@@ -123,7 +123,7 @@ CLEAN_RECIPES: dict[tuple[str, str], BaseRecipe] = {
 }
 """The same from clean demonstrations, where that is measured."""
 WIDE_RECIPES: dict[tuple[str, str], BaseRecipe] = {
-    ("kitchen_2x2", STATE): BaseRecipe(1200, 1280, checkpoint=960, kind=WIDE),
+    ("kitchen_2x2", STATE): BaseRecipe(1200, 1920, checkpoint=1920, kind=WIDE),
     ("playroom_2x2", STATE): BaseRecipe(400, 960, checkpoint=720, kind=WIDE),
     ("kitchen_3x3", STATE): BaseRecipe(900, 1080, checkpoint=1080, kind=WIDE),
     ("kitchen_2x2", PIXELS): BaseRecipe(800, 2400, checkpoint=2400, kind=WIDE),

@@ -10,6 +10,7 @@ import numpy as np
 
 from cronos_lerobot.experiments.definitions import INTERACTION_STEPS, INTERVENTIONS
 from cronos_lerobot.experiments.differences import RowDifference
+from cronos_lerobot.experiments.orders import Order
 from cronos_lerobot.experiments.results import APART, ExperimentResult, RowResult, paper_results, sequential
 from cronos_lerobot.protocol.metrics import Summary, interpolate, summarise
 from cronos_lerobot.report.series import segment_rates, task_rates
@@ -193,6 +194,16 @@ def claim_rows(result: ExperimentResult) -> list[Row]:
     if gap := paper["difference_at_interventions"].get(name):
         claims.append(_difference(gap, rows, result))
     return claims
+
+
+def order_rows(orders: Sequence[Order]) -> list[Row]:
+    """What the paper says of two rows, the difference here, and whether it holds."""
+    rows = []
+    for one in orders:
+        told = {name: getattr(one, name) for name in ("row", "reference", "says", "where", "suite", "split")}
+        found = difference_rows([one.found] if one.found else [])
+        rows.append(told | {"holds": one.holds} | (found[0] if found else {}))
+    return rows
 
 
 def _difference(gap: dict[str, Any], rows: dict[str, RowResult], result: ExperimentResult) -> Row:

@@ -66,7 +66,7 @@ def test_each_plug_stands_alone_and_together_on_both_bases():
 
 def test_commands(tmp_path):
     jobs = jobs_of("few_resets", tmp_path)
-    base = "base/kitchen_2x2_state_1200widedemos_1280steps"
+    base = "base/kitchen_2x2_state_1200widedemos_1920steps"
     wanted = {
         "--start.layouts=reach",
         "--start.arm_pose=after_task",

@@ -1,0 +1,195 @@
+"""What the pages of an experiment show in their tables: text, column by column."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from cronos_lerobot.experiments import tables
+from cronos_lerobot.experiments.differences import RowDifference
+from cronos_lerobot.experiments.orders import Order
+from cronos_lerobot.experiments.results import APART, AtBudget, ExperimentResult
+from cronos_lerobot.protocol.metrics import Summary
+from cronos_lerobot.report.paired import ALPHA, holm
+from cronos_lerobot.report.statistics import Rate
+
+MISSING = "–"
+NOT_APPLICABLE = "not applicable"
+WORDS = {"higher": "above", "lower": "below", "alike": "like"}
+"""For what the paper says of a row beside another."""
+
+Columns = dict[str, list[str]]
+
+
+def main_columns(result: ExperimentResult) -> Columns:
+    """Settings, success at the end, interventions, D and C of every row."""
+    rows = tables.main_rows(result)
+    columns: Columns = {"T": [str(row["T"] or MISSING) for row in rows]}
+    for aid in ("EER", "CL", "LSR", "HSR"):
+        if any(row[aid] for row in rows):
+            columns[aid] = [tables.TICK[row[aid]] for row in rows]
+    titles = (("base", "demonstrations"), ("task_order", "order"), ("configurations", "configurations"))
+    for name, title in titles:
+        if len({row[name] for row in rows}) > 1:
+            columns[title] = [str(row[name]).replace("_", " ") for row in rows]
+    if any(row.row.tag for row in result.rows):
+        columns["row"] = [row.row.tag or MISSING for row in result.rows]
+    for split in result.experiment.splits:
+        suffix = "" if len(result.experiment.splits) == 1 else f", {split.replace('_', '-')}"
+        summaries = [row.success(split) for row in result.rows]
+        columns[f"success{suffix}"] = [_cell(summary) for summary in summaries]
+        columns[f"95 %{suffix}"] = [_interval(summary) for summary in summaries]
+        columns[f"n{suffix}"] = [str(row[f"n_{split}"] or MISSING) for row in rows]
+        for name in APART:
+            columns[f"{name.replace('_', ' ')}{suffix}"] = [_number(row[f"{name}_{split}"], 0) for row in rows]
+    columns["seeds"] = [f"{row['seeds']}/{row['seeds_wanted']}" for row in rows]
+    if any(row["paper_mean"] is not None for row in rows):
+        columns["paper"] = [f"{row['paper_mean']:.3f} ± {row['paper_std']:.3f}" for row in rows]
+    columns["base"] = [_number(row["base_success_mean"], 3) for row in rows]
+    columns["interventions"] = [_number(row["interventions_mean"], 0) for row in rows]
+    columns["D / steps"] = [_cell(row.gap("interaction_steps")) for row in result.rows]
+    columns["C / interventions"] = [_cell(row.gap("interventions")) for row in result.rows]
+    shared = rows[0]["shared_budget"] if rows else None
+    if shared:
+        title = f"C up to {shared:,}"
+        columns[title] = [_cell(row.gap("interventions", up_to=shared)) for row in result.rows]
+    return columns
+
+
+def difference_columns(found: Sequence[RowDifference]) -> Columns:
+    """Each difference with its interval, its p and a word."""
+    if not found:
+        return {}
+    ps = [one.difference.p for one in found]
+    adjusted = holm([1.0 if p is None else p for p in ps])
+    return {
+        "": [one.row.row.label for one in found],
+        "reference": [one.reference.row.label for one in found],
+        "difference": [f"{one.difference.value:+.3f}" for one in found],
+        "95 %": [_signed_interval(one.difference.ci95) for one in found],
+        "p": [MISSING if p is None else f"{p:.2g}" for p in ps],
+        "p (Holm)": [f"{p:.2g}" for p in adjusted],
+        "of": [_of(one) for one in found],
+        "verdict": [_verdict(one.difference.value, p) for one, p in zip(found, adjusted, strict=True)],
+    }
+
+
+def _signed_interval(ends: tuple[float, float] | None) -> str:
+    return MISSING if ends is None else f"[{ends[0]:+.3f}, {ends[1]:+.3f}]"
+
+
+def _verdict(difference: float, p: float) -> str:
+    if p >= ALPHA:
+        return "not separated"
+    return "better" if difference > 0 else "worse"
+
+
+def budget_columns(result: ExperimentResult) -> Columns:
+    """Success of the finished rows after so many interventions."""
+    rows = [row for row in result.rows if row.finished]
+    if not rows:
+        return {}
+    columns: Columns = {"": [row.row.label for row in rows]}
+    return columns | {f"{n:,}": [_at(row.success_at(n)) for row in rows] for n in tables.budgets(result)}
+
+
+def _at(found: AtBudget) -> str:
+    return NOT_APPLICABLE if found.reason else "~" * bool(found.between and found.summary) + _cell(found.summary)
+
+
+def claim_columns(claims: list[dict[str, Any]]) -> Columns:
+    """Numbers in the paper's text beside ours."""
+    if not claims:
+        return {}
+    digits = [2 if claim["paper"] < 1 else 0 for claim in claims]
+    return {
+        "": [claim["claim"] for claim in claims],
+        "paper": [_number(claim["paper"], n) for claim, n in zip(claims, digits, strict=True)],
+        "here": [_ours(claim, n) for claim, n in zip(claims, digits, strict=True)],
+    }
+
+
+def order_columns(orders: Sequence[Order]) -> Columns:
+    """What the paper says of two rows, the difference here, and whether it holds."""
+    found = [one.found for one in orders]
+    return {
+        "": [f"{one.row} is {WORDS[one.says]} {one.reference}" for one in orders],
+        "paper": [one.where for one in orders],
+        "suite": [f"{one.suite}, {one.split.replace('_', '-')}" for one in orders],
+        "difference": [f"{one.difference.value:+.3f}" if one else MISSING for one in found],
+        "95 %": [_signed_interval(one.difference.ci95) if one else MISSING for one in found],
+        "of": [_of(one) if one else MISSING for one in found],
+        "holds": [one.holds for one in orders],
+    }
+
+
+def _of(found: RowDifference) -> str:
+    return "trainings" if found.of_trainings else "these policies"
+
+
+def _ours(claim: dict[str, Any], digits: int) -> str:
+    if claim["not_applicable"]:
+        return f"{NOT_APPLICABLE}: {claim['not_applicable']}"
+    return "~" * claim["interpolated"] + _number(claim["ours"], digits)
+
+
+def sequential_columns(rows: list[dict[str, Any]]) -> Columns:
+    """SEQ 0-3 and chain length, by split and orderings."""
+    if not rows:
+        return {}
+    columns: Columns = {"": [row["row"] for row in rows], "split": [row["split"] for row in rows]}
+    columns["orderings"] = [row["orderings"] for row in rows]
+    measures = [key.removesuffix("_mean") for key in rows[0] if key.endswith("_mean")]
+    for measure in measures:
+        columns[measure.replace("_", " ")] = [
+            _plus_minus(row[f"{measure}_mean"], row[f"{measure}_std"]) for row in rows
+        ]
+    columns["chains"] = [str(row["n"]) for row in rows]
+    columns["found complete"] = [str(row["found_complete"]) for row in rows]
+    columns["never grasped"] = [str(row["never_grasped"]) for row in rows]
+    columns["seeds"] = [str(row["seeds"]) for row in rows]
+    return columns
+
+
+def segment_columns(result: ExperimentResult) -> Columns:
+    """Success while training, by segment since the last scene reset."""
+    rates = {(row["row"], row["segment"]): row["success"] for row in tables.segment_rows(result)}
+    if not rates:
+        return {}
+    rows = [row for row in result.rows if row.seeds]
+    columns: Columns = {"": [row.row.label for row in rows]}
+    for segment in sorted({segment for _, segment in rates}):
+        columns[str(segment + 1)] = [_number(rates.get((row.row.name, segment)), 2) for row in rows]
+    return columns
+
+
+def quarter_columns(result: ExperimentResult) -> Columns:
+    """Success while training, by quarter of the run, reset tasks apart."""
+    rates: dict[tuple[str, bool], dict[int, Rate]] = {}
+    for row in tables.task_rows(result):
+        quarters = rates.setdefault((row["row"], row["is_reset_task"]), {})
+        quarters[row["quarter"]] = quarters.get(row["quarter"], Rate(0, 0)) + Rate(row["successes"], row["n"])
+    if not rates:
+        return {}
+    labels = {row.row.name: row.row.label for row in result.rows}
+    columns: Columns = {"": [labels[name] + ", reset tasks" * is_reset for name, is_reset in rates]}
+    for quarter in sorted({quarter for quarters in rates.values() for quarter in quarters}):
+        found = [quarters.get(quarter) for quarters in rates.values()]
+        columns[str(quarter)] = [_number(rate.value if rate else None, 2) for rate in found]
+    return columns
+
+
+def _cell(summary: Summary | None) -> str:
+    return str(summary) if summary else MISSING
+
+
+def _plus_minus(mean: float | None, std: float | None) -> str:
+    return MISSING if mean is None else f"{mean:.3f}" if std is None else f"{mean:.3f} ± {std:.3f}"
+
+
+def _interval(summary: Summary | None) -> str:
+    return f"[{summary.ci95[0]:.3f}, {summary.ci95[1]:.3f}]" if summary and summary.ci95 else MISSING
+
+
+def _number(value: float | None, digits: int) -> str:
+    return MISSING if value is None else f"{value:,.{digits}f}"

@@ -1,0 +1,55 @@
+"""Which of the paper's sentences about two rows hold here: a paired difference behind each word."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from cronos_lerobot.experiments.differences import RowDifference, compare
+from cronos_lerobot.experiments.results import ExperimentResult, paper_results
+from cronos_lerobot.report.paired import ALPHA
+
+MARGIN = 0.05
+"""Rows are alike if the whole interval of their difference is within this of zero."""
+YES, NO, NOT_SEPARATED, NOT_RUN = "yes", "no", "not separated", "not run"
+
+
+@dataclass(frozen=True)
+class Order:
+    """What the paper says of two rows at the end of their runs, and what is found here."""
+
+    row: str
+    reference: str
+    says: str
+    """Of the row, beside the reference: higher, lower or alike."""
+    where: str
+    """Section of the paper."""
+    suite: str = "independent"
+    split: str = "train"
+    found: RowDifference | None = None
+    """None where one of the two has no finished run, or no such evaluation."""
+
+    @property
+    def holds(self) -> str:
+        """`yes` and `no` are said of 95 % intervals, whichever side of zero, or of `MARGIN`, they are on."""
+        if self.found is None:
+            return NOT_RUN
+        value, p, ends = self.found.difference.value, self.found.difference.p, self.found.difference.ci95
+        separated = p is not None and p < ALPHA
+        if self.says == "alike":
+            within = ends is not None and max(map(abs, ends)) <= MARGIN
+            return YES if within else NO if separated else NOT_SEPARATED
+        if not separated:
+            return NOT_SEPARATED
+        return YES if (value > 0) == (self.says == "higher") else NO
+
+
+def paper_orders(result: ExperimentResult) -> list[Order]:
+    """The paper's sentences about rows of an experiment that are among `result`'s."""
+    rows = {row.row.name: row for row in result.rows}
+    orders = [Order(**said) for said in paper_results()["orders"].get(result.experiment.name, ())]
+    return [
+        Order(one.row, one.reference, one.says, one.where, one.suite, one.split, found)
+        for one in orders
+        if one.row in rows and one.reference in rows
+        for found in [compare(rows[one.row], rows[one.reference], one.suite, one.split)]
+    ]
