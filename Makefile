@@ -20,7 +20,7 @@ $(UV):
 	$(PYTHON) -m pip install --quiet --disable-pip-version-check --target .uv 'uv>=0.8,<1'
 
 setup: system $(UV) ## Install the system packages and the locked Python environment
-	$(UV) sync --frozen --python $(PYTHON)
+	$(UV) sync --frozen --compile-bytecode --python $(PYTHON)
 
 system: ## Install EGL, software OpenGL, and FFmpeg to read videos
 	@sh .ci/system-packages

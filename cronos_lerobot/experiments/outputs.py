@@ -28,6 +28,7 @@ from cronos_lerobot.experiments.orders import MARGIN, Order, paper_orders
 from cronos_lerobot.experiments.results import (
     ExperimentResult,
     RowResult,
+    SeedResult,
     collect,
     paper_results,
 )
@@ -73,6 +74,7 @@ def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options,
     summary = _settings(result) | {"rows": data[name], "claims": tables.claim_rows(result)}
     orders = paper_orders(result)
     summary |= {"differences": data[f"{name}_differences"], "orders": tables.order_rows(orders)}
+    summary["bases"] = {recipe: sorted(policies) for recipe, policies in result.bases.items()}
     summary["hours"] = round(sum(seed.seconds for row in result.rows for seed in row.seeds) / 3600, 2)
     summary |= {"segments": data[f"{name}_segments"], "sequential": data[f"{name}_sequential"]}
     (folder / f"{name}.json").write_text(json.dumps(summary, indent=2))
@@ -228,10 +230,18 @@ def _unfinished(result: ExperimentResult) -> list[str]:
     if result.changed:
         lines += ["", "## Left out: made by another command or version, or damaged", ""]
         lines += [f"- {text}" for text in result.changed]
+    for recipe, policies in result.bases.items():
+        if len(policies) > 1:
+            lines += ["", f"## Not one base policy: {len(policies)} clones by the recipe of {recipe}", ""]
+            lines += [f"- {base}: {_names(seeds)}" for base, seeds in policies.items()]
     if result.commits:
         lines += ["", f"## Made at another commit than {this_commit() or 'this one'}", ""]
         lines += ["The versions are the same, so they count.", "", *(f"- {text}" for text in result.commits)]
     return lines
+
+
+def _names(seeds: Sequence[SeedResult]) -> str:
+    return ", ".join(f"{seed.spec.row.name} seed {seed.spec.seed}" for seed in seeds)
 
 
 def _group(result: ExperimentResult, row: RowResult) -> str:

@@ -179,6 +179,18 @@ class ExperimentResult:
     """Runs that were made at another commit than this one, in the same versions; they count."""
 
     @property
+    def bases(self) -> dict[str, dict[str, list[SeedResult]]]:
+        """By `Base.recipe`, then by the fingerprint of the policy that was cloned by it: the runs from there.
+
+        Two machines may clone the same demonstrations to other last bits.
+        """
+        found: dict[str, dict[str, list[SeedResult]]] = {}
+        for seed in (seed for row in self.rows for seed in row.seeds):
+            if base := seed.run.base:
+                found.setdefault(seed.spec.base.recipe, {}).setdefault(base, []).append(seed)
+        return found
+
+    @property
     def tasks(self) -> list[str]:
         """The instructions, in the scene's order."""
         for row in self.rows:

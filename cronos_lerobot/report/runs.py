@@ -68,6 +68,11 @@ class TrainingRun:
         return self.config.get("seed")
 
     @property
+    def base(self) -> str | None:
+        """Fingerprint of the policy that it began with; None of runs that did not note it."""
+        return self.starts[0].get("policy_fingerprint") if self.starts else None
+
+    @property
     def last(self) -> dict[str, Any]:
         """The latest record, for its counters."""
         return max([*self.updates, *self.evaluations], key=lambda record: record["interaction_steps"])

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from cronos_lerobot.evaluation.policy_source import fingerprint
 from cronos_lerobot.protocol.loop_state import LoopState
 from cronos_lerobot.provenance import git_commit, package_versions
 from cronos_lerobot.training.config import CronosTrainConfig
@@ -186,9 +187,18 @@ def write_manifest(config: CronosTrainConfig, num_processes: int = 1) -> None:
         "num_processes": num_processes,
         "renderer": os.environ.get("MUJOCO_GL"),
         "policy_device": config.policy.device if config.policy else None,
+        "policy_fingerprint": _policy_fingerprint(config),
         "config": config.to_dict(),
     } | describe_environment(config.env)
     write_whole(path, json.dumps({"starts": [*starts, start]}, indent=2))
+
+
+def _policy_fingerprint(config: CronosTrainConfig) -> str | None:
+    """Of the policy in a folder that this start begins with: two machines may have made other clones of it."""
+    policy = config.policy
+    if policy is None or not policy.pretrained_path or not Path(policy.pretrained_path).is_dir():
+        return None
+    return fingerprint(policy)
 
 
 def read_starts(path: Path) -> list[dict[str, Any]]:

@@ -345,3 +345,22 @@ def test_report_only_from_the_command_line(options, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "t80_307k/seed1: 10,240 of 307,200 steps" in done.stdout
     assert Path(tmp_path / "out/table1.png").exists()
+
+
+def test_clones_that_differ_are_said(options, tmp_path):
+    """Runs of several machines make one table; their base policies may differ in the last bits."""
+    for seed, fingerprint in ((1, "aaaa"), (2, "bbbb")):
+        spec = make_run(options, "table1", "t80", seed, (2, 4, 5))
+        manifest = spec.train_folder / "manifest.json"
+        starts = json.loads(manifest.read_text())["starts"]
+        # A run that was resumed began with what it first had.
+        starts = [
+            starts[0] | {"policy_fingerprint": fingerprint},
+            starts[0] | {"policy_fingerprint": "checkpoint"},
+        ]
+        manifest.write_text(json.dumps({"starts": starts}))
+        page = write_outputs(EXPERIMENTS["table1"], EXPERIMENTS["table1"].rows, options, tmp_path / "out")
+        assert ("Not one base policy" in page) == (seed == 2)
+    assert "## Not one base policy: 2 clones by the recipe of kitchen_2x2" in page
+    assert "- aaaa: t80 seed 1\n- bbbb: t80 seed 2" in page
+    assert json.loads((tmp_path / "out/table1.json").read_text())["bases"] == {"kitchen_2x2": ["aaaa", "bbbb"]}

@@ -176,6 +176,8 @@ def test_what_cannot_be_is_one_line(tmp_path, monkeypatch):
     (start,) = json.loads((run / "manifest.json").read_text())["starts"]
     assert start["environment"] == "lerobot_env_cronos/kitchen_2x2-v1"
     assert len(start["benchmark"]["fingerprint"]) == 16
+    # It began with a policy of its own, not with one in a folder.
+    assert start["policy_fingerprint"] is None
     assert "--algorithm.type=ppo" not in start["command"]
 
     def refused(message, *arguments):

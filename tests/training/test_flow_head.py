@@ -44,9 +44,12 @@ def lerobot(command, *flags):
     assert done.returncode == 0, done.stderr[-3000:]
 
 
+RUNS = ("whole", "broken")
+
+
 def trains_saves_and_resumes(folder, monkeypatch, *flags):
     """Returns the weights after one update and after the second, and the checkpoint."""
-    whole, broken = folder / "whole", folder / "broken"
+    whole, broken = (folder / run for run in RUNS)
     cronos_train(monkeypatch, *flags, *TRAIN, "--steps=40", f"--output_dir={whole}")
     cronos_train(monkeypatch, *flags, *TRAIN, "--steps=20", f"--output_dir={broken}")
     before = weights(broken)
@@ -71,6 +74,11 @@ def test_cloned_trained_and_evaluated_by_the_commands(tmp_path, monkeypatch):
     clone = tmp_path / "clone/checkpoints/last/pretrained_model"
     flags = (f"--policy.path={clone}", *OBSERVATIONS["state"])
     before, after, checkpoint = trains_saves_and_resumes(tmp_path, monkeypatch, *flags)
+    # Which policy each start began with: both runs with the same, the resumed one then with its own checkpoint.
+    starts = {run: json.loads((tmp_path / run / "manifest.json").read_text())["starts"] for run in RUNS}
+    (first,), (again, resumed) = ([one["policy_fingerprint"] for one in starts[run]] for run in RUNS)
+    assert first == again != resumed
+    assert len(first) == len(resumed) == 16
     for part in ("actor.", "head.", "value_head.", "critic."):
         assert any(not torch.equal(before[name], after[name]) for name in after if name.startswith(part)), part
 
