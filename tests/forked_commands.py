@@ -14,6 +14,7 @@ import runpy
 import subprocess
 import sys
 import tempfile
+import time
 import traceback
 import types
 import warnings
@@ -68,6 +69,12 @@ class ForkedPopen:
         if self.returncode is None:
             self.returncode = _ask({"poll": self.pid})["code"]
         return self.returncode
+
+    def wait(self) -> int:
+        """The exit code, once there is one."""
+        while (code := self.poll()) is None:
+            time.sleep(0.05)
+        return code
 
 
 def _ask(request: Mapping[str, Any]) -> dict[str, Any]:

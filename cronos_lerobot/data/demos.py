@@ -68,8 +68,8 @@ class StartConfig:
     leaning_share: float = 0.0
     """Share of the layouts in which one object has fallen over the edge of another body, from 0 to 1."""
     share: float = 1.0
-    """Share of the episodes that `arm_pose`, `occupied_receptacles` and `misplaced_objects` apply to; the others
-    start at home, with every object on the table."""
+    """Share of the episodes that `arm_pose`, `occupied_receptacles`, `misplaced_objects` and `earlier_tasks` apply
+    to; the others start at home, with every object on the table."""
 
     def __post_init__(self) -> None:
         """Check the choices."""

@@ -116,7 +116,7 @@ def order_columns(orders: Sequence[Order]) -> Columns:
         "": [f"{one.row} is {WORDS[one.says]} {one.reference}" for one in orders],
         "paper": [one.where for one in orders],
         "suite": [f"{one.suite}, {one.split.replace('_', '-')}" for one in orders],
-        "difference": [f"{one.difference.value:+.3f}" if one else MISSING for one in found],
+        "difference": [f"{one.found.difference.value:+.3f}{one.unit}" if one.found else MISSING for one in orders],
         "95 %": [_signed_interval(one.difference.ci95) if one else MISSING for one in found],
         "of": [_of(one) if one else MISSING for one in found],
         "holds": [one.holds for one in orders],

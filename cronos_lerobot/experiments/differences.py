@@ -73,8 +73,11 @@ def _outcomes(row: RowResult, suite: str, split: str) -> list[Outcomes]:
     found = []
     for seed in row.finished:
         own = (suite, split) == ("independent", "train")
-        folder = seed.spec.evaluation_folder(suite, split, seed.spec.steps)
-        # A run may have none, or have been evaluated when episodes were not kept.
-        with suppress(ValueError, FileNotFoundError):
+        # Only what the report has read: what another version made is left out there, too.
+        if not own and seed.spec.steps not in seed.evaluations.get((suite, split), {}):
+            continue
+        # A run may have been evaluated when episodes were not kept.
+        with suppress(ValueError):
+            folder = seed.spec.evaluation_folder(suite, split, seed.spec.steps)
             found.append(last_evaluation(seed.run) if own else read_outcomes(folder))
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from cronos_lerobot.experiments.differences import RowDifference, compare
 from cronos_lerobot.experiments.results import ExperimentResult, paper_results
@@ -29,8 +29,13 @@ class Order:
     """None where one of the two has no finished run, or no such evaluation."""
 
     @property
+    def unit(self) -> str:
+        """Of the difference: chains are compared by their length, all else by success rates."""
+        return " tasks" if self.suite == "sequential" else ""
+
+    @property
     def holds(self) -> str:
-        """`yes` and `no` are said of 95 % intervals, whichever side of zero, or of `MARGIN`, they are on."""
+        """`yes` and `no` where p < .05, and where two rows alike have an interval within `MARGIN` of zero."""
         if self.found is None:
             return NOT_RUN
         value, p, ends = self.found.difference.value, self.found.difference.p, self.found.difference.ci95
@@ -48,8 +53,7 @@ def paper_orders(result: ExperimentResult) -> list[Order]:
     rows = {row.row.name: row for row in result.rows}
     orders = [Order(**said) for said in paper_results()["orders"].get(result.experiment.name, ())]
     return [
-        Order(one.row, one.reference, one.says, one.where, one.suite, one.split, found)
+        replace(one, found=compare(rows[one.row], rows[one.reference], one.suite, one.split))
         for one in orders
         if one.row in rows and one.reference in rows
-        for found in [compare(rows[one.row], rows[one.reference], one.suite, one.split)]
     ]

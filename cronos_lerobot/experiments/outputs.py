@@ -155,7 +155,8 @@ BUDGET_NOTES = (
     " interventions had been counted; ~ is interpolated between two evaluations."
 )
 ORDER_NOTES = (
-    "Differences as above, of the first row minus the second, on the episodes or chains that are named; holds: yes"
+    "Differences as above, of the first row minus the second, on the episodes of the suite that is named: of"
+    " chains, how many tasks were done before the first failure. Holds: yes"
     f" or no where p < {ALPHA}, not adjusted, or where two rows that are said to do alike have an interval within"
     f" {MARGIN} of zero."
 )

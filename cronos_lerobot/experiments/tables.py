@@ -200,7 +200,9 @@ def order_rows(orders: Sequence[Order]) -> list[Row]:
     """What the paper says of two rows, the difference here, and whether it holds."""
     rows = []
     for one in orders:
-        told = {name: getattr(one, name) for name in ("row", "reference", "says", "where", "suite", "split")}
+        told = {
+            name: getattr(one, name) for name in ("row", "reference", "says", "where", "suite", "split", "unit")
+        }
         found = difference_rows([one.found] if one.found else [])
         rows.append(told | {"holds": one.holds} | (found[0] if found else {}))
     return rows

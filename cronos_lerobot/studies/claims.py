@@ -9,17 +9,16 @@ marks.
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 from cronos_lerobot.experiments.columns import WORDS
+from cronos_lerobot.studies import marked_tables
+from cronos_lerobot.studies.marked_tables import MarkedTable
 
-PAGE = Path("docs/results.md")
 RESULTS = Path("docs/results")
-BEGIN, END = "<!-- claims: made by python -m cronos_lerobot.studies.claims -->", "<!-- end of claims -->"
+CLAIMS = MarkedTable("claims", Path("docs/results.md"), "cronos_lerobot.studies.claims")
 MISSING = "–"
 
 
@@ -59,35 +58,15 @@ def _claim(order: dict[str, Any]) -> tuple[str, ...]:
     suite = f"{order['suite']}, {order['split'].replace('_', '-')}"
     if order.get("difference") is None:
         return said, suite, MISSING, order["holds"]
-    found = f"{order['difference']:+.3f}"
+    found = f"{order['difference']:+.3f}{order['unit']}"
     if order["ci95_low"] is not None:
         found += f" [{order['ci95_low']:+.3f}, {order['ci95_high']:+.3f}]"
     return said, suite, found + ", these policies" * (not order["of_trainings"]), order["holds"]
 
 
-def rewrite(page: str, table: str) -> str:
-    """The page with its table made anew.
-
-    Raises:
-        ValueError: it has not the marks.
-    """
-    if page.count(BEGIN) != 1 or page.count(END) != 1:
-        raise ValueError(f"the page must have {BEGIN} and {END} once each")
-    head, rest = page.split(BEGIN)
-    return f"{head}{BEGIN}\n{table}\n{END}{rest.split(END)[1]}"
-
-
 def main() -> None:
     """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if it is not up to date")
-    args = parser.parse_args()
-    before = PAGE.read_text()
-    after = rewrite(before, make_table(read_experiments(RESULTS)))
-    if not args.check:
-        PAGE.write_text(after)
-    elif after != before:
-        sys.exit(f"{PAGE} is not what {RESULTS} says: run it without --check")
+    marked_tables.main(CLAIMS, lambda: make_table(read_experiments(RESULTS)), __doc__)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -207,11 +208,13 @@ def run_folder(run: Run, folder: Path) -> Path:
 
 
 def read_runs(folder: Path) -> dict[Run, TrainingRun]:
-    """Runs of the study that have begun in a folder, whatever was asked for this time."""
+    """Runs of the study that have come to their first evaluation, whatever was asked for this time."""
     begun = {}
     for path in sorted(path.parent for path in (folder / "runs").glob(f"*_*_*_*/{METRICS}")):
         kind, agent, interval, seed = path.name.split("_")
-        begun[Run(kind, agent, int(interval), int(seed))] = read_training_run(path)
+        if kind in KINDS:
+            with suppress(ValueError):
+                begun[Run(kind, agent, int(interval), int(seed))] = read_training_run(path)
     return begun
 
 

@@ -8,13 +8,13 @@ The files are those that `cronos-reproduce` wrote, in docs/results; the table st
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
-README = Path("README.md")
+from cronos_lerobot.studies import marked_tables
+from cronos_lerobot.studies.marked_tables import MarkedTable
+
 RESULTS = Path("docs/results/few_resets_small_state")
 ROWS = {
     "t80_wide": "episodic: a reset every 80 steps",
@@ -25,7 +25,7 @@ ROWS = {
     "tnone_eer_takeover_memory_wide": "no reset: an expert takes over after two failures and is learned from",
 }
 """What the README calls them; rows without a finished run are left out."""
-BEGIN, END = "<!-- few_resets: made by python -m cronos_lerobot.studies.readme -->", "<!-- end of few_resets -->"
+README = MarkedTable("few_resets", Path("README.md"), "cronos_lerobot.studies.readme")
 
 
 def make_table(folder: Path) -> str:
@@ -56,18 +56,6 @@ def make_table(folder: Path) -> str:
     )
 
 
-def rewrite(readme: str, folder: Path) -> str:
-    """The README with its table made anew.
-
-    Raises:
-        ValueError: it has not the marks.
-    """
-    if readme.count(BEGIN) != 1 or readme.count(END) != 1:
-        raise ValueError(f"the README must have {BEGIN} and {END} once each")
-    head, rest = readme.split(BEGIN)
-    return f"{head}{BEGIN}\n{make_table(folder)}\n{END}{rest.split(END)[1]}"
-
-
 def _success(row: dict[str, Any]) -> str:
     std = row["success_train_std"]
     spread = "" if std is None else f" ± {std:.3f}"
@@ -85,15 +73,7 @@ def _interval(ends: tuple[float | None, float | None], form: str) -> str:
 
 def main() -> None:
     """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if it is not up to date")
-    args = parser.parse_args()
-    before = README.read_text()
-    after = rewrite(before, RESULTS)
-    if not args.check:
-        README.write_text(after)
-    elif after != before:
-        sys.exit(f"{README} is not what {RESULTS} says: run it without --check")
+    marked_tables.main(README, lambda: make_table(RESULTS), __doc__)
 
 
 if __name__ == "__main__":

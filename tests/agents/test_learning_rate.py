@@ -37,6 +37,20 @@ def test_a_smaller_target_stops_an_update_sooner():
     assert epochs[0][1] > epochs[1][1]
 
 
+def test_the_learning_rate_follows_the_falling_target():
+    """The same update is far below the target that stays, and far above the one that fell."""
+    options = {"epochs": 1, "policy_lr": 1e-2, "policy_lr_max": 1.0, "kl_stop_factor": None, "target_kl": 0.05}
+    options |= {"lr_schedule": "kl_update"}
+    ends = []
+    for decay in (None, 1e-6):
+        ppo = make_ppo(kl_decay_updates=decay, **options)
+        for _ in range(2):
+            before = ppo.policy_lr
+            ppo.update(rollout(ppo, reward_for_up))
+        ends.append(ppo.policy_lr / before)
+    assert ends[0] > 1 > ends[1]
+
+
 def test_lr_rises_while_the_policy_hardly_moves():
     ppo = make_ppo(epochs=1, policy_lr=1e-6)
     ppo.update(rollout(ppo, reward_for_up))

@@ -25,7 +25,7 @@ def make_run(options, name, row, seed, successes, status="done", updates=8):
         spec.train_folder, seed=seed, interval=spec.row.interval, successes=successes, updates=updates
     )
     job = train_job(spec, None)
-    record = {"command": list(job.command), "status": status, "seconds": 1.0, "starts": 1}
+    record = {"command": list(job.command), "status": status, "seconds": 1800.0, "starts": 1}
     write_record(job, record | {"made_by": made_by(job)})
     return spec
 

@@ -4,11 +4,14 @@ import json
 
 import pytest
 from experiment_runs import make_run, results
+from synthetic_evaluations import write_evaluation
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS
 from cronos_lerobot.experiments.differences import RowDifference
+from cronos_lerobot.experiments.jobs import made_by, write_record
 from cronos_lerobot.experiments.orders import MARGIN, Order, paper_orders
 from cronos_lerobot.experiments.outputs import write_outputs
+from cronos_lerobot.experiments.plan import checkpoint_evaluations
 from cronos_lerobot.experiments.results import paper_results
 from cronos_lerobot.report.paired import Difference
 
@@ -68,5 +71,38 @@ def test_an_experiment_says_which_sentences_hold(options, tmp_path):
     told = {(one["row"], one["reference"]): one for one in summary["orders"]}
     assert (told["t1280", "t80"]["difference"], told["t1280", "t80"]["holds"]) == (-0.75, "yes")
     assert told["t1280_eer_cl", "t1280_eer"]["holds"] == "not run"
-    # Each of the three took a second.
-    assert summary["hours"] == 0.0
+    # Each of the three took half an hour.
+    assert summary["hours"] == 1.5
+
+
+def evaluate(spec, lengths):
+    """What `cronos-eval` would have found at the end of a run of figure 5: held-out chains of one ordering."""
+    rates = [{"success": sum(n > i for n in lengths) / len(lengths)} for i in range(4)]
+    found = {"positions": rates, "average_chain_length": {"mean": sum(lengths) / len(lengths)}, "n": len(lengths)}
+    for evaluation in EXPERIMENTS["figure5"].evaluations:
+        for job, _ in checkpoint_evaluations(spec, evaluation):
+            if "held_out" in job.name:
+                results = write_evaluation(job.output, spec.row.name, chains=[lengths]) / "results.json"
+                results.write_text(
+                    json.dumps(json.loads(results.read_text()) | {"sequential": {"held_out": found}})
+                )
+                record = {"command": list(job.command), "status": "done", "seconds": 1.0, "starts": 1}
+                write_record(job, record | {"made_by": made_by(job)})
+                return job
+
+
+def test_chains_are_compared_by_their_length(options, tmp_path):
+    short = make_run(options, "figure5", "t80", 1, (2, 4, 6))
+    long = make_run(options, "figure5", "t320_eer", 1, (2, 4, 6))
+    evaluate(short, [0, 1, 0, 1, 0, 1, 0, 1])
+    job = evaluate(long, [3, 4, 3, 4, 3, 4, 3, 4])
+    by_split = {one.split: one for one in paper_orders(results(options, "figure5"))}
+    assert by_split["train"].holds == "not run"
+    assert (by_split["held_out"].holds, by_split["held_out"].found.difference.value) == ("yes", 3.0)
+    page = write_outputs(EXPERIMENTS["figure5"], EXPERIMENTS["figure5"].rows, options, tmp_path / "out")
+    assert "| sequential, held-out | +3.000 tasks |" in page
+    # What the report leaves out is no evidence either.
+    job.record.write_text(job.record.read_text().replace("--eval.suites=sequential", "--eval.suites=another"))
+    result = results(options, "figure5")
+    assert any(job.name in text for text in result.changed)
+    assert {one.holds for one in paper_orders(result)} == {"not run"}

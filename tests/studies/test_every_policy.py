@@ -72,6 +72,10 @@ def test_the_table_has_the_gain_over_the_seeds(tmp_path):
     assert 0.2 - half < 0
     assert lines[2] == f"| act | ppo | 80 | 204,800 | 2,560 | 0.500 | .600 .700 .800 | {gain} |"
     write_run(tmp_path, imitation[1], 0.5, 0.55)
+    # A run that has not come to its first evaluation, and a folder that is none of the study's.
+    for name in ("act_ppo_320_3", "somebody_ppo_80_1"):
+        (tmp_path / "runs" / name).mkdir()
+        (tmp_path / "runs" / name / "metrics.jsonl").touch()
     assert set(read_runs(tmp_path)) == {*ppo, *imitation[:2]}
     ends = merge(find_ends(read_runs(tmp_path)), [], list(KINDS))
     assert make_table(ends).splitlines()[3].endswith("| .550 | +0.050 |")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from cronos_lerobot.studies.readme import BEGIN, END, RESULTS, make_table, rewrite
+from cronos_lerobot.studies.readme import README, RESULTS, make_table
 
 ROOT = Path(__file__).parents[2]
 ROWS = [
@@ -36,12 +36,12 @@ def test_the_table_by_hand(tmp_path):
         "",
         "307,200 interaction steps; before training 0.400; n = 256 for each seed.",
     ]
-    readme = f"# Title\n\n{BEGIN}\nold\n{END}\n\nmore\n"
-    assert rewrite(readme, tmp_path) == f"# Title\n\n{BEGIN}\n{table}\n{END}\n\nmore\n"
+    readme = f"# Title\n\n{README.begin}\nold\n{README.end}\n\nmore\n"
+    assert README.rewrite(readme, table) == f"# Title\n\n{README.begin}\n{table}\n{README.end}\n\nmore\n"
     with pytest.raises(ValueError, match="once each"):
-        rewrite("# Title", tmp_path)
+        README.rewrite("# Title", table)
 
 
 def test_the_readme_is_what_the_files_say():
-    readme = (ROOT / "README.md").read_text()
-    assert rewrite(readme, ROOT / RESULTS) == readme
+    readme = (ROOT / README.page).read_text()
+    assert README.rewrite(readme, make_table(ROOT / RESULTS)) == readme

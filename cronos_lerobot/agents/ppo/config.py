@@ -227,6 +227,11 @@ class PPOConfig(RLAlgorithmConfig):
             raise ValueError(f"algorithm.lr_schedule={self.lr_schedule} needs algorithm.target_kl.")
         if self.target_kl is None and self.kl_decay_updates is not None:
             raise ValueError(f"algorithm.kl_decay_updates={self.kl_decay_updates} needs algorithm.target_kl.")
+        if self.kl_decay_updates is not None and self.lr_schedule == "fixed" and self.kl_stop_factor is None:
+            raise ValueError(
+                f"algorithm.kl_decay_updates={self.kl_decay_updates} has no effect where neither "
+                "algorithm.lr_schedule nor algorithm.kl_stop_factor goes by the KL divergence."
+            )
         if self.policy_lr_min > self.policy_lr_max:
             raise ValueError(
                 f"algorithm.policy_lr_min must be at most policy_lr_max={self.policy_lr_max}, got "
