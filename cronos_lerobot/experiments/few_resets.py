@@ -22,7 +22,7 @@ INTERVAL = 1280
 """T of the rows with few resets: a sixteenth of the resets of T = 80."""
 BUDGET = 1016
 """B, a sixteenth of those of T = 80 in 1.3 M steps; staggered resets every 1280 steps spend as many."""
-EARLY, EARLY_RESETS, LATE = 320, 768, 5120
+EARLY, EARLY_RESETS, LATE = 320, 768, 4400
 """Of `early`: T at first, as in the paper's curriculum; resets of all streams by then; T after them."""
 
 
@@ -95,11 +95,11 @@ SCREENED = (*AIDS, *(plugged(name) for name in PLUGS), *PAIRS, METHOD, TUNED)
 
 METHOD_BY_BUDGET = (
     METHOD,
-    replace(METHOD, interval=4 * LATE, stages=((EARLY_RESETS // 4 * EARLY, EARLY),)),
-    plugged("staggered", "decay", interval=4 * LATE),
+    replace(METHOD, interval=20_000, stages=((EARLY_RESETS // 4 * EARLY, EARLY),)),
+    plugged("staggered", "decay", interval=20_240),
     replace(plugged("decay"), interval=None),
 )
-"""In 1.3 M steps of 64 streams these are 970, 252 and 63 resets, and none."""
+"""In 1.3 M steps of 64 streams these are 1,008, 254 and 64 resets, and none."""
 PAPER_BY_BUDGET = tuple(
     Row(interval, end_effector_reset=True, heuristic_reset=True) for interval in (1280, 5120, 10240, None)
 )

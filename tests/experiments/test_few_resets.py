@@ -6,14 +6,17 @@ from experiment_runs import TINY, make_run
 from flags import parse_flags
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base
-from cronos_lerobot.experiments.few_resets import PLUGS, plugged, wide
+from cronos_lerobot.experiments.few_resets import BUDGET, METHOD_BY_BUDGET, PLUGS, plugged, wide
 from cronos_lerobot.experiments.intervention_plots import find_end, interventions_figure, row_styles, side_by_side
 from cronos_lerobot.experiments.outputs import write_outputs
 from cronos_lerobot.experiments.plan import make_jobs
 from cronos_lerobot.experiments.plots import AXIS_LABELS
 from cronos_lerobot.experiments.results import collect
-from cronos_lerobot.experiments.scales import SCALES, STATE, base_recipe
+from cronos_lerobot.experiments.scales import BASE_KINDS, SCALES, STATE, base_recipe
 from cronos_lerobot.experiments.specs import Options
+from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.protocol.loop_state import LoopState
+from cronos_lerobot.protocol.resets import PeriodicSceneReset
 from cronos_lerobot.scripts import reproduce
 from cronos_lerobot.training.config import CronosTrainConfig
 
@@ -56,7 +59,7 @@ def test_each_plug_stands_alone_and_together_on_both_bases():
     assert [name.split("_")[-1] for name in narrow[5:-5]] == list(PLUGS)
     assert narrow[-5:] == [
         "tnone_eer_takeover_memory", "t1280_eer_critic_staggered", "t1280_eer_staggered_decay",
-        "t5120_eer_staggered_early_decay", "t80_decay",
+        "t4400_eer_staggered_early_decay", "t80_decay",
     ]  # fmt: skip
     wides = [f"{name}_wide_resets" if "lsr" in name else f"{name}_wide" for name in narrow]
     assert names == narrow + wides
@@ -77,10 +80,10 @@ def test_commands(tmp_path):
     }
     assert wanted < set(jobs[f"{base}/demos"].command)
     assert "--reset_tasks=true" in jobs[f"{base.replace('widedemos', 'wide_resetsdemos')}/demos"].command
-    run = jobs["kitchen_2x2_state_small/t5120_eer_staggered_early_decay_wide_307k/seed1"]
+    run = jobs["kitchen_2x2_state_small/t4400_eer_staggered_early_decay_wide_307k/seed1"]
     assert run.needs == (f"{base}/clone",)
     # 768 x 320 x 307,200 / 1,300,000
-    early = {"--protocol.curriculum=[[58074, 320]]", "--protocol.scene_reset_interval=5120"}
+    early = {"--protocol.curriculum=[[58074, 320]]", "--protocol.scene_reset_interval=4400"}
     assert early | {"--protocol.reset_phase=staggered", "--algorithm.kl_decay_updates=10"} < set(run.command)
     critic = jobs["kitchen_2x2_state_small/t1280_eer_critic_wide_307k/seed1"].command
     assert "--protocol.task_order=critic" in critic
@@ -95,7 +98,7 @@ def test_commands(tmp_path):
 def test_budgets_of_a_plug_need_no_interval_and_one_cannot_have_one():
     assert plugged("asked", interval=1280).interval is None
     assert plugged("critic", interval=5120).interval == 5120
-    assert plugged("staggered", "early").interval == 5120
+    assert plugged("staggered", "early").interval == 4400
     assert wide(plugged("critic")).name == "t1280_eer_critic_wide"
 
 
@@ -191,3 +194,30 @@ def test_only_the_papers_experiments_are_all(monkeypatch, capsys, tmp_path):
     out = capsys.readouterr().out
     assert "t80_307k" in out
     assert "wide" not in out
+
+
+def test_the_method_spends_what_its_budgets_allow():
+    """Counted by the strategy itself, switch by switch, over 1.3 M steps of 64 streams."""
+    counts = []
+    for row in METHOD_BY_BUDGET:
+        protocol = ProtocolConfig(
+            scene_reset_interval=row.interval,
+            curriculum=list(row.stages),
+            reset_phase="staggered" if "staggered" in row.name else "together",
+        )
+        reset, loop = PeriodicSceneReset(np.random.default_rng(0), protocol), LoopState(64, 4)
+        counts.append(0)
+        while loop.n < 1_300_480:
+            loop.t += 80
+            counts[-1] += len(reset.due(None, loop))
+    assert counts == [1008, 254, 64, 0]
+    assert counts[0] <= BUDGET
+
+
+def test_a_kind_of_demonstrations_keeps_its_flags():
+    """A base policy's folder tells no more of them than its name: other flags are a kind with another name."""
+    wide_flags = (
+        "--start.layouts=reach", "--start.arm_pose=after_task", "--start.occupied_receptacles=true",
+        "--start.misplaced_objects=true", "--start.earlier_tasks=3", "--start.share=0.5",
+    )  # fmt: skip
+    assert {"narrow": (), "wide": wide_flags, "wide_resets": (*wide_flags, "--reset_tasks=true")} == BASE_KINDS
