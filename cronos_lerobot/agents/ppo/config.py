@@ -121,7 +121,7 @@ class PPOConfig(RLAlgorithmConfig):
     """Passes after them that train the value alone."""
     value_warmup_updates: int = 2
     """Updates at the start of a run that train the value alone, because it starts from noise."""
-    minibatch_size: int = 2048
+    minibatch_size: int = 512
     """Decisions in one backward pass of one process."""
     grad_accumulation: int = 1
     """Minibatches of each process in one optimizer step."""
