@@ -72,18 +72,20 @@ class Kind:
 
 
 STEPS = 102_400
+LARGE_MINIBATCHES = ("--algorithm.minibatch_size=2048",)
+"""With which its results were made; today's default learns more (docs/trials.md)."""
 KINDS = {
     "tokens": Kind(
         ("--policy.type=pocketvla",),
         320,
-        {"ppo": (), "imitation": IMITATION},
+        {"ppo": LARGE_MINIBATCHES, "imitation": IMITATION},
         {"ppo": 204_800},
     ),
     "flow": Kind(
         ("--policy.type=pocketvla", "--policy.head=flow"),
         300,
         {
-            "ppo": ("--algorithm.noise_level=0.3", "--algorithm.ratio=factor"),
+            "ppo": ("--algorithm.noise_level=0.3", "--algorithm.ratio=factor", *LARGE_MINIBATCHES),
             "imitation": IMITATION,
             "steering": STEERING,
         },
@@ -97,7 +99,10 @@ KINDS = {
             f"--policy.normalization_mapping={json.dumps(MIN_MAX | {'ACTION': 'MEAN_STD'})}",
         ),
         4000,
-        {"ppo": ("--algorithm.noise_std=0.2", "--algorithm.ratio=factor"), "imitation": IMITATION},
+        {
+            "ppo": ("--algorithm.noise_std=0.2", "--algorithm.ratio=factor", *LARGE_MINIBATCHES),
+            "imitation": IMITATION,
+        },
         {"ppo": 204_800},
     ),
     "diffusion": Kind(
