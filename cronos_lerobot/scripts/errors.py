@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import sys
 from argparse import ArgumentError
 from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager, redirect_stderr
+from contextlib import contextmanager, redirect_stderr, suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -74,6 +75,7 @@ def parse_command_line(
     if config_path is not None and not Path(config_path).exists():
         raise FileNotFoundError(f"--config_path={config_path}: no such file or folder")
     sys.argv = [*given, *_missing_types(given, types or {})]
+    _allow_single_files(given)
     try:
         with redirect_stderr(said):
             config = parser.wrap()(keep)()  # ty: ignore[missing-argument]  (it reads the command line)
@@ -98,6 +100,15 @@ def parse_command_line(
         sys.argv = given
     sys.stderr.write(said.getvalue())
     return config
+
+
+def _allow_single_files(arguments: list[str]) -> None:
+    """Let `discover_packages_path` name a module as well as a package, in which LeRobot looks for more modules."""
+    for name in parser.parse_plugin_args(parser.PLUGIN_DISCOVERY_SUFFIX, arguments).values():
+        # LeRobot says what cannot be imported.
+        with suppress(ImportError):
+            module = importlib.import_module(name)
+            module.__path__ = getattr(module, "__path__", [])
 
 
 def _missing_types(arguments: list[str], types: Mapping[str, str]) -> list[str]:

@@ -33,6 +33,15 @@ def test_a_right_command_line_is_read(monkeypatch):
     assert parse(monkeypatch, "--name=b", "--inner.size=3") == Config("b", Inner(3))
 
 
+def test_a_plugin_may_be_one_file(monkeypatch, tmp_path):
+    (tmp_path / "my_only_file.py").write_text("imported = []\nimported.append(__name__)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert parse(monkeypatch, "--inner.discover_packages_path=my_only_file") == Config()
+    assert sys.modules.pop("my_only_file").imported == ["my_only_file"]
+    with pytest.raises(SystemExit, match=r"^error: Failed to load plugin 'no_such_file'"):
+        parse(monkeypatch, "--inner.discover_packages_path=no_such_file")
+
+
 def test_the_reason_that_draccus_hides_is_the_line(monkeypatch):
     with pytest.raises(SystemExit, match=r"^error: inner\.size must be >= 1, got 0\.$"):
         parse(monkeypatch, "--inner.size=0")
