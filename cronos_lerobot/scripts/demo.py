@@ -13,6 +13,7 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from cronos_lerobot.experiments.scales import BASE_KINDS, DIVERSE_DEMO_FLAGS, WIDE
 from cronos_lerobot.scripts import probe
 from cronos_lerobot.scripts.pipeline import Step, StepFailedError, remember, run_steps
 
@@ -59,14 +60,14 @@ class Scale:
 
 
 _FULL = Scale(
-    demos=400,
-    clone_steps=320,
+    demos=1200,
+    clone_steps=640,
     clone_batch=256,
-    train_steps=245_760,
+    train_steps=204_800,
     streams=64,
     update_interval=160,
     scene_reset_interval=320,
-    eval_freq=81_920,
+    eval_freq=102_400,
     train_eval_episodes=32,
     eval_episodes=64,
     eval_splits=("train", "held_out"),
@@ -95,12 +96,12 @@ SCALES = {
     ),
 }
 
-RECORD_FLAGS = ["--seed=1", "--noise.share=0.75", "--misses.share=0.25", "--steps_after_release=8"]
-"""Flags of `cronos-record-demos` that no scale changes. Noise and misses show how to recover; the frames after the
-release show that a finished task is left alone."""
+RECORD_FLAGS = ["--seed=1", *BASE_KINDS[WIDE], *DIVERSE_DEMO_FLAGS]
+"""Flags of `cronos-record-demos` that no scale changes: from layouts all over the reach, and from the middle of
+streams, a policy is cloned that does held-out layouts as well."""
 CLONE_FLAGS = ["--seed=1"]
 """Flags of `lerobot-train` that no scale changes."""
-TRAIN_FLAGS = ["--seed=1", "--protocol.end_effector_reset=true"]
+TRAIN_FLAGS = ["--seed=1", "--protocol.end_effector_reset=true", "--protocol.reset_phase=staggered"]
 """Flags of `cronos-train` that no scale changes."""
 
 

@@ -28,7 +28,7 @@ DIFFERENCE = {
 
 def test_the_table_by_hand(tmp_path):
     found = {"steps": 307_200, "rows": ROWS, "differences": [DIFFERENCE]}
-    (tmp_path / "few_resets.json").write_text(json.dumps(found))
+    (tmp_path / "few_resets_best.json").write_text(json.dumps(found))
     table = make_table(tmp_path)
     assert table.splitlines()[2:] == [
         "| episodic: a reset every 80 steps | 3,840 | 0.750 ± 0.100 [0.600, 0.900] | 2 |  |",
