@@ -71,6 +71,14 @@ def fingerprint(policy: PreTrainedConfig) -> str:
     return digest.hexdigest()[:16]
 
 
+def files_fingerprint(folder: Path) -> str:
+    """A short hash of a checkpoint's weights and processors, whatever flags make of its config."""
+    digest = hashlib.sha256()
+    for file in _weights_and_processors(folder):
+        digest.update(file.name.encode() + _hash(file))
+    return digest.hexdigest()[:16]
+
+
 def _weights_and_processors(folder: Path) -> Iterator[Path]:
     """Not config.json, of which flags may have another mind, nor train_config.json, which says how it was made."""
     for pattern in ("*.safetensors", "policy_*.json", "adapter_config.json"):

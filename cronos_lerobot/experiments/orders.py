@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from cronos_lerobot.experiments.differences import RowDifference, compare
@@ -35,14 +36,16 @@ class Order:
 
     @property
     def holds(self) -> str:
-        """`yes` and `no` where p < .05, and where two rows alike have an interval within `MARGIN` of zero."""
+        """`yes` and `no` where p < .05; of rows alike, where their interval is within `MARGIN`, or beyond it."""
         if self.found is None:
             return NOT_RUN
         value, p, ends = self.found.difference.value, self.found.difference.p, self.found.difference.ci95
         separated = p is not None and p < ALPHA
         if self.says == "alike":
-            within = ends is not None and max(map(abs, ends)) <= MARGIN
-            return YES if within else NO if separated else NOT_SEPARATED
+            low, high = ends or (-math.inf, math.inf)
+            if max(-low, high) <= MARGIN:
+                return YES
+            return NO if max(low, -high) > MARGIN else NOT_SEPARATED
         if not separated:
             return NOT_SEPARATED
         return YES if (value > 0) == (self.says == "higher") else NO

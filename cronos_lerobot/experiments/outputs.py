@@ -157,8 +157,8 @@ BUDGET_NOTES = (
 ORDER_NOTES = (
     "Differences as above, of the first row minus the second, on the episodes of the suite that is named: of"
     " chains, how many tasks were done before the first failure. Holds: yes"
-    f" or no where p < {ALPHA}, not adjusted, or where two rows that are said to do alike have an interval within"
-    f" {MARGIN} of zero."
+    f" or no where p < {ALPHA}, not adjusted; of two rows that are said to do alike, where the whole interval is"
+    f" within {MARGIN} of zero, or beyond it."
 )
 PPO_NOTES = (
     "A scale is that of steps, streams and seeds. The learning algorithm is `ppo`, with this project's settings,"
@@ -231,10 +231,13 @@ def _unfinished(result: ExperimentResult) -> list[str]:
     if result.changed:
         lines += ["", "## Left out: made by another command or version, or damaged", ""]
         lines += [f"- {text}" for text in result.changed]
-    for recipe, policies in result.bases.items():
+    for name, policies in result.bases.items():
         if len(policies) > 1:
-            lines += ["", f"## Not one base policy: {len(policies)} clones by the recipe of {recipe}", ""]
+            lines += ["", f"## Not one base policy: {len(policies)} clones called {name}", ""]
             lines += [f"- {base}: {_names(seeds)}" for base, seeds in policies.items()]
+    if mixed := result.mixed:
+        lines += ["", "## Rows whose runs had other settings by default", ""]
+        lines += [f"- {row}: {'; '.join(settings)}" for row, settings in mixed.items()]
     if result.commits:
         lines += ["", f"## Made at another commit than {this_commit() or 'this one'}", ""]
         lines += ["The versions are the same, so they count.", "", *(f"- {text}" for text in result.commits)]

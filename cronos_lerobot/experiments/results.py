@@ -17,10 +17,11 @@ from cronos_lerobot.experiments.definitions import INTERVENTIONS, CheckpointEval
 from cronos_lerobot.experiments.jobs import Job, changes, other_commits, read_record, status
 from cronos_lerobot.experiments.plan import base_evaluation_jobs, checkpoint_evaluations, train_job
 from cronos_lerobot.experiments.runner import DONE
-from cronos_lerobot.experiments.specs import Options, RunSpec, run_specs
+from cronos_lerobot.experiments.specs import Options, RunSpec, base_folder, run_specs
 from cronos_lerobot.protocol.metrics import Gap, Summary, performance_gap, success_at, summarise
 from cronos_lerobot.report.runs import Group, TrainingRun, read_training_run
 from cronos_lerobot.training.logging import METRICS
+from cronos_lerobot.training.resume import flatten
 
 RESULTS = "results.json"
 APART = ("found_complete", "never_grasped")
@@ -180,14 +181,35 @@ class ExperimentResult:
 
     @property
     def bases(self) -> dict[str, dict[str, list[SeedResult]]]:
-        """By `Base.recipe`, then by the fingerprint of the policy that was cloned by it: the runs from there.
+        """By its folder's name, then by the fingerprint of the policy that was cloned there: the runs from it.
 
         Two machines may clone the same demonstrations to other last bits.
         """
         found: dict[str, dict[str, list[SeedResult]]] = {}
         for seed in (seed for row in self.rows for seed in row.seeds):
             if base := seed.run.base:
-                found.setdefault(seed.spec.base.recipe, {}).setdefault(base, []).append(seed)
+                name = (
+                    "--policy.path" if self.options.policy_path else base_folder(seed.spec.base, self.options).name
+                )
+                found.setdefault(name, {}).setdefault(base, []).append(seed)
+        return found
+
+    @property
+    def mixed(self) -> dict[str, list[str]]:
+        """Rows whose runs had several settings of the agent, though the same command: the default has changed.
+
+        By the row's name: each setting with its values and the seeds that had them.
+        """
+        found: dict[str, list[str]] = {}
+        for row in self.rows:
+            settings = {seed.spec.seed: flatten(seed.run.config.get("algorithm", {})) for seed in row.seeds}
+            for name in sorted({name for values in settings.values() for name in values}):
+                seeds: dict[str, list[int]] = {}
+                for number, values in settings.items():
+                    seeds.setdefault(str(values.get(name)), []).append(number)
+                if len(seeds) > 1:
+                    said = [f"{value} (seed {', '.join(map(str, numbers))})" for value, numbers in seeds.items()]
+                    found.setdefault(row.row.name, []).append(f"{name} {', '.join(said)}")
         return found
 
     @property

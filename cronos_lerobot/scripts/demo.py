@@ -76,7 +76,7 @@ _FULL = Scale(
 
 SCALES = {
     "full": _FULL,
-    # A third of the learning, half of the evaluation.
+    # Two fifths of the learning, half of the evaluation.
     "short": replace(
         _FULL, train_steps=81_920, eval_freq=40_960, train_eval_episodes=16, eval_episodes=32, filmed_segments=8
     ),
@@ -222,8 +222,8 @@ def choose_scale(folder: Path) -> str:
     print(f"the demo takes about {minutes[scale]:.0f} min here.")
     if scale == "short":
         print(
-            f"That is a shortened one, with a third of the learning; in full (--scale=full) it would take about "
-            f"{minutes['full']:.0f} min."
+            "That is a shortened one, with two fifths of the learning; in full (--scale=full) it would take about"
+            f" {minutes['full']:.0f} min."
         )
     return scale
 

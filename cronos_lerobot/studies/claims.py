@@ -13,13 +13,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-from cronos_lerobot.experiments.columns import WORDS
+from cronos_lerobot.experiments.columns import MISSING, WORDS
 from cronos_lerobot.studies import marked_tables
 from cronos_lerobot.studies.marked_tables import MarkedTable
 
 RESULTS = Path("docs/results")
 CLAIMS = MarkedTable("claims", Path("docs/results.md"), "cronos_lerobot.studies.claims")
-MISSING = "–"
 
 
 def read_experiments(folder: Path) -> list[dict[str, Any]]:

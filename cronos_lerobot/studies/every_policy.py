@@ -17,7 +17,6 @@ import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -217,9 +216,8 @@ def read_runs(folder: Path) -> dict[Run, TrainingRun]:
     begun = {}
     for path in sorted(path.parent for path in (folder / "runs").glob(f"*_*_*_*/{METRICS}")):
         kind, agent, interval, seed = path.name.split("_")
-        if kind in KINDS:
-            with suppress(ValueError):
-                begun[Run(kind, agent, int(interval), int(seed))] = read_training_run(path)
+        if kind in KINDS and (path / METRICS).read_bytes().count(b"\n"):
+            begun[Run(kind, agent, int(interval), int(seed))] = read_training_run(path)
     return begun
 
 

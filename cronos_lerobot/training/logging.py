@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from cronos_lerobot.evaluation.policy_source import fingerprint
+from cronos_lerobot.evaluation.policy_source import files_fingerprint
 from cronos_lerobot.protocol.loop_state import LoopState
 from cronos_lerobot.provenance import git_commit, package_versions
 from cronos_lerobot.training.config import CronosTrainConfig
@@ -198,7 +198,7 @@ def _policy_fingerprint(config: CronosTrainConfig) -> str | None:
     policy = config.policy
     if policy is None or not policy.pretrained_path or not Path(policy.pretrained_path).is_dir():
         return None
-    return fingerprint(policy)
+    return files_fingerprint(Path(policy.pretrained_path))
 
 
 def read_starts(path: Path) -> list[dict[str, Any]]:

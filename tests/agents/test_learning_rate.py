@@ -23,6 +23,8 @@ def test_target_kl_halves_after_so_many_updates():
     assert target_kl(PPOConfig(target_kl=0.08), 12) == 0.08
     with pytest.raises(ValueError, match=r"kl_decay_updates=4 needs algorithm.target_kl"):
         PPOConfig(target_kl=None, lr_schedule="fixed", kl_decay_updates=4)
+    with pytest.raises(ValueError, match="kl_decay_updates=4 has no effect where neither"):
+        PPOConfig(target_kl=0.08, lr_schedule="fixed", kl_stop_factor=None, kl_decay_updates=4)
 
 
 def test_a_smaller_target_stops_an_update_sooner():

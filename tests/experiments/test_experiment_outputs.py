@@ -347,20 +347,36 @@ def test_report_only_from_the_command_line(options, tmp_path):
     assert Path(tmp_path / "out/table1.png").exists()
 
 
+def edit_first_start(spec, **changes):
+    """As if the run had begun with these entries of its manifest; a start that resumed it has others."""
+    manifest = spec.train_folder / "manifest.json"
+    first = json.loads(manifest.read_text())["starts"][0]
+    manifest.write_text(json.dumps({"starts": [first | changes, first | {"policy_fingerprint": "checkpoint"}]}))
+
+
 def test_clones_that_differ_are_said(options, tmp_path):
     """Runs of several machines make one table; their base policies may differ in the last bits."""
-    for seed, fingerprint in ((1, "aaaa"), (2, "bbbb")):
-        spec = make_run(options, "table1", "t80", seed, (2, 4, 5))
-        manifest = spec.train_folder / "manifest.json"
-        starts = json.loads(manifest.read_text())["starts"]
-        # A run that was resumed began with what it first had.
-        starts = [
-            starts[0] | {"policy_fingerprint": fingerprint},
-            starts[0] | {"policy_fingerprint": "checkpoint"},
-        ]
-        manifest.write_text(json.dumps({"starts": starts}))
-        page = write_outputs(EXPERIMENTS["table1"], EXPERIMENTS["table1"].rows, options, tmp_path / "out")
-        assert ("Not one base policy" in page) == (seed == 2)
-    assert "## Not one base policy: 2 clones by the recipe of kitchen_2x2" in page
+    experiment = EXPERIMENTS["figure4"]
+    # Rows of one configuration begin with a base policy of their own.
+    for row, seed, fingerprint in (("t80", 1, "aaaa"), ("t80_1config", 1, "cccc"), ("t80", 2, "bbbb")):
+        edit_first_start(make_run(options, "figure4", row, seed, (2, 4, 5)), policy_fingerprint=fingerprint)
+        page = write_outputs(experiment, experiment.rows, options, tmp_path / "out")
+        assert ("Not one base policy" in page) == (fingerprint == "bbbb")
+    name = "kitchen_2x2_state_400demos_320steps"
+    assert f"## Not one base policy: 2 clones called {name}" in page
     assert "- aaaa: t80 seed 1\n- bbbb: t80 seed 2" in page
-    assert json.loads((tmp_path / "out/table1.json").read_text())["bases"] == {"kitchen_2x2": ["aaaa", "bbbb"]}
+    bases = json.loads((tmp_path / "out/figure4.json").read_text())["bases"]
+    assert bases == {name: ["aaaa", "bbbb"], f"{name}_1config": ["cccc"]}
+
+
+def test_other_defaults_behind_one_command_are_said(options, tmp_path):
+    experiment = EXPERIMENTS["table1"]
+    for row, seed, size in (("t80", 1, 2048), ("t80", 2, 512), ("t1280", 1, 512)):
+        spec = make_run(options, "table1", row, seed, (2, 4, 5))
+        manifest = spec.train_folder / "manifest.json"
+        text = manifest.read_text()
+        assert text.count('{"type": "ppo"}') == 1
+        manifest.write_text(text.replace('{"type": "ppo"}', f'{{"type": "ppo", "minibatch_size": {size}}}'))
+        page = write_outputs(experiment, experiment.rows, options, tmp_path / "out")
+        assert ("other settings by default" in page) == ((row, seed) != ("t80", 1))
+    assert "- t80: minibatch_size 2048 (seed 1), 512 (seed 2)" in page
