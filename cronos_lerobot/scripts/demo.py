@@ -1,4 +1,4 @@
-"""`cronos-demo`: the whole of CRONOS in one command, in about ten minutes on two CPU cores.
+"""`cronos-demo`: the whole of CRONOS in one command, in about twelve minutes on two CPU cores.
 
 The scripted expert demonstrates four tasks in a shared kitchen scene, a small policy is cloned from it, that
 policy goes on learning by itself in 64 streams that are hardly ever reset, and both are evaluated on layouts of
@@ -22,9 +22,9 @@ DEMOS = "local/cronos_demos"
 STREAMS = "local/cronos_demo_streams"
 PAGE = "index.html"
 
-MINUTES_PER_PROBE_SECOND = {"full": 8.5, "short": 4.3}
-"""How long a scale takes [min] where the probe takes one second. Of full: 9.9 minutes where it took 1.17 s, on two
-cores with nothing else to do; of short: from the minutes of full's steps."""
+MINUTES_PER_PROBE_SECOND = {"full": 8.8, "short": 5.1}
+"""How long a scale takes [min] where the probe takes one second. Of full: 11.5 minutes where it took 1.31 s, on
+two cores with little else to do; of short: from the minutes of full's steps."""
 SHORTEN_ABOVE_MIN = 20.0
 """Where the full demo would take longer than this, `--scale=auto` takes the short one."""
 
