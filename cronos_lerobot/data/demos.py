@@ -23,7 +23,7 @@ from cronos_lerobot.data.perturbations import (
 from cronos_lerobot.data.schema import SUCCESS, TRUNCATED
 from cronos_lerobot.data.writer import SegmentWriter
 
-ARM_POSES = ("home", "random", "after_task")
+ARM_POSES = ("home", "random", "after_task", "either")
 FREE_LAYOUTS = {"random": sample_configuration, "reach": sample_reach_configuration}
 """How layouts are drawn that are no configuration of the benchmark."""
 LAYOUTS = ("train", *FREE_LAYOUTS)
@@ -45,6 +45,16 @@ class Expert(Protocol):
         """Actions (n, 7) in physical units for the environment's state as it is now."""
 
 
+class StreamPolicy(Protocol):
+    """A policy that acts in all streams of a vector environment and learns nothing."""
+
+    def forget(self, ids: np.ndarray) -> None:
+        """A new task begins in the streams `ids`."""
+
+    def choose(self, o_t: dict[str, np.ndarray], tau: list[str]) -> np.ndarray:
+        """Actions (n, 7) in physical units for what streams observe, with their instructions."""
+
+
 @dataclass
 class StartConfig:
     """Where a demonstration starts."""
@@ -55,7 +65,8 @@ class StartConfig:
     num_configurations: int = NUM_CONFIGURATIONS
     """Of the training configurations the first so many; a policy cloned from one has only ever seen that one."""
     arm_pose: str = "home"
-    """`home`; `random`: at a random place above the table; `after_task`: where another task left it."""
+    """`home`; `random`: at a random place above the table; `after_task`: where another task left it; `either`:
+    in every second episode after another task where that left it, and at home in the others."""
     occupied_receptacles: bool = False
     """The target receptacle already holds another object."""
     misplaced_objects: bool = False
@@ -65,6 +76,10 @@ class StartConfig:
     """Where a demonstration begins after another task, how many may have been done: one to so many, with equal
     chances, the last of them as above and those before it any others. From two on all objects may lie on
     receptacles, and two on one, as in a stream that goes on without a scene reset."""
+    policy: str | None = None
+    """Checkpoint or Hub id of a policy that does the earlier tasks in place of the expert: one to `earlier_tasks`
+    of any, each for `max_steps`, whether it succeeds or not. Demonstrations then begin where its own streams get
+    stuck (as in DAgger, Ross et al. 2011, an expert for the states of the learner)."""
     leaning_share: float = 0.0
     """Share of the layouts in which one object has fallen over the edge of another body, from 0 to 1."""
     share: float = 1.0
@@ -86,7 +101,13 @@ class StartConfig:
         if self.earlier_tasks > 1 and not self.is_after_another:
             raise ValueError(
                 f"start.earlier_tasks={self.earlier_tasks} needs start.occupied_receptacles,"
-                " start.misplaced_objects or start.arm_pose=after_task: without them nothing was done before"
+                " start.misplaced_objects, start.arm_pose=after_task or start.policy: without them nothing was"
+                " done before"
+            )
+        if self.policy and (self.occupied_receptacles or self.misplaced_objects):
+            raise ValueError(
+                "start.policy does any tasks before: start.occupied_receptacles and start.misplaced_objects say"
+                " which ones the expert does"
             )
         for name in ("share", "leaning_share"):
             if not 0 <= (value := getattr(self, name)) <= 1:
@@ -95,7 +116,8 @@ class StartConfig:
     @property
     def is_after_another(self) -> bool:
         """Whether demonstrations begin where another task ended."""
-        return self.occupied_receptacles or self.misplaced_objects or self.arm_pose == "after_task"
+        after_task = self.arm_pose in ("after_task", "either")
+        return self.occupied_receptacles or self.misplaced_objects or after_task or bool(self.policy)
 
 
 @dataclass
@@ -132,6 +154,8 @@ class _Episode:
     """Those that are not done yet, the next one first."""
     at_home: bool
     rng: np.random.Generator
+    arm_goes_home: bool = False
+    """After what was done before."""
     settling: bool = True
     steps: int = 0
     released: int = 0
@@ -154,6 +178,7 @@ class DemoCollector:
         *,
         seed: int = 0,
         tasks: Sequence[Task] | None = None,
+        policy: StreamPolicy | None = None,
     ) -> None:
         """Collect from all streams of `env` into `writer`, which may already hold episodes.
 
@@ -164,8 +189,14 @@ class DemoCollector:
             config: what a demonstration is.
             seed: decides layouts, noise, misses and starts.
             tasks: to demonstrate; all of the scene's when None, with its reset tasks if `config` says so.
+            policy: that of `config.start.policy`.
+
+        Raises:
+            ValueError: there is a policy and `config` names none, or the other way round.
         """
-        self.env, self.expert, self.writer, self.config = env, expert, writer, config
+        if (policy is None) != (config.start.policy is None):
+            raise ValueError(f"start.policy is {config.start.policy}, and the policy that was given is {policy}")
+        self.env, self.expert, self.writer, self.config, self.policy = env, expert, writer, config, policy
         self.finished, self.successes = 0, 0
         self._started = 0
         self._seed = (seed, writer.num_episodes)
@@ -193,11 +224,21 @@ class DemoCollector:
         while any(episode is not None for episode in self._episodes):
             labels = np.clip(self.expert.act(), ACTION_LOW, ACTION_HIGH).astype(np.float32)
             columns = observation_columns(observation) | {ACTION: labels}
-            observation, reward, _, _, info = self.env.step(self._perturb(labels))
+            executed = self._perturb(self._let_policy_act(observation, labels))
+            observation, reward, _, _, info = self.env.step(executed)
             columns |= {REWARD: reward, SUCCESS: info["is_success"]}
             for stream in range(self.env.num_envs):
                 self._after_step(stream, columns, info)
             self._start_idle_streams(num_episodes)
+
+    def _let_policy_act(self, observation: dict[str, np.ndarray], labels: np.ndarray) -> np.ndarray:
+        """Actions in which earlier tasks are the policy's, if there is one."""
+        if self.policy is None:
+            return labels
+        earlier = np.array([episode is not None and bool(episode.preludes) for episode in self._episodes])
+        if not earlier.any():
+            return labels
+        return np.where(earlier[:, None], self.policy.choose(observation, self.env.instructions), labels)
 
     def _perturb(self, labels: np.ndarray) -> np.ndarray:
         recording = np.array([episode is not None and not episode.preludes for episode in self._episodes])
@@ -222,13 +263,14 @@ class DemoCollector:
             for key, column in columns.items():
                 episode.frames.setdefault(key, []).append(column[stream].copy())
         succeeded = episode.released > self.config.steps_after_release
+        is_late = episode.steps >= self.config.max_steps
         if info["diverged"][stream]:
             self._end(stream, episode, succeeded=False, keep=False)
-        elif succeeded and episode.preludes:
+        elif episode.preludes and (is_late if self.policy else succeeded):
             self._end_prelude(stream, episode)
-        elif succeeded:
+        elif succeeded and not episode.preludes:
             self._end(stream, episode, succeeded=True, keep=True)
-        elif episode.steps >= self.config.max_steps:
+        elif is_late:
             self._end(stream, episode, succeeded=False, keep=self.config.keep_failures and not episode.preludes)
 
     def _end(self, stream: int, episode: _Episode, *, succeeded: bool, keep: bool) -> None:
@@ -254,12 +296,15 @@ class DemoCollector:
     def _end_prelude(self, stream: int, episode: _Episode) -> None:
         ids = np.array([stream])
         del episode.preludes[0]
+        if episode.arm_goes_home and (self.policy is not None or not episode.preludes):
+            self.env.end_effector_reset(ids)
         if episode.preludes:
             self._begin_prelude(ids, episode)
             return
-        if self.config.start.arm_pose == "home" or episode.at_home:
-            self.env.end_effector_reset(ids)
         self._begin_task(ids, episode)
+        if self.policy is not None and self.env.is_success[stream]:
+            # The policy has left it complete: nothing can be shown.
+            self._episodes[stream] = None
 
     def _start_idle_streams(self, num_episodes: int) -> None:
         """Give every idle stream an episode of the task that has the fewest, until enough are under way."""
@@ -292,6 +337,10 @@ class DemoCollector:
         if task.receptacle is None or (start.is_after_another and not episode.at_home):
             earlier = [] if episode.at_home else self._earlier(task, rng)
             episode.preludes = [*earlier, self._prelude(task, rng)]
+            pose = start.arm_pose
+            episode.arm_goes_home = (
+                pose == "home" or episode.at_home or (pose == "either" and bool(rng.random() < 0.5))
+            )
             self._begin_prelude(ids, episode)
         else:
             self._begin_task(ids, episode)
@@ -312,6 +361,9 @@ class DemoCollector:
             own = [other for other in self.env.scene.tasks if other.object == task.object]
             return own[rng.integers(len(own))]
         start = self.config.start
+        if start.policy is not None:
+            others = [other for other in self.env.scene.tasks if other != task]
+            return others[rng.integers(len(others))]
         # Whether the task before had the same object, and the same receptacle.
         wanted = {(False, True)} if start.occupied_receptacles else set()
         wanted |= {(True, False)} if start.misplaced_objects else set()
@@ -325,6 +377,8 @@ class DemoCollector:
     def _begin_prelude(self, ids: np.ndarray, episode: _Episode) -> None:
         self.env.set_task(ids, episode.preludes[:1])
         self.expert.reset(ids)
+        if self.policy is not None:
+            self.policy.forget(ids)
         episode.steps, episode.released = 0, 0
 
     def _begin_task(self, ids: np.ndarray, episode: _Episode) -> None:

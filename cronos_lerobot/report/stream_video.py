@@ -189,17 +189,35 @@ def make_spectator(
     Raises:
         ValueError: there is no such checkpoint, or no environment of the scene shows it what it takes.
     """
-    folder = find_policy(policy_path).folder
-    policy_config = PreTrainedConfig.from_pretrained(folder)
-    policy_config.pretrained_path, policy_config.device = folder, device
+    policy_config = _read_policy(policy_path, device)
     features = policy_config.input_features or {}
-    where = {"scene": scene} if scene else trained_scene(folder)
+    where = {"scene": scene} if scene else trained_scene(policy_config.pretrained_path)
     env_config = CronosEnvConfig(**observations_of(features), **where)
     told = task_observation_of(features, env_config)
     env_config = dataclasses.replace(env_config, task_observation=told)
+    return env_config, _spectator(policy_config, env_config)
+
+
+def load_spectator(policy_path: str, env_config: CronosEnvConfig, device: str = "cpu") -> PolicySpectator:
+    """Load a policy for an environment that is given; see `make_spectator`.
+
+    Raises:
+        ValueError: there is no such checkpoint, or the environment does not show it what it takes.
+    """
+    return _spectator(_read_policy(policy_path, device), env_config)
+
+
+def _read_policy(policy_path: str, device: str) -> PreTrainedConfig:
+    folder = find_policy(policy_path).folder
+    policy_config = PreTrainedConfig.from_pretrained(folder)
+    policy_config.pretrained_path, policy_config.device = folder, device
+    return policy_config
+
+
+def _spectator(policy_config: PreTrainedConfig, env_config: CronosEnvConfig) -> PolicySpectator:
     check_observations(policy_config, env_config)
     temperature = getattr(policy_config, "temperature", SuitesConfig.temperature)
-    return env_config, PolicySpectator(load_actor(policy_config, env_config, temperature))
+    return PolicySpectator(load_actor(policy_config, env_config, temperature))
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -27,6 +27,7 @@ from cronos_lerobot.data.origin import DEMONSTRATIONS, flags_of, origin_of
 from cronos_lerobot.data.schema import demonstration_features, feature_names
 from cronos_lerobot.data.writer import RecordingError, SegmentWriter
 from cronos_lerobot.locks import FolderLock
+from cronos_lerobot.report.stream_video import PolicySpectator, load_spectator
 from cronos_lerobot.scripts.errors import error_line, parse_command_line, stop
 
 MAY_DIFFER = ("resume", "num_envs", "env.num_threads", "dataset.repo_id", "dataset.num_episodes")
@@ -104,13 +105,23 @@ def record_demos(cfg: RecordDemosConfig) -> None:
     _collect(cfg, *_open(cfg))
 
 
-def _open(cfg: RecordDemosConfig) -> tuple[CronosVectorEnv, SegmentWriter]:
+Opened = tuple[CronosVectorEnv, SegmentWriter, PolicySpectator | None]
+"""Streams, the dataset, and the policy that does the earlier tasks."""
+
+
+def _open(cfg: RecordDemosConfig) -> Opened:
     assert isinstance(cfg.env, CronosEnvConfig)
+    policy = None
+    if cfg.start.policy is not None:
+        policy = load_spectator(cfg.start.policy, cfg.env)
+        policy.seed(cfg.seed)
     env = CronosVectorEnv(cfg.num_envs, cfg.env.scene, **cfg.env.gym_kwargs)
-    return env, open_writer(cfg, env)
+    return env, open_writer(cfg, env), policy
 
 
-def _collect(cfg: RecordDemosConfig, env: CronosVectorEnv, writer: SegmentWriter) -> None:
+def _collect(
+    cfg: RecordDemosConfig, env: CronosVectorEnv, writer: SegmentWriter, policy: PolicySpectator | None
+) -> None:
     from lerobot_env_cronos.expert.expert import ScriptedExpert
 
     task = find_task(env.scene.name, cfg.env.task)
@@ -119,9 +130,8 @@ def _collect(cfg: RecordDemosConfig, env: CronosVectorEnv, writer: SegmentWriter
         with writer:
             before = writer.num_episodes
             expert = ScriptedExpert(env, seed=cfg.seed)
-            collector = DemoCollector(
-                env, expert, writer, cfg, seed=cfg.seed, tasks=None if task is None else [task]
-            )
+            tasks = None if task is None else [task]
+            collector = DemoCollector(env, expert, writer, cfg, seed=cfg.seed, tasks=tasks, policy=policy)
             with tqdm(total=cfg.dataset.num_episodes, initial=before, unit="episode") as bar:
                 frames = 0
 
