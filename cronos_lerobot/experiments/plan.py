@@ -83,7 +83,9 @@ def _record_command(base: Base, options: Options, folder: Path) -> list[str]:
     recipe = options.recipes[base.recipe]
     command = ["cronos-record-demos", "--env.type=cronos", f"--env.scene={base.scene}"]
     command += [f"--dataset.repo_id=local/{folder.parent.name}", f"--dataset.root={folder}"]
-    command += [f"--env.obs_type={options.obs_type}", f"--dataset.num_episodes={recipe.demos}", "--seed=1"]
+    # A second round draws layouts of its own.
+    seed = 2 if recipe.corrects else 1
+    command += [f"--env.obs_type={options.obs_type}", f"--dataset.num_episodes={recipe.demos}", f"--seed={seed}"]
     command += recipe.demo_flags
     command += [] if base.configurations == 64 else [f"--start.num_configurations={base.configurations}"]
     if OBS_NAMES[options.obs_type] == "pixels":
