@@ -16,7 +16,7 @@ from cronos_lerobot.experiments.definitions import (
     Row,
     register_experiment,
 )
-from cronos_lerobot.experiments.scales import CORRECTED, WIDE, WIDE_RESETS
+from cronos_lerobot.experiments.scales import WIDE, WIDE_RESETS
 
 INTERVAL = 1280
 """T of the rows with few resets: a sixteenth of the resets of T = 80."""
@@ -73,12 +73,12 @@ def wide(row: Row) -> Row:
 
     Those of a row with learned resets have reset tasks among them.
     """
-    return replace(row, base=WIDE_RESETS if row.learned_reset else WIDE)
+    return with_resets(row) if row.learned_reset else replace(row, base=WIDE)
 
 
-def corrected(row: Row) -> Row:
-    """The row from the wide base policy after a second round, demonstrated where its own streams got stuck."""
-    return replace(row, base=CORRECTED)
+def with_resets(row: Row) -> Row:
+    """The row from the wide base policy that can do reset tasks, whether they are given or not."""
+    return replace(row, base=WIDE_RESETS)
 
 
 PLAIN = Row(INTERVAL, end_effector_reset=True)
@@ -91,15 +91,14 @@ AIDS = (
 )
 """The paper's: Table 1's rows with end-effector resets."""
 METHOD = plugged(*TOGETHER)
+LEARNED = replace(METHOD, learned_reset=True)
+"""Learned resets keep old scenes like fresh ones, if the base policy can do them."""
 TAUGHT = plugged("takeover", "memory")
 """An expert's segments are cloned only where successes are kept."""
 TUNED = Row(80, tag="decay", flags=PLUGS["decay"].flags)
 """What settles the policy of few resets may settle that of T = 80."""
 PAIRS = (TAUGHT, plugged("critic", "staggered"), plugged("staggered", "decay"))
 SCREENED = (*AIDS, *(plugged(name) for name in PLUGS), *PAIRS, METHOD, TUNED)
-
-COMPARED = (EPISODIC, TUNED, PLAIN, BEST, METHOD)
-"""T = 80, as it is and settling, few resets alone, the paper's best row, and this project's."""
 
 METHOD_BY_BUDGET = (
     METHOD,
@@ -133,7 +132,7 @@ for _experiment in (
     Experiment(
         "few_resets_best",
         "Learning with few resets, evaluated in full",
-        (*map(wide, COMPARED), *map(corrected, COMPARED)),
+        (*map(wide, (EPISODIC, TUNED, PLAIN, BEST, METHOD)), *map(with_resets, (TUNED, METHOD, LEARNED))),
         splits=BOTH,
         evaluations=(CheckpointEvaluation("independent", ("held_out",)), CheckpointEvaluation("sequential", BOTH)),
         budgets=_BUDGETS,

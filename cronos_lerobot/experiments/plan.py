@@ -20,7 +20,7 @@ from cronos_lerobot.experiments.definitions import (
 )
 from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job
 from cronos_lerobot.experiments.progress import train_progress
-from cronos_lerobot.experiments.scales import ALGORITHM_FLAGS, OBS_NAMES, BaseRecipe
+from cronos_lerobot.experiments.scales import ALGORITHM_FLAGS, OBS_NAMES
 from cronos_lerobot.experiments.specs import (
     UPDATE_INTERVAL,
     Options,
@@ -52,59 +52,29 @@ def make_jobs(experiments: Iterable[tuple[Experiment, tuple[Row, ...]]], options
 
 
 def base_jobs(base: Base, options: Options) -> list[Job]:
-    """Demonstrations of the expert, and their cloning: two jobs.
-
-    A second round has those of the first before it, and joins the demonstrations of both.
-    """
+    """Demonstrations of the expert, and their cloning: two jobs."""
     folder, recipe, scene = base_folder(base, options), options.recipes[base.recipe], base.scene
-    environment, name = gymnasium_id(scene), f"base/{folder.name}"
-
-    def job(what: str, command: Iterable[str], *needs: Job) -> Job:
-        needed = tuple(one.name for one in needs)
-        return Job(
-            f"{name}/{what}", tuple(command), folder / what, needs=needed, environment=environment, stage=BASE
-        )
-
-    if recipe.corrects is None:
-        demos = job("demos", _record_command(base, options, folder / "demos"))
-        return [demos, job("clone", _clone_command(folder, recipe, options), demos)]
-    first = replace(options, recipes={base.recipe: recipe.corrects})
-    *before, clone = base_jobs(base, first)
-    start = f"--start.policy={base_policy(base, first)}"
-    corrections = job("corrections", [*_record_command(base, options, folder / "corrections"), start], clone)
-    both = [str(folder / "corrections"), str(before[-1].output)]
-    merge = ["lerobot-edit-dataset", f"--new_repo_id=local/{folder.name}", f"--new_root={folder / 'demos'}"]
-    merge += ["--operation.type=merge", f"--operation.repo_ids={json.dumps(['local/second', 'local/first'])}"]
-    demos = job("demos", [*merge, f"--operation.roots={json.dumps(both)}"], corrections)
-    return [*before, clone, corrections, demos, job("clone", _clone_command(folder, recipe, options), demos)]
-
-
-def _record_command(base: Base, options: Options, folder: Path) -> list[str]:
-    recipe = options.recipes[base.recipe]
-    command = ["cronos-record-demos", "--env.type=cronos", f"--env.scene={base.scene}"]
-    command += [f"--dataset.repo_id=local/{folder.parent.name}", f"--dataset.root={folder}"]
-    # A second round draws layouts of its own.
-    seed = 2 if recipe.corrects else 1
-    command += [f"--env.obs_type={options.obs_type}", f"--dataset.num_episodes={recipe.demos}", f"--seed={seed}"]
-    command += recipe.demo_flags
-    command += [] if base.configurations == 64 else [f"--start.num_configurations={base.configurations}"]
-    if OBS_NAMES[options.obs_type] == "pixels":
-        # PNG images; the critic sees the privileged state.
-        command += ["--env.privileged_state=true", "--dataset.video=false", "--num_envs=64"]
-    return command
-
-
-def _clone_command(folder: Path, recipe: BaseRecipe, options: Options) -> list[str]:
-    command = ["lerobot-train", "--policy.type=pocketvla", "--policy.device=cpu", "--policy.push_to_hub=false"]
-    command += [f"--dataset.repo_id=local/{folder.name}", f"--dataset.root={folder / 'demos'}"]
-    command += [f"--batch_size={recipe.clone_batch}", f"--steps={recipe.clone_steps}"]
-    command += [f"--save_freq={recipe.save_freq}", "--log_freq=40", "--wandb.enable=false", "--seed=1"]
-    command += [f"--output_dir={folder / 'clone'}"]
-    if OBS_NAMES[options.obs_type] == "pixels":
-        # One worker decodes the PNG images.
-        command += ["--policy.observation=image", "--policy.critic_observation=environment_state"]
-        return [*command, "--num_workers=1", "--dataloader_multiprocessing_context=fork"]
-    return [*command, "--num_workers=0"]
+    pixels = OBS_NAMES[options.obs_type] == "pixels"
+    dataset = (f"--dataset.repo_id=local/{folder.name}", f"--dataset.root={folder / 'demos'}")
+    record = ["cronos-record-demos", "--env.type=cronos", f"--env.scene={scene}", *dataset]
+    record += [f"--env.obs_type={options.obs_type}", f"--dataset.num_episodes={recipe.demos}", "--seed=1"]
+    record += recipe.demo_flags
+    record += [] if base.configurations == 64 else [f"--start.num_configurations={base.configurations}"]
+    clone = ["lerobot-train", "--policy.type=pocketvla", "--policy.device=cpu", "--policy.push_to_hub=false"]
+    clone += [*dataset, f"--batch_size={recipe.clone_batch}", f"--steps={recipe.clone_steps}"]
+    clone += [f"--save_freq={recipe.save_freq}", "--log_freq=40", "--wandb.enable=false", "--seed=1"]
+    clone += [f"--output_dir={folder / 'clone'}"]
+    if pixels:
+        # PNG images and one worker that decodes them; the critic sees the privileged state.
+        record += ["--env.privileged_state=true", "--dataset.video=false", "--num_envs=64"]
+        clone += ["--policy.observation=image", "--policy.critic_observation=environment_state"]
+        clone += ["--num_workers=1", "--dataloader_multiprocessing_context=fork"]
+    else:
+        clone += ["--num_workers=0"]
+    name = f"base/{folder.name}"
+    demos = Job(f"{name}/demos", tuple(record), folder / "demos", environment=gymnasium_id(scene), stage=BASE)
+    clone_job = Job(f"{name}/clone", tuple(clone), folder / "clone", needs=(demos.name,), stage=BASE)
+    return [demos, replace(clone_job, environment=demos.environment)]
 
 
 def train_flags(spec: RunSpec) -> list[str]:

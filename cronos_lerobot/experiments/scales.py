@@ -49,7 +49,7 @@ SCALES: dict[str, Scale] = {
 
 DIVERSE_DEMO_FLAGS = ("--noise.share=0.75", "--misses.share=0.25", "--steps_after_release=8")
 """Noise and misses show how to recover, the frames after the release that a finished task is left alone."""
-WIDE, WIDE_RESETS, CORRECTED = "wide", "wide_resets", "corrected"
+WIDE, WIDE_RESETS = "wide", "wide_resets"
 _WIDE_FLAGS = (
     "--start.layouts=reach",
     "--start.arm_pose=after_task",
@@ -62,18 +62,10 @@ BASE_KINDS: dict[str, tuple[str, ...]] = {
     NARROW: (),
     WIDE: _WIDE_FLAGS,
     WIDE_RESETS: (*_WIDE_FLAGS, "--reset_tasks=true"),
-    CORRECTED: (
-        "--start.layouts=reach",
-        "--start.arm_pose=either",
-        "--start.earlier_tasks=6",
-        "--start.share=0.75",
-    ),
 }
 """Kinds of base policies by where their demonstrations begin, as flags of `cronos-record-demos`: in the training
 configurations; wherever the arm can do the tasks, every second after one to three other tasks: where they left the
-arm, other objects on the target, the object itself on another receptacle; the same with reset tasks among them;
-and those of a second round (`BaseRecipe.corrects`), three in four after one to six tasks of the first round's
-clone, which leaves the scene as no expert does."""
+arm, other objects on the target, the object itself on another receptacle; the same with reset tasks among them."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +85,6 @@ class BaseRecipe:
     comes from home, which is the bias of the paper's base policy (Section 5)."""
     kind: str = NARROW
     """Where the demonstrations begin: one of `BASE_KINDS`."""
-    corrects: BaseRecipe | None = None
-    """The first round, if this is a second: `demos` begin in streams of its base policy (`--start.policy`), and
-    the demonstrations of both rounds are cloned."""
 
     def __post_init__(self) -> None:
         valid = [*range(self.save_freq, self.clone_steps, self.save_freq), self.clone_steps]
@@ -111,9 +100,7 @@ class BaseRecipe:
     def made(self) -> str:
         """What its folder is called after."""
         words = ("" if self.kind == NARROW else self.kind, "clean" if self.clean else "", "demos")
-        # Another first round makes another base policy.
-        first = f"{self.corrects.made}_" if self.corrects else ""
-        return f"{first}{self.demos}{''.join(words)}_{self.clone_steps}steps"
+        return f"{self.demos}{''.join(words)}_{self.clone_steps}steps"
 
     @property
     def save_freq(self) -> int:
@@ -143,13 +130,8 @@ WIDE_RECIPES: dict[tuple[str, str], BaseRecipe] = {
 }
 """The same over the whole reach. What may lie anywhere takes more demonstrations: `kitchen_2x2`'s clone of 400
 came to .43 and stayed there, of 1,200 to .82 (docs/trials.md)."""
-CORRECTED_RECIPES: dict[tuple[str, str], BaseRecipe] = {
-    (scene, obs_type): BaseRecipe(
-        first.demos, first.clone_steps * 3 // 2, first.clone_steps * 3 // 2, kind=CORRECTED, corrects=first
-    )
-    for (scene, obs_type), first in WIDE_RECIPES.items()
-}
-"""As many demonstrations again, begun in streams of the wide clone. Measured for the state of `kitchen_2x2`."""
+WIDE_RESETS_RECIPES = WIDE_RECIPES | {("kitchen_2x2", STATE): BaseRecipe(3600, 3840, checkpoint=3840)}
+"""The same with reset tasks, of each as many as of any other task: learned resets have to succeed."""
 SMOKE_RECIPE = BaseRecipe(8, 5, checkpoint=5, clone_batch=32)
 
 ALGORITHM_FLAGS = {
@@ -167,12 +149,12 @@ def base_recipe(scale: Scale, scene: str, obs_type: str, *, clean: bool = False,
     """
     clean = clean and kind == NARROW
     if scale.smoke:
-        first = replace(SMOKE_RECIPE, kind=WIDE) if kind == CORRECTED else None
-        return replace(SMOKE_RECIPE, clean=clean, kind=kind, corrects=first)
-    if kind == NARROW:
-        recipes = CLEAN_RECIPES if clean else BASE_RECIPES
-    else:
-        recipes = CORRECTED_RECIPES if kind == CORRECTED else WIDE_RECIPES
+        return replace(SMOKE_RECIPE, clean=clean, kind=kind)
+    recipes = {
+        NARROW: CLEAN_RECIPES if clean else BASE_RECIPES,
+        WIDE: WIDE_RECIPES,
+        WIDE_RESETS: WIDE_RESETS_RECIPES,
+    }[kind]
     if (scene, obs_type) not in recipes:
         known = ", ".join(f"{s}/{OBS_NAMES[o]}" for s, o in recipes)
         name = "clean base policy" if clean else "base policy" if kind == NARROW else f"{kind} base policy"

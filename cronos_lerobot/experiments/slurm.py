@@ -192,13 +192,9 @@ def plan_arrays(jobs: Sequence[Job], waiting: Iterable[Job]) -> tuple[Elements, 
     bases: dict[str, list[Job]] = {}
     evaluations: dict[str, list[Job]] = {}
     runs: list[Job] = []
-    elements: dict[str, list[Job]] = {}
     for job in jobs:
         if job.stage == BASE:
-            # In one element with what it needs, of its own folder or of a first round's.
-            needed = next((elements[name] for name in job.needs if name in elements), None)
-            elements[job.name] = needed or bases.setdefault(job.name.rpartition("/")[0], [])
-            elements[job.name].append(job)
+            bases.setdefault(job.name.rpartition("/")[0], []).append(job)
         elif job.stage == EVALUATION:
             evaluations.setdefault(job.needs[0] if job.needs else job.name, []).append(job)
         else:

@@ -5,14 +5,7 @@ from pathlib import Path
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS
 from cronos_lerobot.experiments.few_resets import PLUGS, TOGETHER
-from cronos_lerobot.experiments.scales import (
-    BASE_RECIPES,
-    CLEAN_RECIPES,
-    CORRECTED_RECIPES,
-    OBS_NAMES,
-    SCALES,
-    WIDE_RECIPES,
-)
+from cronos_lerobot.experiments.scales import BASE_RECIPES, CLEAN_RECIPES, OBS_NAMES, SCALES, WIDE_RECIPES
 from cronos_lerobot.scripts.reproduce import make_parser
 
 DOCS = (Path(__file__).parents[2] / "docs/experiments.md").read_text()
@@ -51,7 +44,7 @@ def test_scales():
 def test_recipes():
     recipes = {
         (scene, OBS_NAMES[obs], recipe.clean, recipe.kind): recipe
-        for table in (BASE_RECIPES, CLEAN_RECIPES, WIDE_RECIPES, CORRECTED_RECIPES)
+        for table in (BASE_RECIPES, CLEAN_RECIPES, WIDE_RECIPES)
         for (scene, obs), recipe in table.items()
     }
     section = DOCS[DOCS.index("| | demonstrations") :].split("\n\n")[0].splitlines()[2:]
@@ -59,11 +52,8 @@ def test_recipes():
     for line in section:
         name, *numbers = (cell.strip() for cell in line.strip("|").split("|")[:4])
         scene, obs = re.findall(r"\w+", name)[:2]
-        kind = next((kind for kind in ("wide", "corrected") if kind in name), "narrow")
-        recipe = recipes[scene, obs, "--base.clean=true" in name, kind]
-        rounds = [recipe.corrects, recipe] if recipe.corrects else [recipe]
-        assert numbers[0] == " + ".join(str(one.demos) for one in rounds)
-        assert [int(number) for number in numbers[1:]] == [recipe.clone_steps, recipe.checkpoint]
+        recipe = recipes[scene, obs, "--base.clean=true" in name, "wide" if "wide" in name else "narrow"]
+        assert [int(number) for number in numbers] == [recipe.demos, recipe.clone_steps, recipe.checkpoint]
 
 
 def test_every_flag_is_there():
@@ -81,5 +71,4 @@ def test_plugs():
         "staggered_decay",
         "_".join(TOGETHER),
         "wide",
-        "corrected",
     ]

@@ -1,7 +1,5 @@
 """The experiments of few resets: what their rows do, and the figure of success against interventions."""
 
-import json
-
 import numpy as np
 import pytest
 from experiment_runs import TINY, make_run
@@ -15,7 +13,6 @@ from cronos_lerobot.experiments.plan import make_jobs
 from cronos_lerobot.experiments.plots import AXIS_LABELS
 from cronos_lerobot.experiments.results import collect
 from cronos_lerobot.experiments.scales import BASE_KINDS, SCALES, STATE, base_recipe
-from cronos_lerobot.experiments.slurm import plan_arrays
 from cronos_lerobot.experiments.specs import Options
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.loop_state import LoopState
@@ -96,28 +93,6 @@ def test_commands(tmp_path):
     assert {"--protocol.scene_reset_interval=null", "--protocol.reset_budget=240"} < set(asked)
     smoke = jobs_of("few_resets", tmp_path, "smoke")["kitchen_2x2_state_smoke/tnone_eer_asked_3k/seed1"].command
     assert "--protocol.reset_budget=2" in smoke
-
-
-def test_a_second_round_begins_in_streams_of_the_first_rounds_clone(tmp_path):
-    jobs = jobs_of("few_resets_best", tmp_path)
-    first = "base/kitchen_2x2_state_1200widedemos_1920steps"
-    second = f"{first}_1200correcteddemos_2880steps"
-    assert [name for name in jobs if name.startswith("base/")] == [
-        f"{first}/demos", f"{first}/clone", f"{second}/corrections", f"{second}/demos", f"{second}/clone",
-    ]  # fmt: skip
-    policy = str(tmp_path / first / "clone/checkpoints/001920/pretrained_model")
-    corrections = jobs[f"{second}/corrections"]
-    assert {f"--start.policy={policy}", "--seed=2", "--dataset.num_episodes=1200"} < set(corrections.command)
-    assert corrections.needs == (f"{first}/clone",)
-    roots = json.dumps([str(tmp_path / second / "corrections"), str(tmp_path / first / "demos")])
-    assert f"--operation.roots={roots}" in jobs[f"{second}/demos"].command
-    assert f"--dataset.root={tmp_path / second / 'demos'}" in jobs[f"{second}/clone"].command
-    run = jobs["kitchen_2x2_state_small/t80_decay_corrected_307k/seed1"]
-    assert run.needs == (f"{second}/clone",)
-    assert f"--policy.path={tmp_path / second / 'clone/checkpoints/002880/pretrained_model'}" in run.command
-    # A cluster makes all of it in one element, as what comes second waits for what comes first.
-    (chain,), _, _ = plan_arrays(list(jobs.values()), jobs.values())
-    assert [job.name for job in chain] == [name for name in jobs if name.startswith("base/")]
 
 
 def test_budgets_of_a_plug_need_no_interval_and_one_cannot_have_one():
@@ -245,10 +220,4 @@ def test_a_kind_of_demonstrations_keeps_its_flags():
         "--start.layouts=reach", "--start.arm_pose=after_task", "--start.occupied_receptacles=true",
         "--start.misplaced_objects=true", "--start.earlier_tasks=3", "--start.share=0.5",
     )  # fmt: skip
-    corrected_flags = (
-        "--start.layouts=reach", "--start.arm_pose=either", "--start.earlier_tasks=6", "--start.share=0.75",
-    )  # fmt: skip
-    assert {
-        "narrow": (), "wide": wide_flags, "wide_resets": (*wide_flags, "--reset_tasks=true"),
-        "corrected": corrected_flags,
-    } == BASE_KINDS  # fmt: skip
+    assert {"narrow": (), "wide": wide_flags, "wide_resets": (*wide_flags, "--reset_tasks=true")} == BASE_KINDS
