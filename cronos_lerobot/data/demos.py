@@ -378,7 +378,9 @@ class DemoCollector:
         self.env.set_task(ids, episode.preludes[:1])
         self.expert.reset(ids)
         if self.policy is not None:
+            # It has seen neither its task yet nor the arm at home.
             self.policy.forget(ids)
+            episode.settling = True
         episode.steps, episode.released = 0, 0
 
     def _begin_task(self, ids: np.ndarray, episode: _Episode) -> None:

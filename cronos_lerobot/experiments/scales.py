@@ -130,7 +130,9 @@ WIDE_RECIPES: dict[tuple[str, str], BaseRecipe] = {
 }
 """The same over the whole reach. What may lie anywhere takes more demonstrations: `kitchen_2x2`'s clone of 400
 came to .43 and stayed there, of 1,200 to .82 (docs/trials.md)."""
-WIDE_RESETS_RECIPES = WIDE_RECIPES | {("kitchen_2x2", STATE): BaseRecipe(3600, 3840, checkpoint=3840)}
+WIDE_RESETS_RECIPES: dict[tuple[str, str], BaseRecipe] = {
+    key: replace(recipe, kind=WIDE_RESETS) for key, recipe in WIDE_RECIPES.items()
+} | {("kitchen_2x2", STATE): BaseRecipe(3600, 3840, checkpoint=3840, kind=WIDE_RESETS)}
 """The same with reset tasks, of each as many as of any other task: learned resets have to succeed."""
 SMOKE_RECIPE = BaseRecipe(8, 5, checkpoint=5, clone_batch=32)
 

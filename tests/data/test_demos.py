@@ -239,36 +239,33 @@ class Drifter:
 
     action = np.array([0, 0.004, 0, 0, 0, 0, 1], np.float32)
 
-    def __init__(self):
-        self.told, self.forgotten = [], []
+    def __init__(self, executed=()):
+        self.executed, self.told, self.forgotten = executed, [], []
 
     def forget(self, ids):
         self.forgotten += ids.tolist()
 
     def choose(self, o_t, tau):
         assert len(o_t["agent_pos"]) == len(tau)
-        self.told.append(list(tau))
+        self.told.append((len(self.executed), list(tau)))
         return np.tile(self.action, (len(tau), 1))
 
 
 def test_a_policy_does_the_earlier_tasks_in_the_experts_place(env, tmp_path, monkeypatch):
     config = DemoConfig(start=StartConfig(policy="me/drifter", earlier_tasks=3, arm_pose="either"), max_steps=60)
-    drifter, spy, task = Drifter(), Spy(env, monkeypatch), env.scene.tasks[0]
+    spy, task = Spy(env, monkeypatch), env.scene.tasks[0]
+    drifter = Drifter(spy.executed)
     dataset, collector = collect(env, tmp_path / "d", config, 8, tasks=[task], expert=spy, policy=drifter)
     executed = np.array(spy.executed)
     drifts = (executed == drifter.action).all(axis=-1)
     assert drifts.any()
     for stream in range(NUM_ENVS):
-        # Each of one to three tasks to its very end.
+        # Each of one to three tasks to its very end, after a step at rest in which it is seen.
         edges = np.flatnonzero(np.diff(np.concatenate([[0], drifts[:, stream], [0]])))
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
-            assert end - begin in (60, 120, 180)
+            assert end - begin == 60
     # Never the task that is demonstrated next, and each is begun anew.
-    told = {
-        told[i]
-        for told, drifting in zip(drifter.told, drifts[drifts.any(axis=1)])
-        for i in np.flatnonzero(drifting)
-    }
+    told = {told[i] for step, told in drifter.told for i in np.flatnonzero(drifts[step])}
     assert told <= {other.instruction for other in env.scene.tasks if other != task}
     assert len(drifter.forgotten) >= collector.finished
     at_home = []

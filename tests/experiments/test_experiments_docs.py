@@ -5,7 +5,14 @@ from pathlib import Path
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS
 from cronos_lerobot.experiments.few_resets import PLUGS, TOGETHER
-from cronos_lerobot.experiments.scales import BASE_RECIPES, CLEAN_RECIPES, OBS_NAMES, SCALES, WIDE_RECIPES
+from cronos_lerobot.experiments.scales import (
+    BASE_RECIPES,
+    CLEAN_RECIPES,
+    OBS_NAMES,
+    SCALES,
+    WIDE_RECIPES,
+    WIDE_RESETS_RECIPES,
+)
 from cronos_lerobot.scripts.reproduce import make_parser
 
 DOCS = (Path(__file__).parents[2] / "docs/experiments.md").read_text()
@@ -44,7 +51,7 @@ def test_scales():
 def test_recipes():
     recipes = {
         (scene, OBS_NAMES[obs], recipe.clean, recipe.kind): recipe
-        for table in (BASE_RECIPES, CLEAN_RECIPES, WIDE_RECIPES)
+        for table in (BASE_RECIPES, CLEAN_RECIPES, WIDE_RECIPES, WIDE_RESETS_RECIPES)
         for (scene, obs), recipe in table.items()
     }
     section = DOCS[DOCS.index("| | demonstrations") :].split("\n\n")[0].splitlines()[2:]
@@ -52,7 +59,8 @@ def test_recipes():
     for line in section:
         name, *numbers = (cell.strip() for cell in line.strip("|").split("|")[:4])
         scene, obs = re.findall(r"\w+", name)[:2]
-        recipe = recipes[scene, obs, "--base.clean=true" in name, "wide" if "wide" in name else "narrow"]
+        kind = "wide_resets" if "reset tasks" in name else "wide" if "wide" in name else "narrow"
+        recipe = recipes[scene, obs, "--base.clean=true" in name, kind]
         assert [int(number) for number in numbers] == [recipe.demos, recipe.clone_steps, recipe.checkpoint]
 
 
