@@ -162,7 +162,15 @@ def _draw_shares(ax: Axes, streams: Sequence[Streams]) -> None:
     ax.set_yticks(places, [one.name for one in streams])
     ax.set(ylim=(len(streams) - 0.4, -0.6), xlim=(0, 1))
     ax.set_title("how the bodies lay when the task was given", fontsize=9, color=INK, loc="left")
-    ax.legend(fontsize=7, frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, -0.42))
+    ax.legend(
+        fontsize=7,
+        frameon=False,
+        ncols=5,
+        loc="upper center",
+        bbox_to_anchor=(0.42, -0.16),
+        columnspacing=1,
+        handlelength=1,
+    )
 
 
 def _draw_starts(ax: Axes, streams: Sequence[Streams]) -> None:
