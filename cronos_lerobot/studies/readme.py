@@ -24,9 +24,12 @@ ROWS = {
     "t1280_eer_cl_hsr_wide": "the paper's best: curriculum, lost bodies put back",
     "t4400_eer_staggered_early_decay_wide": "few resets: most of them early, each stream at a time of its own,"
     " smaller and smaller updates",
+    "t80_decay_wide_resets": "episodic, from a base that was shown reset tasks as well, in more demonstrations",
+    "t4400_eer_staggered_early_decay_wide_resets": "few resets, from that base",
+    "t4400_eer_lsr_staggered_early_decay_wide_resets": "few resets and learned ones, from that base",
 }
-"""What the README calls them; rows without a finished run are left out, and the first of the others is what they
-are compared with."""
+"""What the README calls them; rows without a finished run are left out, and the first of the others from the same
+base policy is what they are compared with."""
 README = MarkedTable("few_resets", Path("README.md"), "cronos_lerobot.studies.readme")
 
 
@@ -35,33 +38,41 @@ def make_table(folder: Path) -> str:
     found = json.loads((folder / f"{EXPERIMENT}.json").read_text())
     rows = {row["row"]: row for row in found["rows"] if row["success_train_mean"] is not None}
     shown = [name for name in ROWS if name in rows]
-    differences = {one["row"]: one for one in found["differences"] if one["reference"] == shown[0]}
+    firsts = {rows[name]["base"]: name for name in reversed(shown)}
+    differences = {one["row"]: one for one in found["differences"] if one["reference"] in firsts.values()}
     lines = [
-        "| training, from the wide base | interventions | success | seeds | minus the first row [95 %] |",
-        "|---|---|---|---|---|",
+        "| training | interventions | success | held out | seeds | minus the first row from that base [95 %] |",
+        "|---|---|---|---|---|---|",
     ]
     for name in shown:
         row = rows[name]
+        is_compared = name in differences and differences[name]["reference"] == firsts[row["base"]]
         cells = (
             ROWS[name],
             f"{row['interventions_mean']:,.0f}",
-            _success(row),
+            _success(row, "train"),
+            _success(row, "held_out"),
             str(row["seeds"]),
-            _difference(differences[name]) if name in differences else "",
+            _difference(differences[name]) if is_compared else "",
         )
         lines.append(f"| {' | '.join(cells)} |")
-    before = " and ".join(f"{value:.3f}" for value in sorted({rows[name]["base_success_mean"] for name in shown}))
+    before = " and ".join(
+        f"{value:.3f}" for value in dict.fromkeys(rows[name]["base_success_mean"] for name in shown)
+    )
     steps, n = found["steps"], rows[shown[0]]["n_train"]
     return "\n".join(
         [*lines, "", f"{steps:,} interaction steps; before training {before}; n = {n} for each seed."]
     )
 
 
-def _success(row: dict[str, Any]) -> str:
-    std = row["success_train_std"]
+def _success(row: dict[str, Any], split: str) -> str:
+    mean, std = row.get(f"success_{split}_mean"), row.get(f"success_{split}_std")
+    if mean is None:
+        return ""
     spread = "" if std is None else f" ± {std:.3f}"
-    ends = row["success_train_ci95_low"], row["success_train_ci95_high"]
-    return f"{row['success_train_mean']:.3f}{spread}" + _interval(ends, ".3f")
+    return f"{mean:.3f}{spread}" + _interval(
+        (row[f"success_{split}_ci95_low"], row[f"success_{split}_ci95_high"]), ".3f"
+    )
 
 
 def _difference(found: dict[str, Any]) -> str:

@@ -8,33 +8,43 @@ import pytest
 from cronos_lerobot.studies.readme import README, RESULTS, make_table
 
 ROOT = Path(__file__).parents[2]
+
+
+def make_row(name, base, seeds, interventions, before, **success):
+    """A row as `cronos-reproduce` writes it; by split: mean, standard deviation, ends of the interval."""
+    row = {"row": name, "base": base, "seeds": seeds, "interventions_mean": interventions, "n_train": 256}
+    row |= {"base_success_mean": before, "success_train_mean": None}
+    for split, values in success.items():
+        names = ("mean", "std", "ci95_low", "ci95_high")
+        row |= {f"success_{split}_{what}": value for what, value in zip(names, values, strict=True)}
+    return row
+
+
 ROWS = [
-    {
-        "row": "t80_wide", "seeds": 2, "success_train_mean": 0.75, "success_train_std": 0.1,
-        "success_train_ci95_low": 0.6, "success_train_ci95_high": 0.9, "n_train": 256, "base_success_mean": 0.4,
-        "interventions_mean": 3840,
-    },
-    {
-        "row": "t1280_eer_wide", "seeds": 1, "success_train_mean": 0.5, "success_train_std": None,
-        "success_train_ci95_low": 0.45, "success_train_ci95_high": 0.55, "n_train": 256, "base_success_mean": 0.4,
-        "interventions_mean": 192,
-    },
-    {"row": "t1280_eer_cl_hsr_wide", "seeds": 0, "success_train_mean": None},
-]  # fmt: skip
-DIFFERENCE = {
-    "row": "t1280_eer_wide", "reference": "t80_wide", "difference": -0.25, "ci95_low": -0.5, "ci95_high": 0.0,
-}  # fmt: skip
+    make_row("t80_wide", "wide", 2, 3840, 0.4, train=(0.75, 0.1, 0.6, 0.9), held_out=(0.7, 0.05, 0.5, 0.9)),
+    make_row("t1280_eer_wide", "wide", 1, 192, 0.4, train=(0.5, None, 0.45, 0.55)),
+    make_row("t1280_eer_cl_hsr_wide", "wide", 0, None, None),
+    make_row("t80_decay_wide_resets", "wide_resets", 1, 3840, 0.3, train=(0.8, None, 0.7, 0.9)),
+]
+DIFFERENCES = [
+    {"row": row, "reference": "t80_wide", "difference": -0.25, "ci95_low": -0.5, "ci95_high": 0.0}
+    for row in ("t1280_eer_wide", "t80_decay_wide_resets")
+]
 
 
 def test_the_table_by_hand(tmp_path):
-    found = {"steps": 307_200, "rows": ROWS, "differences": [DIFFERENCE]}
+    found = {"steps": 307_200, "rows": ROWS, "differences": DIFFERENCES}
     (tmp_path / "few_resets_best.json").write_text(json.dumps(found))
     table = make_table(tmp_path)
     assert table.splitlines()[2:] == [
-        "| episodic: a reset every 80 steps | 3,840 | 0.750 ± 0.100 [0.600, 0.900] | 2 |  |",
-        "| a reset every 1280 steps | 192 | 0.500 [0.450, 0.550] | 1 | -0.250 [-0.500, +0.000] |",
+        "| episodic: a reset every 80 steps | 3,840 | 0.750 ± 0.100 [0.600, 0.900] | 0.700 ± 0.050 [0.500, 0.900] "
+        "| 2 |  |",
+        "| a reset every 1280 steps | 192 | 0.500 [0.450, 0.550] |  | 1 | -0.250 [-0.500, +0.000] |",
+        # From another base, with which the first row does not compare.
+        "| episodic, from a base that was shown reset tasks as well, in more demonstrations | 3,840 "
+        "| 0.800 [0.700, 0.900] |  | 1 |  |",
         "",
-        "307,200 interaction steps; before training 0.400; n = 256 for each seed.",
+        "307,200 interaction steps; before training 0.400 and 0.300; n = 256 for each seed.",
     ]
     readme = f"# Title\n\n{README.begin}\nold\n{README.end}\n\nmore\n"
     assert README.rewrite(readme, table) == f"# Title\n\n{README.begin}\n{table}\n{README.end}\n\nmore\n"
