@@ -6,8 +6,9 @@
         --runs "T = 80=<run of seed 1>,<run of seed 2>"
 
 A name has the files of one or more seeds. It draws `streams.png` and writes the numbers behind it as `streams.csv`
-and as a table in Markdown, `streams.md`. Runs are folders of `cronos-train`; of these the figure shows where the
-interventions went.
+and as tables in Markdown, `streams.md`: success, and the difference of every two names in the first segment, the
+others of the first half and the second half of the streams, paired by seed. Runs are folders of `cronos-train`; of
+these the figure shows where the interventions went.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import csv
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +27,7 @@ from matplotlib.figure import Figure
 
 from cronos_lerobot.report.figures import COLORS, INK, style_axes
 from cronos_lerobot.report.runs import TrainingRun, read_training_run
-from cronos_lerobot.report.statistics import Rate, SeedRate
+from cronos_lerobot.report.statistics import Gain, Rate, SeedRate, sum_rates
 from cronos_lerobot.report.tables import Row, write_csv
 from cronos_lerobot.studies.stream_evaluation import Start
 
@@ -115,6 +117,22 @@ def make_table(streams: Sequence[Streams]) -> str:
             share = f"{one.share(start):.0%} of them"
             cells.append(share if rate is None or start == Start.COMPLETE else f"{rate.value:.2f} ({share})")
         lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def make_differences(streams: Sequence[Streams]) -> str:
+    """A table in Markdown: success of each kind of policy minus that of each one before, by part of the stream.
+
+    Intervals are Student's t over the seeds, pair by pair, where both have as many; see `Gain.interval`.
+    """
+    length = len(streams[0].by_segment())
+    parts = {"first segment": (0, 1), "others of the first half": (1, length // 2)}
+    parts |= {"second half": (length // 2, length), "all": (0, length)}
+    parts = {name: (a, b) for name, (a, b) in parts.items() if a < b}
+    lines = [f"| policy | minus | {' | '.join(parts)} |", "|---" * (len(parts) + 2) + "|"]
+    for before, after in combinations(streams, 2):
+        gains = (Gain(*(sum_rates(one.by_segment()[a:b]) for one in (before, after))) for a, b in parts.values())
+        lines.append(f"| {after.name} | {before.name} | {' | '.join(map(str, gains))} |")
     return "\n".join(lines)
 
 
@@ -234,13 +252,15 @@ def main() -> None:
     args = _parse_args()
     try:
         streams = [read_streams(name, paths) for name, paths in args.streams]
+        if len(lengths := {len(one.by_segment()) for one in streams}) > 1:
+            raise ValueError(f"--streams: streams of different lengths: {', '.join(map(str, sorted(lengths)))}")
         runs = {name: [read_training_run(folder) for folder in folders] for name, folders in args.runs}
     except (OSError, ValueError) as error:
         sys.exit(str(error))
     args.output.mkdir(parents=True, exist_ok=True)
     draw_streams(streams, runs).savefig(args.output / "streams.png", dpi=150)
     write_csv(args.output / "streams.csv", table_rows(streams))
-    table = make_table(streams)
+    table = f"{make_table(streams)}\n\n{make_differences(streams)}"
     (args.output / "streams.md").write_text(table + "\n")
     print(table)
 

@@ -9,7 +9,7 @@ from lerobot_env_cronos.statistics import wilson_interval
 from synthetic_runs import read_csv, write_training_run
 
 from cronos_lerobot.studies import streams_compared
-from cronos_lerobot.studies.streams_compared import Start, draw_streams, make_table, read_streams
+from cronos_lerobot.studies.streams_compared import Start, draw_streams, make_differences, make_table, read_streams
 
 FIRST = {
     ("segment", "0"): (8, 10), ("segment", "1"): (2, 10), ("segment", "all"): (10, 20),
@@ -60,6 +60,18 @@ def test_the_table_has_rates_with_their_shares(files):
         f"| first | 1 | 20 | 0.500 [{low:.3f}, {high:.3f}] "
         "| 0.38 (80% of them) | 0% of them | 0% of them | 0% of them | 20% of them |"
     )
+
+
+def test_differences_are_paired_by_seed(tmp_path, files):
+    swapped = tmp_path / "3.csv", tmp_path / "4.csv"
+    write_streams(swapped[0], FIRST | {("segment", "0"): (9, 10)})
+    write_streams(swapped[1], SECOND | {("segment", "0"): (9, 10)})
+    # First segment: .8 and 1.0 against .9 and .9, that is +.1 and -.1 by seed: 12.706 standard errors of .1.
+    line = make_differences([read_streams("a", files), read_streams("b", swapped)]).splitlines()[2]
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    assert cells[:3] == ["b", "a", "+0.000 [-1.271, +1.271]"]
+    # Of two segments the first half has no others.
+    assert cells[3:] == ["+0.000 [+0.000, +0.000]", "+0.000 [-0.635, +0.635]"]
 
 
 def test_the_command_writes_figure_and_numbers(files, tmp_path, monkeypatch):
