@@ -83,8 +83,8 @@ class StartConfig:
     leaning_share: float = 0.0
     """Share of the layouts in which one object has fallen over the edge of another body, from 0 to 1."""
     share: float = 1.0
-    """Share of the episodes that `arm_pose`, `occupied_receptacles`, `misplaced_objects` and `earlier_tasks` apply
-    to; the others start at home, with every object on the table."""
+    """Share of the episodes that `arm_pose`, `occupied_receptacles`, `misplaced_objects`, `earlier_tasks` and
+    `policy` apply to; the others start at home, with every object on the table."""
 
     def __post_init__(self) -> None:
         """Check the choices."""
@@ -101,8 +101,8 @@ class StartConfig:
         if self.earlier_tasks > 1 and not self.is_after_another:
             raise ValueError(
                 f"start.earlier_tasks={self.earlier_tasks} needs start.occupied_receptacles,"
-                " start.misplaced_objects, start.arm_pose=after_task or start.policy: without them nothing was"
-                " done before"
+                " start.misplaced_objects, start.arm_pose=after_task (or either) or start.policy: without them"
+                " nothing was done before"
             )
         if self.policy and (self.occupied_receptacles or self.misplaced_objects):
             raise ValueError(
@@ -206,7 +206,7 @@ class DemoCollector:
         self._episodes: list[_Episode | None] = [None] * env.num_envs
         self._noise = ActionNoise(config.noise, env.num_envs)
         self._misses = GraspMisses(config.misses, env)
-        self._failures_in_a_row = 0
+        self._failures_in_a_row = self._complete_in_a_row = 0
 
     def collect(self, num_episodes: int, on_episode: Callable[[int], object] = lambda frames: None) -> None:
         """Write `num_episodes` more episodes, the same number of each task as far as that divides.
@@ -231,11 +231,15 @@ class DemoCollector:
                 self._after_step(stream, columns, info)
             self._start_idle_streams(num_episodes)
 
+    def _is_policys(self, episode: _Episode) -> bool:
+        """Whether what is done before is done by the policy."""
+        return self.policy is not None and not episode.at_home
+
     def _let_policy_act(self, observation: dict[str, np.ndarray], labels: np.ndarray) -> np.ndarray:
         """Actions in which earlier tasks are the policy's, if there is one."""
         if self.policy is None:
             return labels
-        earlier = np.array([episode is not None and bool(episode.preludes) for episode in self._episodes])
+        earlier = np.array([e is not None and bool(e.preludes) and self._is_policys(e) for e in self._episodes])
         if not earlier.any():
             return labels
         return np.where(earlier[:, None], self.policy.choose(observation, self.env.instructions), labels)
@@ -255,6 +259,9 @@ class DemoCollector:
             return
         if episode.settling:
             episode.settling = False
+            if self.policy is not None:
+                # What it planned at rest, it planned for what it saw before.
+                self.policy.forget(np.array([stream]))
             return
         episode.steps += 1
         resting = info["is_success"][stream] and not info["is_grasped"][stream]
@@ -266,7 +273,7 @@ class DemoCollector:
         is_late = episode.steps >= self.config.max_steps
         if info["diverged"][stream]:
             self._end(stream, episode, succeeded=False, keep=False)
-        elif episode.preludes and (is_late if self.policy else succeeded):
+        elif episode.preludes and (is_late if self._is_policys(episode) else succeeded):
             self._end_prelude(stream, episode)
         elif succeeded and not episode.preludes:
             self._end(stream, episode, succeeded=True, keep=True)
@@ -276,6 +283,7 @@ class DemoCollector:
     def _end(self, stream: int, episode: _Episode, *, succeeded: bool, keep: bool) -> None:
         self._episodes[stream] = None
         self.finished += 1
+        self._complete_in_a_row = 0
         self.successes += succeeded
         self._failures_in_a_row = 0 if succeeded else self._failures_in_a_row + 1
         if self._failures_in_a_row >= MAX_FAILURES_IN_A_ROW:
@@ -296,15 +304,24 @@ class DemoCollector:
     def _end_prelude(self, stream: int, episode: _Episode) -> None:
         ids = np.array([stream])
         del episode.preludes[0]
-        if episode.arm_goes_home and (self.policy is not None or not episode.preludes):
+        if episode.arm_goes_home and (self._is_policys(episode) or not episode.preludes):
             self.env.end_effector_reset(ids)
         if episode.preludes:
             self._begin_prelude(ids, episode)
             return
         self._begin_task(ids, episode)
-        if self.policy is not None and self.env.is_success[stream]:
-            # The policy has left it complete: nothing can be shown.
-            self._episodes[stream] = None
+        if self._is_policys(episode) and self.env.is_success[stream]:
+            self._discard(stream, episode)
+
+    def _discard(self, stream: int, episode: _Episode) -> None:
+        """The policy has left the task complete: nothing can be shown."""
+        self._episodes[stream] = None
+        self._complete_in_a_row += 1
+        if self._complete_in_a_row >= MAX_FAILURES_IN_A_ROW:
+            raise ExpertError(
+                f"start.policy left the task complete {MAX_FAILURES_IN_A_ROW} times in a row, last"
+                f" {episode.task.instruction!r}"
+            )
 
     def _start_idle_streams(self, num_episodes: int) -> None:
         """Give every idle stream an episode of the task that has the fewest, until enough are under way."""
@@ -361,7 +378,7 @@ class DemoCollector:
             own = [other for other in self.env.scene.tasks if other.object == task.object]
             return own[rng.integers(len(own))]
         start = self.config.start
-        if start.policy is not None:
+        if self.policy is not None:
             others = [other for other in self.env.scene.tasks if other != task]
             return others[rng.integers(len(others))]
         # Whether the task before had the same object, and the same receptacle.
@@ -377,10 +394,8 @@ class DemoCollector:
     def _begin_prelude(self, ids: np.ndarray, episode: _Episode) -> None:
         self.env.set_task(ids, episode.preludes[:1])
         self.expert.reset(ids)
-        if self.policy is not None:
-            # It has seen neither its task yet nor the arm at home.
-            self.policy.forget(ids)
-            episode.settling = True
+        # A policy has seen neither its task yet nor the arm at home.
+        episode.settling |= self._is_policys(episode)
         episode.steps, episode.released = 0, 0
 
     def _begin_task(self, ids: np.ndarray, episode: _Episode) -> None:

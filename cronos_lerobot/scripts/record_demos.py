@@ -114,9 +114,11 @@ def _open(cfg: RecordDemosConfig) -> Opened:
     policy = None
     if cfg.start.policy is not None:
         policy = load_spectator(cfg.start.policy, cfg.env)
-        policy.seed(cfg.seed)
     env = CronosVectorEnv(cfg.num_envs, cfg.env.scene, **cfg.env.gym_kwargs)
-    return env, open_writer(cfg, env), policy
+    writer = open_writer(cfg, env)
+    if policy is not None:
+        policy.seed(cfg.seed + writer.num_episodes)
+    return env, writer, policy
 
 
 def _collect(

@@ -58,7 +58,7 @@ def story(scale: str, time_limit: str, warning_s: int) -> tuple[Act, ...]:
             30,
         ),
         Act("What has become of it", "cronos-reproduce status --root=cluster", lines=12),
-        Act("Slurm's own words", "cat cluster/slurm/logs/*/*.out | grep -v '^$'", lines=20),
+        Act("Slurm's own words", "cat cluster/slurm/logs/*.out | grep -v '^$'", lines=20),
         Act("Both have", SAME, lines=1),
     )
 
