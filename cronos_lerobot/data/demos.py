@@ -7,11 +7,10 @@ from typing import Protocol
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, REWARD
 from lerobot_env_cronos import CronosVectorEnv, Task
-from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS, sample_configuration
-from lerobot_env_cronos.expert.reach import sample_reach_configuration
 from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW
 
 from cronos_lerobot.agents.processing import observation_columns
+from cronos_lerobot.data.demo_starts import FREE_LAYOUTS, StartConfig
 from cronos_lerobot.data.perturbations import (
     ActionNoise,
     GraspMisses,
@@ -23,10 +22,6 @@ from cronos_lerobot.data.perturbations import (
 from cronos_lerobot.data.schema import SUCCESS, TRUNCATED
 from cronos_lerobot.data.writer import SegmentWriter
 
-ARM_POSES = ("home", "random", "after_task", "either")
-FREE_LAYOUTS = {"random": sample_configuration, "reach": sample_reach_configuration}
-"""How layouts are drawn that are no configuration of the benchmark."""
-LAYOUTS = ("train", *FREE_LAYOUTS)
 CONFIGURATION = "cronos.configuration"
 MAX_FAILURES_IN_A_ROW = 200
 
@@ -53,71 +48,6 @@ class StreamPolicy(Protocol):
 
     def choose(self, o_t: dict[str, np.ndarray], tau: list[str]) -> np.ndarray:
         """Actions (n, 7) in physical units for what streams observe, with their instructions."""
-
-
-@dataclass
-class StartConfig:
-    """Where a demonstration starts."""
-
-    layouts: str = "train"
-    """`train`: the scene's 64 training configurations in turn; `random`: freshly drawn in the spawn area; `reach`:
-    freshly drawn wherever the arm can do the scene's tasks, at any yaw."""
-    num_configurations: int = NUM_CONFIGURATIONS
-    """Of the training configurations the first so many; a policy cloned from one has only ever seen that one."""
-    arm_pose: str = "home"
-    """`home`; `random`: at a random place above the table; `after_task`: where another task left it; `either`:
-    in every second episode after another task where that left it, and at home in the others."""
-    occupied_receptacles: bool = False
-    """The target receptacle already holds another object."""
-    misplaced_objects: bool = False
-    """The task's object lies on another receptacle, where another task has put it; beside `occupied_receptacles`
-    it is either, with equal chances for each task that may have come before."""
-    earlier_tasks: int = 1
-    """Where a demonstration begins after another task, how many may have been done: one to so many, with equal
-    chances, the last of them as above and those before it any others. From two on all objects may lie on
-    receptacles, and two on one, as in a stream that goes on without a scene reset."""
-    policy: str | None = None
-    """Checkpoint or Hub id of a policy that does the earlier tasks in place of the expert: one to `earlier_tasks`
-    of any, each for `max_steps`, whether it succeeds or not. Demonstrations then begin where its own streams get
-    stuck (as in DAgger, Ross et al. 2011, an expert for the states of the learner)."""
-    leaning_share: float = 0.0
-    """Share of the layouts in which one object has fallen over the edge of another body, from 0 to 1."""
-    share: float = 1.0
-    """Share of the episodes that `arm_pose`, `occupied_receptacles`, `misplaced_objects`, `earlier_tasks` and
-    `policy` apply to; the others start at home, with every object on the table."""
-
-    def __post_init__(self) -> None:
-        """Check the choices."""
-        if self.layouts not in LAYOUTS:
-            raise ValueError(f"unknown start.layouts {self.layouts!r}; valid: {list(LAYOUTS)}")
-        if self.arm_pose not in ARM_POSES:
-            raise ValueError(f"unknown start.arm_pose {self.arm_pose!r}; valid: {list(ARM_POSES)}")
-        if not 1 <= self.num_configurations <= NUM_CONFIGURATIONS:
-            raise ValueError(
-                f"start.num_configurations must be 1 to {NUM_CONFIGURATIONS}, got {self.num_configurations}"
-            )
-        if self.earlier_tasks < 1:
-            raise ValueError(f"start.earlier_tasks must be at least 1, got {self.earlier_tasks}")
-        if self.earlier_tasks > 1 and not self.is_after_another:
-            raise ValueError(
-                f"start.earlier_tasks={self.earlier_tasks} needs start.occupied_receptacles,"
-                " start.misplaced_objects, start.arm_pose=after_task (or either) or start.policy: without them"
-                " nothing was done before"
-            )
-        if self.policy and (self.occupied_receptacles or self.misplaced_objects):
-            raise ValueError(
-                "start.policy does any tasks before: start.occupied_receptacles and start.misplaced_objects say"
-                " which ones the expert does"
-            )
-        for name in ("share", "leaning_share"):
-            if not 0 <= (value := getattr(self, name)) <= 1:
-                raise ValueError(f"start.{name} must be between 0 and 1, got {value}")
-
-    @property
-    def is_after_another(self) -> bool:
-        """Whether demonstrations begin where another task ended."""
-        after_task = self.arm_pose in ("after_task", "either")
-        return self.occupied_receptacles or self.misplaced_objects or after_task or bool(self.policy)
 
 
 @dataclass
