@@ -7,7 +7,7 @@
 
 A name has the files of one or more seeds. It draws `streams.png` and writes the numbers behind it as `streams.csv`
 and as tables in Markdown, `streams.md`: success, and the difference of every two names in the first segment, the
-others of the first half and the second half of the streams, paired by seed. Runs are folders of `cronos-train`; of
+others of the first half and the second half of the streams. Runs are folders of `cronos-train`; of
 these the figure shows where the interventions went.
 """
 
@@ -24,19 +24,20 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.stats import ttest_ind
 
 from cronos_lerobot.report.figures import COLORS, INK, style_axes
 from cronos_lerobot.report.runs import TrainingRun, read_training_run
-from cronos_lerobot.report.statistics import Gain, Rate, SeedRate, sum_rates
+from cronos_lerobot.report.statistics import Rate, SeedRate, newcombe_interval, sum_rates
 from cronos_lerobot.report.tables import Row, write_csv
 from cronos_lerobot.studies.stream_evaluation import Start
 
 STARTS = {
-    Start.FREE: ("free", COLORS[5]),
-    Start.RECEPTACLE_OCCUPIED: ("receptacle occupied", COLORS[4]),
-    Start.ON_OTHER_RECEPTACLE: ("on the other receptacle", COLORS[1]),
-    Start.LOST: ("lost", COLORS[3]),
-    Start.COMPLETE: ("found complete", COLORS[6]),
+    Start.FREE: ("free", "#cfe1f2"),
+    Start.RECEPTACLE_OCCUPIED: ("receptacle occupied", "#93c4de"),
+    Start.ON_OTHER_RECEPTACLE: ("on the other receptacle", "#4a97c9"),
+    Start.LOST: ("lost", "#08306b"),
+    Start.COMPLETE: ("found complete", "#d9d9d9"),
 }
 """Words and colour of how a segment's bodies lay, from the easiest on."""
 NAMED = "NAME=PATH[,PATH...]"
@@ -63,6 +64,11 @@ class Streams:
         )
         return k / n
 
+    def done(self) -> SeedRate:
+        """Success of the segments that were not found complete."""
+        whole = [(seed["segment", "all"], seed.get(("start", "complete"), Rate(0, 0))) for seed in self.seeds]
+        return SeedRate.of(Rate(all_.successes - found.n, all_.n - found.n) for all_, found in whole)
+
     def by_segment(self) -> list[SeedRate]:
         """Success of the first, second, ... segment since the placement."""
         length = sum(table == "segment" for table, _ in self.seeds[0]) - 1
@@ -84,9 +90,14 @@ def read_streams(name: str, paths: Sequence[Path]) -> Streams:
 def _read(path: Path) -> dict[tuple[str, str], Rate]:
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    if not rows or not {"table", "name", "successes", "n"} <= set(rows[0]):
+    rates = {
+        (row["table"], row["name"]): Rate(int(row["successes"]), int(row["n"]))
+        for row in rows
+        if {"table", "name", "successes", "n"} <= set(row)
+    }
+    if ("segment", "all") not in rates:
         raise ValueError(f"{path} is no file of python -m cronos_lerobot.studies.stream_evaluation --output")
-    return {(row["table"], row["name"]): Rate(int(row["successes"]), int(row["n"])) for row in rows}
+    return rates
 
 
 def table_rows(streams: Sequence[Streams]) -> list[Row]:
@@ -123,17 +134,29 @@ def make_table(streams: Sequence[Streams]) -> str:
 def make_differences(streams: Sequence[Streams]) -> str:
     """A table in Markdown: success of each kind of policy minus that of each one before, by part of the stream.
 
-    Intervals are Student's t over the seeds, pair by pair, where both have as many; see `Gain.interval`.
+    Of two kinds with several seeds the interval is Welch's over the seeds, which have nothing in common but their
+    number; else `newcombe_interval`, which takes a kind with one seed as that one policy.
     """
     length = len(streams[0].by_segment())
     parts = {"first segment": (0, 1), "others of the first half": (1, length // 2)}
     parts |= {"second half": (length // 2, length), "all": (0, length)}
     parts = {name: (a, b) for name, (a, b) in parts.items() if a < b}
-    lines = [f"| policy | minus | {' | '.join(parts)} |", "|---" * (len(parts) + 2) + "|"]
+    head = ["policy", "minus", *parts, "all but those found complete"]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for before, after in combinations(streams, 2):
-        gains = (Gain(*(sum_rates(one.by_segment()[a:b]) for one in (before, after))) for a, b in parts.values())
-        lines.append(f"| {after.name} | {before.name} | {' | '.join(map(str, gains))} |")
+        both = [[sum_rates(one.by_segment()[a:b]) for one in (before, after)] for a, b in parts.values()]
+        both.append([before.done(), after.done()])
+        lines.append(f"| {after.name} | {before.name} | {' | '.join(_difference(*pair) for pair in both)} |")
     return "\n".join(lines)
+
+
+def _difference(before: Rate, after: Rate) -> str:
+    low, high = newcombe_interval(before, after)
+    one, other = ([seed.value for seed in getattr(rate, "seeds", ())] for rate in (before, after))
+    if min(len(one), len(other)) > 1:
+        low, high = ttest_ind(other, one, equal_var=False).confidence_interval()
+    difference = np.mean(other) - np.mean(one) if one and other else after.value - before.value
+    return f"{difference:+.3f} [{low:+.3f}, {high:+.3f}]"
 
 
 def _cell(rate: Rate) -> str:
@@ -242,6 +265,8 @@ def _parse_args() -> argparse.Namespace:
     names = [name for name, _ in args.streams]
     if unknown := [name for name, _ in args.runs if name not in names]:
         parser.error(f"--runs: no streams are named {', '.join(unknown)}; there are {', '.join(names)}")
+    if len(set(names)) < len(names):
+        parser.error(f"--streams: names have to differ, got {', '.join(names)}")
     if len(names) > len(COLORS):
         parser.error(f"--streams: at most {len(COLORS)} names can be told apart, not {len(names)}")
     return args

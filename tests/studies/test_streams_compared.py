@@ -8,6 +8,7 @@ import pytest
 from lerobot_env_cronos.statistics import wilson_interval
 from synthetic_runs import read_csv, write_training_run
 
+from cronos_lerobot.report.statistics import Rate, newcombe_interval
 from cronos_lerobot.studies import streams_compared
 from cronos_lerobot.studies.streams_compared import Start, draw_streams, make_differences, make_table, read_streams
 
@@ -62,16 +63,27 @@ def test_the_table_has_rates_with_their_shares(files):
     )
 
 
-def test_differences_are_paired_by_seed(tmp_path, files):
-    swapped = tmp_path / "3.csv", tmp_path / "4.csv"
-    write_streams(swapped[0], FIRST | {("segment", "0"): (9, 10)})
-    write_streams(swapped[1], SECOND | {("segment", "0"): (9, 10)})
-    # First segment: .8 and 1.0 against .9 and .9, that is +.1 and -.1 by seed: 12.706 standard errors of .1.
-    line = make_differences([read_streams("a", files), read_streams("b", swapped)]).splitlines()[2]
+def test_differences_of_several_seeds_have_welchs_interval(tmp_path, files):
+    third = write_streams(tmp_path / "3.csv", FIRST | {("segment", "0"): (5, 10)})
+    fourth = write_streams(tmp_path / "4.csv", SECOND | {("segment", "0"): (7, 10)})
+    line = make_differences([read_streams("a", files), read_streams("b", (third, fourth))]).splitlines()[2]
     cells = [cell.strip() for cell in line.strip("|").split("|")]
-    assert cells[:3] == ["b", "a", "+0.000 [-1.271, +1.271]"]
-    # Of two segments the first half has no others.
-    assert cells[3:] == ["+0.000 [+0.000, +0.000]", "+0.000 [-0.635, +0.635]"]
+    # First segment: .8 and 1.0 against .5 and .7, variances .02 each: 2 degrees of freedom, 4.303 x sqrt(.02).
+    assert cells[:3] == [
+        "b",
+        "a",
+        f"-0.300 [{-0.3 - 4.30265 * 0.02**0.5:+.3f}, {-0.3 + 4.30265 * 0.02**0.5:+.3f}]",
+    ]
+    # Second segments are the same, and so are those that were done: (10 - 4) / 16 and 14 / 20.
+    assert cells[3].startswith("+0.000 [")
+    assert cells[-1].startswith("+0.000 [")
+    assert read_streams("a", files).done().seeds == (Rate(6, 16), Rate(14, 20))
+
+
+def test_differences_from_one_seed_take_it_as_that_policy(files):
+    line = make_differences([read_streams("a", files[:1]), read_streams("b", files[1:])]).splitlines()[2]
+    low, high = newcombe_interval(Rate(8, 10), Rate(10, 10))
+    assert f"| +0.200 [{low:+.3f}, {high:+.3f}] |" in line
 
 
 def test_the_command_writes_figure_and_numbers(files, tmp_path, monkeypatch):
@@ -105,6 +117,7 @@ def test_panels_show_what_the_files_say(files):
     ("arguments", "said"),
     [
         (["--streams", "nothing"], "'nothing' is not NAME=PATH"),
+        (["--streams", "a={0}", "a={0}"], "names have to differ, got a, a"),
         (["--streams", "a={0}", "--runs", "b=run"], "no streams are named b; there are a"),
     ],
 )
