@@ -120,8 +120,8 @@ def find_end(row: RowResult) -> End | None:
 
 
 def _panel(row: RowResult) -> str:
-    """`narrow` or `wide`, with the reset tasks that learned resets need or without them."""
-    return row.row.base.split("_")[0]
+    """Its base policy, such as `narrow`, or `wide resets`."""
+    return row.row.base.replace("_", " ")
 
 
 def _draw_row(ax: Axes, row: RowResult, style: Style, end: End, axis: str, place: tuple[float, float]) -> None:
