@@ -136,7 +136,7 @@ class DemoCollector:
         self._episodes: list[_Episode | None] = [None] * env.num_envs
         self._noise = ActionNoise(config.noise, env.num_envs)
         self._misses = GraspMisses(config.misses, env)
-        self._failures_in_a_row = self._complete_in_a_row = 0
+        self._failures_in_a_row = 0
 
     def collect(self, num_episodes: int, on_episode: Callable[[int], object] = lambda frames: None) -> None:
         """Write `num_episodes` more episodes, the same number of each task as far as that divides.
@@ -213,14 +213,12 @@ class DemoCollector:
     def _end(self, stream: int, episode: _Episode, *, succeeded: bool, keep: bool) -> None:
         self._episodes[stream] = None
         self.finished += 1
-        self._complete_in_a_row = 0
         self.successes += succeeded
-        self._failures_in_a_row = 0 if succeeded else self._failures_in_a_row + 1
-        if self._failures_in_a_row >= MAX_FAILURES_IN_A_ROW:
-            raise ExpertError(
-                f"the expert failed {MAX_FAILURES_IN_A_ROW} times in a row, last to {episode.task.instruction!r}"
-                f" within --max_steps={self.config.max_steps}"
-            )
+        if succeeded:
+            self._failures_in_a_row = 0
+        else:
+            last = f"to {episode.task.instruction!r} within --max_steps={self.config.max_steps}"
+            self._count_failure("the expert failed", last)
         if keep:
             frames = {key: np.stack(values) for key, values in episode.frames.items()}
             is_last = np.arange(episode.steps) == episode.steps - 1
@@ -246,12 +244,15 @@ class DemoCollector:
     def _discard(self, stream: int, episode: _Episode) -> None:
         """The policy has left the task complete: nothing can be shown."""
         self._episodes[stream] = None
-        self._complete_in_a_row += 1
-        if self._complete_in_a_row >= MAX_FAILURES_IN_A_ROW:
-            raise ExpertError(
-                f"start.policy left the task complete {MAX_FAILURES_IN_A_ROW} times in a row, last"
-                f" {episode.task.instruction!r}"
-            )
+        self._count_failure(
+            "start.policy had left the task complete or the expert failed", repr(episode.task.instruction)
+        )
+
+    def _count_failure(self, what: str, last: str) -> None:
+        """One more attempt came to nothing; give up after too many without a success between them."""
+        self._failures_in_a_row += 1
+        if self._failures_in_a_row >= MAX_FAILURES_IN_A_ROW:
+            raise ExpertError(f"{what} {MAX_FAILURES_IN_A_ROW} times in a row, last {last}")
 
     def _start_idle_streams(self, num_episodes: int) -> None:
         """Give every idle stream an episode of the task that has the fewest, until enough are under way."""
@@ -284,10 +285,9 @@ class DemoCollector:
         if task.receptacle is None or (start.is_after_another and not episode.at_home):
             earlier = [] if episode.at_home else self._earlier(task, rng)
             episode.preludes = [*earlier, self._prelude(task, rng)]
-            pose = start.arm_pose
-            episode.arm_goes_home = (
-                pose == "home" or episode.at_home or (pose == "either" and bool(rng.random() < 0.5))
-            )
+            episode.arm_goes_home = episode.at_home or start.arm_pose == "home"
+            if start.arm_pose == "either" and not episode.at_home:
+                episode.arm_goes_home = bool(rng.random() < 0.5)
             self._begin_prelude(ids, episode)
         else:
             self._begin_task(ids, episode)
@@ -296,8 +296,11 @@ class DemoCollector:
     def _earlier(self, task: Task, rng: np.random.Generator) -> list[Task]:
         """What was done before the last task before; never the task itself, which would be found complete."""
         most = self.config.start.earlier_tasks
+        return self._others(task, rng, int(rng.integers(most))) if most > 1 else []
+
+    def _others(self, task: Task, rng: np.random.Generator, count: int) -> list[Task]:
         others = [other for other in self.env.scene.tasks if other != task]
-        return [others[i] for i in rng.integers(len(others), size=rng.integers(most))] if most > 1 else []
+        return [others[i] for i in rng.integers(len(others), size=count)]
 
     def _prelude(self, task: Task, rng: np.random.Generator) -> Task:
         """What was done before: another object put onto the target receptacle, or the task's own onto another one.
@@ -309,8 +312,7 @@ class DemoCollector:
             return own[rng.integers(len(own))]
         start = self.config.start
         if self.policy is not None:
-            others = [other for other in self.env.scene.tasks if other != task]
-            return others[rng.integers(len(others))]
+            return self._others(task, rng, 1)[0]
         # Whether the task before had the same object, and the same receptacle.
         wanted = {(False, True)} if start.occupied_receptacles else set()
         wanted |= {(True, False)} if start.misplaced_objects else set()

@@ -105,15 +105,10 @@ def record_demos(cfg: RecordDemosConfig) -> None:
     _collect(cfg, *_open(cfg))
 
 
-Opened = tuple[CronosVectorEnv, SegmentWriter, PolicySpectator | None]
-"""Streams, the dataset, and the policy that does the earlier tasks."""
-
-
-def _open(cfg: RecordDemosConfig) -> Opened:
+def _open(cfg: RecordDemosConfig) -> tuple[CronosVectorEnv, SegmentWriter, PolicySpectator | None]:
+    """Streams, the dataset, and the policy that does the earlier tasks."""
     assert isinstance(cfg.env, CronosEnvConfig)
-    policy = None
-    if cfg.start.policy is not None:
-        policy = load_spectator(cfg.start.policy, cfg.env)
+    policy = None if cfg.start.policy is None else load_spectator(cfg.start.policy, cfg.env)
     env = CronosVectorEnv(cfg.num_envs, cfg.env.scene, **cfg.env.gym_kwargs)
     writer = open_writer(cfg, env)
     if policy is not None:

@@ -6,9 +6,9 @@
         --runs "T = 80=<run of seed 1>,<run of seed 2>"
 
 A name has the files of one or more seeds. It draws `streams.png` and writes the numbers behind it as `streams.csv`
-and as tables in Markdown, `streams.md`: success, and the difference of every two names in the first segment, the
-others of the first half and the second half of the streams. Runs are folders of `cronos-train`; of
-these the figure shows where the interventions went.
+and as tables in Markdown, `streams.md`: success by how the bodies lay, by part of the stream (the first segment,
+the others of its first half, its second half), and the difference of every two names. Runs are folders of
+`cronos-train`; of these the figure shows where the interventions went.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.stats import ttest_ind
 
 from cronos_lerobot.report.figures import COLORS, INK, style_axes
 from cronos_lerobot.report.runs import TrainingRun, read_training_run
@@ -67,7 +66,19 @@ class Streams:
     def done(self) -> SeedRate:
         """Success of the segments that were not found complete."""
         whole = [(seed["segment", "all"], seed.get(("start", "complete"), Rate(0, 0))) for seed in self.seeds]
-        return SeedRate.of(Rate(all_.successes - found.n, all_.n - found.n) for all_, found in whole)
+        return SeedRate.of(Rate(all_.successes - found.successes, all_.n - found.n) for all_, found in whole)
+
+    def parts(self) -> dict[str, Rate]:
+        """Success by part of the stream, of all of it, and of what was not found complete."""
+        rates = self.by_segment()
+        half = len(rates) // 2
+        parts = {
+            "first segment": rates[:1],
+            "others of the first half": rates[1:half],
+            "second half": rates[half:],
+        }
+        found = {name: sum_rates(part) for name, part in (parts | {"all": rates}).items() if part}
+        return found | {"all but those found complete": self.done()}
 
     def by_segment(self) -> list[SeedRate]:
         """Success of the first, second, ... segment since the placement."""
@@ -131,32 +142,32 @@ def make_table(streams: Sequence[Streams]) -> str:
     return "\n".join(lines)
 
 
+def make_parts(streams: Sequence[Streams]) -> str:
+    """A table in Markdown: success of each kind of policy by part of the stream."""
+    return _parts_table([[one.name, *map(_cell, one.parts().values())] for one in streams], ["policy"], streams)
+
+
 def make_differences(streams: Sequence[Streams]) -> str:
     """A table in Markdown: success of each kind of policy minus that of each one before, by part of the stream.
 
-    Of two kinds with several seeds the interval is Welch's over the seeds, which have nothing in common but their
-    number; else `newcombe_interval`, which takes a kind with one seed as that one policy.
+    Intervals are `newcombe_interval`'s, not pair by pair: seeds of two kinds have nothing in common but their
+    number. A kind with one seed is taken as that one policy.
     """
-    length = len(streams[0].by_segment())
-    parts = {"first segment": (0, 1), "others of the first half": (1, length // 2)}
-    parts |= {"second half": (length // 2, length), "all": (0, length)}
-    parts = {name: (a, b) for name, (a, b) in parts.items() if a < b}
-    head = ["policy", "minus", *parts, "all but those found complete"]
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    lines = []
     for before, after in combinations(streams, 2):
-        both = [[sum_rates(one.by_segment()[a:b]) for one in (before, after)] for a, b in parts.values()]
-        both.append([before.done(), after.done()])
-        lines.append(f"| {after.name} | {before.name} | {' | '.join(_difference(*pair) for pair in both)} |")
-    return "\n".join(lines)
+        pairs = zip(before.parts().values(), after.parts().values(), strict=True)
+        lines.append([after.name, before.name, *(_difference(*pair) for pair in pairs)])
+    return _parts_table(lines, ["policy", "minus"], streams)
+
+
+def _parts_table(lines: list[list[str]], first: list[str], streams: Sequence[Streams]) -> str:
+    head = [*first, *streams[0].parts()]
+    return "\n".join([f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *lines)])
 
 
 def _difference(before: Rate, after: Rate) -> str:
     low, high = newcombe_interval(before, after)
-    one, other = ([seed.value for seed in getattr(rate, "seeds", ())] for rate in (before, after))
-    if min(len(one), len(other)) > 1:
-        low, high = ttest_ind(other, one, equal_var=False).confidence_interval()
-    difference = np.mean(other) - np.mean(one) if one and other else after.value - before.value
-    return f"{difference:+.3f} [{low:+.3f}, {high:+.3f}]"
+    return f"{after.value - before.value:+.3f} [{low:+.3f}, {high:+.3f}]"
 
 
 def _cell(rate: Rate) -> str:
@@ -165,7 +176,7 @@ def _cell(rate: Rate) -> str:
 
 def draw_streams(streams: Sequence[Streams], runs: Mapping[str, Sequence[TrainingRun]]) -> Figure:
     """Success by segment, how segments began, success by how they began, and where the interventions went."""
-    figure = Figure(figsize=(10, 7.2 if runs else 6.4), layout="constrained")
+    figure = Figure(figsize=(10, 7.2), layout="constrained")
     axes = figure.subplots(2, 2)
     _draw_segments(axes[0, 0], streams)
     _draw_shares(axes[0, 1], streams)
@@ -185,7 +196,7 @@ def _draw_segments(ax: Axes, streams: Sequence[Streams]) -> None:
         x, y = np.arange(1, len(rates) + 1), np.array([rate.value for rate in rates])
         seeds = f" ({len(one.seeds)} seeds)" if len(one.seeds) > 1 else ""
         ax.plot(x, y, "o-", ms=3.5, lw=1.5, color=color, label=one.name + seeds)
-        for i in range(len(one.seeds) * (len(one.seeds) > 1)):
+        for i in range(len(one.seeds)):
             ax.plot(x, [rate.seeds[i].value for rate in rates], lw=0.7, alpha=0.35, color=color)
     style_axes(ax, "segment since the placement, no reset")
     ax.set(ylim=(0, 1.02), ylabel="success")
@@ -285,9 +296,9 @@ def main() -> None:
     args.output.mkdir(parents=True, exist_ok=True)
     draw_streams(streams, runs).savefig(args.output / "streams.png", dpi=150)
     write_csv(args.output / "streams.csv", table_rows(streams))
-    table = f"{make_table(streams)}\n\n{make_differences(streams)}"
-    (args.output / "streams.md").write_text(table + "\n")
-    print(table)
+    tables = "\n\n".join(make(streams) for make in (make_table, make_parts, make_differences))
+    (args.output / "streams.md").write_text(tables + "\n")
+    print(tables)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from lerobot_env_cronos.expert.reach import find_reach
 from lerobot_env_cronos.scene.robot import HOME_QPOS
 from tiny_checkpoints import STATE, save_policy
 
-from cronos_lerobot.data.demos import DemoCollector, DemoConfig, StartConfig
+from cronos_lerobot.data.demos import DemoCollector, DemoConfig, ExpertError, StartConfig
 from cronos_lerobot.data.perturbations import ActionNoise, MissConfig, NoiseConfig, drop_against_another
 from cronos_lerobot.data.schema import demonstration_features, feature_names
 from cronos_lerobot.data.writer import SegmentWriter
@@ -243,7 +243,7 @@ class Drifter:
         self.executed, self.told, self.forgotten = executed, [], []
 
     def forget(self, ids):
-        self.forgotten += ids.tolist()
+        self.forgotten += [(len(self.executed), stream) for stream in ids.tolist()]
 
     def choose(self, o_t, tau):
         assert len(o_t["agent_pos"]) == len(tau)
@@ -255,7 +255,7 @@ def test_a_policy_does_the_earlier_tasks_in_the_experts_place(env, tmp_path, mon
     config = DemoConfig(start=StartConfig(policy="me/drifter", earlier_tasks=3, arm_pose="either"), max_steps=60)
     spy, task = Spy(env, monkeypatch), env.scene.tasks[0]
     drifter = Drifter(spy.executed)
-    dataset, collector = collect(env, tmp_path / "d", config, 8, tasks=[task], expert=spy, policy=drifter)
+    dataset, _ = collect(env, tmp_path / "d", config, 8, tasks=[task], expert=spy, policy=drifter)
     executed = np.array(spy.executed)
     drifts = (executed == drifter.action).all(axis=-1)
     assert drifts.any()
@@ -264,10 +264,10 @@ def test_a_policy_does_the_earlier_tasks_in_the_experts_place(env, tmp_path, mon
         edges = np.flatnonzero(np.diff(np.concatenate([[0], drifts[:, stream], [0]])))
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
             assert end - begin == 60
-    # Never the task that is demonstrated next, and each is begun anew.
+            assert (begin, stream) in drifter.forgotten
+    # Never the task that is demonstrated next.
     told = {told[i] for step, told in drifter.told for i in np.flatnonzero(drifts[step])}
     assert told <= {other.instruction for other in env.scene.tasks if other != task}
-    assert len(drifter.forgotten) >= collector.finished
     at_home = []
     for episode in episodes_of(dataset):
         assert not (episode["action"] == drifter.action).all(axis=1).any()
@@ -279,17 +279,24 @@ def test_a_policy_does_the_earlier_tasks_in_the_experts_place(env, tmp_path, mon
 def test_what_the_policy_has_left_complete_is_not_demonstrated(env, tmp_path, monkeypatch):
     task, set_task, found = env.scene.tasks[0], env.set_task, []
 
-    def complete_at_first(ids, tasks):
+    def complete(ids, tasks):
         set_task(ids, tasks)
-        if tasks[0] == task and not found:
+        if tasks[0] == task and len(found) < often:
             env.is_success[ids] = True
             found.append(ids)
 
-    monkeypatch.setattr(env, "set_task", complete_at_first)
-    config = DemoConfig(start=StartConfig(policy="me/drifter"), max_steps=60)
+    monkeypatch.setattr(env, "set_task", complete)
+    config, often = DemoConfig(start=StartConfig(policy="me/drifter"), max_steps=60), 1
     dataset, collector = collect(env, tmp_path / "d", config, 2, tasks=[task], policy=Drifter())
     assert len(found) == 1
     assert dataset.num_episodes == collector.finished == collector.successes == 2
+    # A policy that always leaves it complete ends the recording.
+    monkeypatch.setattr("cronos_lerobot.data.demos.MAX_FAILURES_IN_A_ROW", 5)
+    found, often = [], 1000
+    with pytest.raises(
+        ExpertError, match="left the task complete or the expert failed 5 times in a row, last 'put"
+    ):
+        collect(env, tmp_path / "e", config, 2, tasks=[task], policy=Drifter())
 
 
 def test_a_policy_that_begins_is_one_that_is_given(env, tmp_path):

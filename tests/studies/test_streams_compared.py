@@ -10,7 +10,14 @@ from synthetic_runs import read_csv, write_training_run
 
 from cronos_lerobot.report.statistics import Rate, newcombe_interval
 from cronos_lerobot.studies import streams_compared
-from cronos_lerobot.studies.streams_compared import Start, draw_streams, make_differences, make_table, read_streams
+from cronos_lerobot.studies.streams_compared import (
+    Start,
+    draw_streams,
+    make_differences,
+    make_parts,
+    make_table,
+    read_streams,
+)
 
 FIRST = {
     ("segment", "0"): (8, 10), ("segment", "1"): (2, 10), ("segment", "all"): (10, 20),
@@ -63,27 +70,34 @@ def test_the_table_has_rates_with_their_shares(files):
     )
 
 
-def test_differences_of_several_seeds_have_welchs_interval(tmp_path, files):
-    third = write_streams(tmp_path / "3.csv", FIRST | {("segment", "0"): (5, 10)})
-    fourth = write_streams(tmp_path / "4.csv", SECOND | {("segment", "0"): (7, 10)})
+def cells_of(line):
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_parts_of_a_stream_and_what_was_done_in_it(files):
+    parts = read_streams("a", files).parts()
+    # Of two segments the first half has no others; 10 - 4 of 16 and 14 of 20 were not found complete.
+    assert list(parts) == ["first segment", "second half", "all", "all but those found complete"]
+    assert [(rate.successes, rate.n) for rate in parts.values()] == [(18, 20), (6, 20), (24, 40), (20, 36)]
+    assert parts["all but those found complete"].seeds == (Rate(6, 16), Rate(14, 20))
+    head, _, line = make_parts([read_streams("a", files[:1])]).splitlines()
+    assert cells_of(head) == ["policy", *parts]
+    assert cells_of(line)[:2] == ["a", "0.800 [{:.3f}, {:.3f}]".format(*wilson_interval(8, 10))]
+
+
+def test_seeds_are_not_paired_in_differences(tmp_path, files):
+    third = write_streams(tmp_path / "3.csv", FIRST | {("segment", "0"): (7, 10)})
+    fourth = write_streams(tmp_path / "4.csv", SECOND | {("segment", "0"): (9, 10)})
     line = make_differences([read_streams("a", files), read_streams("b", (third, fourth))]).splitlines()[2]
-    cells = [cell.strip() for cell in line.strip("|").split("|")]
-    # First segment: .8 and 1.0 against .5 and .7, variances .02 each: 2 degrees of freedom, 4.303 x sqrt(.02).
-    assert cells[:3] == [
-        "b",
-        "a",
-        f"-0.300 [{-0.3 - 4.30265 * 0.02**0.5:+.3f}, {-0.3 + 4.30265 * 0.02**0.5:+.3f}]",
-    ]
-    # Second segments are the same, and so are those that were done: (10 - 4) / 16 and 14 / 20.
-    assert cells[3].startswith("+0.000 [")
-    assert cells[-1].startswith("+0.000 [")
-    assert read_streams("a", files).done().seeds == (Rate(6, 16), Rate(14, 20))
+    # First segment: .8 and 1.0 against .7 and .9, each .1 less; 12.706 standard errors of .1 on both sides.
+    off = 2**0.5 * 1.27062
+    assert cells_of(line)[:3] == ["b", "a", f"-0.100 [{-0.1 - off:+.3f}, {-0.1 + off:+.3f}]"]
 
 
 def test_differences_from_one_seed_take_it_as_that_policy(files):
     line = make_differences([read_streams("a", files[:1]), read_streams("b", files[1:])]).splitlines()[2]
     low, high = newcombe_interval(Rate(8, 10), Rate(10, 10))
-    assert f"| +0.200 [{low:+.3f}, {high:+.3f}] |" in line
+    assert cells_of(line)[2] == f"+0.200 [{low:+.3f}, {high:+.3f}]"
 
 
 def test_the_command_writes_figure_and_numbers(files, tmp_path, monkeypatch):
@@ -111,6 +125,7 @@ def test_panels_show_what_the_files_say(files):
     shares_of_each = [[34 / 40, 16 / 20], [0, 0], [0, 0], [2 / 40, 0], [4 / 40, 4 / 20]]
     np.testing.assert_allclose(widths, shares_of_each, atol=1e-12)
     assert starts.lines[1].get_ydata() == [20 / 34]
+    assert [list(line.get_ydata()) for line in segments.lines[1:3]] == [[0.8, 0.2], [1.0, 0.4]]
 
 
 @pytest.mark.parametrize(
