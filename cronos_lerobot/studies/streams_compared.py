@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -234,7 +235,7 @@ def _draw_starts(ax: Axes, streams: Sequence[Streams]) -> None:
                 ax.plot([i + shift] * len(rate.seeds), [seed.value for seed in rate.seeds], "_", color=color, ms=9)
                 ax.plot(i + shift, rate.value, "o", color=color, ms=5)
     style_axes(ax, "")
-    ax.set_xticks(range(len(starts)), [STARTS[start][0].replace("other ", "other\n") for start in starts])
+    ax.set_xticks(range(len(starts)), [fill(STARTS[start][0], 13) for start in starts])
     ax.set(ylim=(0, 1.02), ylabel="success")
     ax.set_title("success by how the bodies lay (dashes: seeds)", fontsize=9, color=INK, loc="left")
 
