@@ -3,20 +3,15 @@ import sys
 
 import numpy as np
 import pytest
+from collected_demos import Spy, collect, command, episodes_of, home_position
 from forked_commands import run_forked
 from lerobot.datasets import LeRobotDataset
 from lerobot_env_cronos import CronosVectorEnv
-from lerobot_env_cronos.config import CronosEnvConfig
-from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.expert.reach import find_reach
-from lerobot_env_cronos.scene.robot import HOME_QPOS
-from tiny_checkpoints import STATE, save_policy
 
-from cronos_lerobot.data.demos import DemoCollector, DemoConfig, ExpertError, StartConfig
+from cronos_lerobot.data.demos import DemoConfig, StartConfig
 from cronos_lerobot.data.perturbations import ActionNoise, MissConfig, NoiseConfig, drop_against_another
-from cronos_lerobot.data.schema import demonstration_features, feature_names
-from cronos_lerobot.data.writer import SegmentWriter
-from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig, record_demos
+from cronos_lerobot.scripts.record_demos import RecordDemosConfig, record_demos
 
 NUM_ENVS = 4
 
@@ -24,46 +19,6 @@ NUM_ENVS = 4
 @pytest.fixture(scope="module")
 def env():
     return CronosVectorEnv(NUM_ENVS, obs_type="environment_state_agent_pos")
-
-
-def collect(env, root, config: DemoConfig, num_episodes=4, *, seed=0, tasks=None, expert=None, policy=None):
-    features = demonstration_features(env.single_observation_space, **feature_names(env))
-    with SegmentWriter("me/demos", root, features, 5) as writer:
-        collector = DemoCollector(
-            env, expert or ScriptedExpert(env), writer, config, seed=seed, tasks=tasks, policy=policy
-        )
-        collector.collect(num_episodes)
-    return LeRobotDataset("me/demos", root=root), collector
-
-
-def episodes_of(dataset):
-    rows = dataset.hf_dataset.with_format("numpy")[:]
-    for episode in range(dataset.num_episodes):
-        mine = rows["episode_index"] == episode
-        yield {key: column[mine] for key, column in rows.items()}
-
-
-class Spy:
-    """An expert whose actions, and the actions executed, are kept."""
-
-    def __init__(self, env, monkeypatch):
-        self.env, self.expert = env, ScriptedExpert(env)
-        self.labels, self.seen, self.executed = [], [], []
-        step = env.step
-
-        def spy(actions):
-            self.executed.append(np.array(actions))
-            return step(actions)
-
-        monkeypatch.setattr(env, "step", spy)
-
-    def reset(self, ids):
-        self.expert.reset(ids)
-
-    def act(self):
-        self.seen.append(self.env.observe()["agent_pos"])
-        self.labels.append(self.expert.act().astype(np.float32))
-        return self.labels[-1]
 
 
 def test_successful_episodes_of_every_task_in_balance(env, tmp_path):
@@ -95,12 +50,6 @@ def test_starts_in_the_first_configurations_alone(env, tmp_path):
     assert dataset.meta.episodes["cronos.configuration"] == [0, 0]
     with pytest.raises(ValueError, match=r"start\.num_configurations must be 1 to 64, got 65"):
         StartConfig(num_configurations=65)
-
-
-def home_position(env):
-    env.scene_reset(np.array([0]), np.array([0]))
-    np.testing.assert_array_equal(env.simulation.qpos[0, :6], HOME_QPOS)
-    return env.simulation.end_effector()[0][0]
 
 
 def test_the_first_frame_is_of_the_new_episode(env, tmp_path):
@@ -234,78 +183,6 @@ def test_starts_after_several_tasks_have_all_objects_on_receptacles(env, tmp_pat
     assert on_receptacles > on_one > 0
 
 
-class Drifter:
-    """A policy that drifts a little to the left with an open gripper, whatever the task."""
-
-    action = np.array([0, 0.004, 0, 0, 0, 0, 1], np.float32)
-
-    def __init__(self, executed=()):
-        self.executed, self.told, self.forgotten = executed, [], []
-
-    def forget(self, ids):
-        self.forgotten += [(len(self.executed), stream) for stream in ids.tolist()]
-
-    def choose(self, o_t, tau):
-        assert len(o_t["agent_pos"]) == len(tau)
-        self.told.append((len(self.executed), list(tau)))
-        return np.tile(self.action, (len(tau), 1))
-
-
-def test_a_policy_does_the_earlier_tasks_in_the_experts_place(env, tmp_path, monkeypatch):
-    config = DemoConfig(start=StartConfig(policy="me/drifter", earlier_tasks=3, arm_pose="either"), max_steps=60)
-    spy, task = Spy(env, monkeypatch), env.scene.tasks[0]
-    drifter = Drifter(spy.executed)
-    dataset, _ = collect(env, tmp_path / "d", config, 8, tasks=[task], expert=spy, policy=drifter)
-    executed = np.array(spy.executed)
-    drifts = (executed == drifter.action).all(axis=-1)
-    assert drifts.any()
-    for stream in range(NUM_ENVS):
-        # Each of one to three tasks to its very end, after a step at rest in which it is seen.
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], drifts[:, stream], [0]])))
-        for begin, end in zip(edges[::2], edges[1::2], strict=True):
-            assert end - begin == 60
-            assert (begin, stream) in drifter.forgotten
-    # Never the task that is demonstrated next.
-    told = {told[i] for step, told in drifter.told for i in np.flatnonzero(drifts[step])}
-    assert told <= {other.instruction for other in env.scene.tasks if other != task}
-    at_home = []
-    for episode in episodes_of(dataset):
-        assert not (episode["action"] == drifter.action).all(axis=1).any()
-        assert episode["next.success"][-1]
-        at_home.append(np.abs(episode["observation.state"][0, :3] - home_position(env)).max() < 0.01)
-    assert 0 < sum(at_home) < 8
-
-
-def test_what_the_policy_has_left_complete_is_not_demonstrated(env, tmp_path, monkeypatch):
-    task, set_task, found = env.scene.tasks[0], env.set_task, []
-
-    def complete(ids, tasks):
-        set_task(ids, tasks)
-        if tasks[0] == task and len(found) < often:
-            env.is_success[ids] = True
-            found.append(ids)
-
-    monkeypatch.setattr(env, "set_task", complete)
-    config, often = DemoConfig(start=StartConfig(policy="me/drifter"), max_steps=60), 1
-    dataset, collector = collect(env, tmp_path / "d", config, 2, tasks=[task], policy=Drifter())
-    assert len(found) == 1
-    assert dataset.num_episodes == collector.finished == collector.successes == 2
-    # A policy that always leaves it complete ends the recording.
-    monkeypatch.setattr("cronos_lerobot.data.demos.MAX_FAILURES_IN_A_ROW", 5)
-    found, often = [], 1000
-    with pytest.raises(
-        ExpertError, match="left the task complete or the expert failed 5 times in a row, last 'put"
-    ):
-        collect(env, tmp_path / "e", config, 2, tasks=[task], policy=Drifter())
-
-
-def test_a_policy_that_begins_is_one_that_is_given(env, tmp_path):
-    with pytest.raises(ValueError, match=r"start\.policy does any tasks before: start\.occupied_receptacles"):
-        StartConfig(policy="me/policy", occupied_receptacles=True)
-    with pytest.raises(ValueError, match=r"start\.policy is None, and the policy that was given is <"):
-        collect(env, tmp_path / "d", DemoConfig(), policy=Drifter())
-
-
 def test_tasks_done_before_want_something_done_before():
     with pytest.raises(ValueError, match=r"start\.earlier_tasks=2 needs start\.occupied_receptacles, "):
         StartConfig(earlier_tasks=2)
@@ -398,26 +275,6 @@ def test_one_task_only(env, tmp_path):
 def test_wrong_options_are_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()
-
-
-def command(root, num_episodes, **options) -> RecordDemosConfig:
-    flags = {key: options.pop(key) for key in ("video", "overwrite") if key in options}
-    dataset = DemoDatasetConfig("me/demos", root, num_episodes, **flags)
-    environment = CronosEnvConfig(observation_height=64, observation_width=64)
-    return RecordDemosConfig(env=environment, dataset=dataset, num_envs=2, **options)
-
-
-def test_the_command_begins_with_a_checkpoint_that_fits(tmp_path):
-    start = StartConfig(policy=str(save_policy(tmp_path / "policy", "pocketvla", STATE)))
-    shown, pixels = (command(tmp_path / name, 1, start=start) for name in ("shown", "pixels"))
-    shown.env, pixels.env = CronosEnvConfig(**STATE), CronosEnvConfig(obs_type="pixels_agent_pos")
-    record_demos(shown)
-    assert LeRobotDataset("me/d", root=tmp_path / "shown").num_episodes == 1
-    with pytest.raises(ValueError, match=r"the policy takes observation\.environment_state, which the env"):
-        record_demos(pixels)
-    assert not (tmp_path / "pixels").exists()
-    with pytest.raises(ValueError, match="is neither a folder nor <owner>/<repository> on the Hub"):
-        record_demos(command(tmp_path / "p", 1, start=StartConfig(policy="no such/policy at all")))
 
 
 def test_the_command_records_resumes_and_overwrites(tmp_path, caplog):
