@@ -152,6 +152,15 @@ def test_figure_has_a_line_of_panels_for_each_base_and_marks_at_the_ends(drawn):
     assert labels == ["T = 80 (2 seeds)", "T = 1280, EER (2 seeds)", "T = 1280, EER, staggered (1 seed)"]
 
 
+def test_one_way_of_training_from_two_wide_bases_has_a_line_of_panels_for_each(tmp_path):
+    options, experiment = options_of("few_resets_best", tmp_path / "root"), EXPERIMENTS["few_resets_best"]
+    for row, wins in (("t80_decay_wide", 6), ("t80_decay_wide_resets", 4)):
+        make_run(options, "few_resets_best", row, 1, (2, 3, wins))
+    first, _, second, _ = interventions_figure(collect(experiment, experiment.rows, options)).axes
+    assert [ax.get_title(loc="left") for ax in (first, second)] == ["wide base policy", "wide resets base policy"]
+    assert [box[0].get_ydata()[0] for ax in (first, second) for box in ax.containers] == [0.75, 0.5]
+
+
 def test_marks_at_one_place_stand_side_by_side():
     assert side_by_side([960.0, 16_000.0, 1016.0, 960.0]) == [-7.0, 0.0, 7.0, 0.0]
     assert side_by_side([0.0, 64.0, 0.0]) == [-3.5, 0.0, 3.5]
