@@ -201,7 +201,9 @@ class DemoCollector:
                 episode.frames.setdefault(key, []).append(column[stream].copy())
         succeeded = episode.released > self.config.steps_after_release
         is_late = episode.steps >= self.config.max_steps
-        if info["diverged"][stream]:
+        if info["diverged"][stream] and episode.preludes and self._is_policys(episode):
+            self._discard(stream, episode)
+        elif info["diverged"][stream]:
             self._end(stream, episode, succeeded=False, keep=False)
         elif episode.preludes and (is_late if self._is_policys(episode) else succeeded):
             self._end_prelude(stream, episode)
@@ -242,10 +244,11 @@ class DemoCollector:
             self._discard(stream, episode)
 
     def _discard(self, stream: int, episode: _Episode) -> None:
-        """The policy has left the task complete: nothing can be shown."""
+        """After what the policy did nothing can be shown: the task is complete, or the simulation broke down."""
         self._episodes[stream] = None
         self._count_failure(
-            "start.policy had left the task complete or the expert failed", repr(episode.task.instruction)
+            "start.policy had left the task complete or the simulation broken down, or the expert failed",
+            repr(episode.task.instruction),
         )
 
     def _count_failure(self, what: str, last: str) -> None:

@@ -26,6 +26,9 @@ KINDS = (DEMONSTRATIONS, STREAMS)
 NO_FLAGS = ("root", "discover_packages_path", "features", "features_map")
 """Fields that are left out: folders of whoever made the dataset, and what follows from the flags."""
 
+MAYBE_FOLDERS = ("benchmark", "policy")
+"""Fields that name a folder or something on the Hub; of a folder only that it was one. A hash says which."""
+
 
 @dataclass(frozen=True)
 class Origin:
@@ -44,6 +47,8 @@ class Origin:
     versions: dict[str, str] = field(default_factory=dict)
     """Of the packages that began it."""
     commit: str | None = None
+    start_policy: str | None = None
+    """Of demonstrations that begin where a policy left the scene: a hash of that policy's files."""
 
     @property
     def scene(self) -> str:
@@ -51,8 +56,10 @@ class Origin:
         return check_environment_id(self.environment, "the dataset")
 
 
-def origin_of(env: CronosVectorEnv, kind: str, flags: Mapping[str, Any]) -> Origin:
-    """The origin of what is about to be recorded in `env`."""
+def origin_of(
+    env: CronosVectorEnv, kind: str, flags: Mapping[str, Any], start_policy: str | None = None
+) -> Origin:
+    """The origin of what is about to be recorded in `env`; `start_policy` as in `Origin`."""
     source = env.benchmark.source
     return Origin(
         kind,
@@ -62,6 +69,7 @@ def origin_of(env: CronosVectorEnv, kind: str, flags: Mapping[str, Any]) -> Orig
         dict(flags),
         package_versions(),
         git_commit(),
+        start_policy,
     )
 
 
@@ -84,7 +92,7 @@ def _flatten(encoded: Mapping[str, Any], prefix: str) -> dict[str, Any]:
         if isinstance(value, dict) and value:
             flags |= _flatten(value, f"{prefix}{name}.")
         else:
-            is_folder = name == "benchmark" and value is not None and Path(value).is_dir()
+            is_folder = name in MAYBE_FOLDERS and isinstance(value, str) and Path(value).is_dir()
             flags[prefix + name] = "a folder" if is_folder else value
     return flags
 
@@ -165,6 +173,11 @@ def check_same(there: Origin, here: Origin, what: str, ignored: tuple[str, ...] 
         ]
         if differing:
             raise ValueError(f"{what} was recorded with {'; '.join(differing)}: resume it with the same flags")
+        if there.start_policy != here.start_policy:
+            raise ValueError(
+                f"{what} was recorded after the policy {there.start_policy}, not after {here.start_policy}:"
+                " --start.policy names another one, or its files have changed"
+            )
 
 
 def _text(value: Any) -> str:

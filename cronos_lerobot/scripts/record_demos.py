@@ -26,6 +26,7 @@ from cronos_lerobot.data.demos import DemoCollector, DemoConfig, ExpertError
 from cronos_lerobot.data.origin import DEMONSTRATIONS, flags_of, origin_of
 from cronos_lerobot.data.schema import demonstration_features, feature_names
 from cronos_lerobot.data.writer import RecordingError, SegmentWriter
+from cronos_lerobot.evaluation.policy_source import files_fingerprint, find_policy
 from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.report.stream_video import PolicySpectator, load_spectator
 from cronos_lerobot.scripts.errors import error_line, parse_command_line, stop
@@ -158,11 +159,12 @@ def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv) -> SegmentWriter:
         FileExistsError: the folder exists and neither flag is set.
         FileNotFoundError: there is nothing to resume.
         FolderInUseError: another process writes to it.
-        ValueError: the dataset to resume was recorded in another scene or with other flags.
+        ValueError: the dataset to resume was recorded in another scene, with other flags or after another policy.
     """
     root = cfg.dataset.root
     assert root is not None
-    origin = origin_of(env, DEMONSTRATIONS, flags_of(cfg))
+    policy = None if cfg.start.policy is None else files_fingerprint(find_policy(cfg.start.policy).folder)
+    origin = origin_of(env, DEMONSTRATIONS, flags_of(cfg), policy)
     if cfg.resume:
         writer = SegmentWriter.resume(cfg.dataset.repo_id, root, origin=origin, may_differ=MAY_DIFFER)
         if writer.num_episodes > cfg.dataset.num_episodes:

@@ -1,7 +1,10 @@
 """Demonstrations that begin where a policy has left its own streams."""
 
+import shutil
+
 import numpy as np
 import pytest
+import torch
 from collected_demos import Spy, collect, command, episodes_of, home_position
 from lerobot.datasets import LeRobotDataset
 from lerobot_env_cronos import CronosVectorEnv
@@ -9,6 +12,8 @@ from lerobot_env_cronos.config import CronosEnvConfig
 from tiny_checkpoints import STATE, save_policy
 
 from cronos_lerobot.data.demos import DemoConfig, ExpertError, StartConfig
+from cronos_lerobot.data.origin import read_origin
+from cronos_lerobot.evaluation.policy_source import files_fingerprint
 from cronos_lerobot.scripts.record_demos import record_demos
 
 NUM_ENVS = 4
@@ -79,9 +84,27 @@ def test_what_the_policy_has_left_complete_is_not_demonstrated(env, tmp_path, mo
     monkeypatch.setattr("cronos_lerobot.data.demos.MAX_FAILURES_IN_A_ROW", 5)
     found, often = [], 1000
     with pytest.raises(
-        ExpertError, match="left the task complete or the expert failed 5 times in a row, last 'put"
+        ExpertError, match=r"had left the task complete or the .* failed 5 times in a row, last 'put"
     ):
         collect(env, tmp_path / "e", config, 2, tasks=[task], policy=Drifter())
+
+
+def test_a_policy_that_breaks_the_simulation_is_no_failure_of_the_expert(env, tmp_path, monkeypatch):
+    drifter, step, broken = Drifter(), env.step, []
+
+    def break_down(actions):
+        *result, info = step(actions)
+        drifting = np.flatnonzero((actions == drifter.action).all(axis=1))
+        if len(drifting) and not broken:
+            broken.append(drifting[0])
+            info["diverged"] = np.arange(NUM_ENVS) == drifting[0]
+        return *result, info
+
+    monkeypatch.setattr(env, "step", break_down)
+    config = DemoConfig(start=StartConfig(policy="me/drifter"), max_steps=60)
+    dataset, collector = collect(env, tmp_path / "d", config, 2, policy=drifter)
+    assert len(broken) == 1
+    assert dataset.num_episodes == collector.finished == collector.successes == 2
 
 
 def test_a_policy_that_begins_is_one_that_is_given(env, tmp_path):
@@ -96,7 +119,19 @@ def test_the_command_begins_with_a_checkpoint_that_fits(tmp_path):
     shown, pixels = (command(tmp_path / name, 1, start=start) for name in ("shown", "pixels"))
     shown.env, pixels.env = CronosEnvConfig(**STATE), CronosEnvConfig(obs_type="pixels_agent_pos")
     record_demos(shown)
-    assert LeRobotDataset("me/d", root=tmp_path / "shown").num_episodes == 1
+    dataset = LeRobotDataset("me/d", root=tmp_path / "shown")
+    assert dataset.num_episodes == 1
+    origin = read_origin(tmp_path / "shown", dataset.meta.features, "it")
+    assert origin.flags["start.policy"] == "a folder"
+    assert origin.start_policy == files_fingerprint(tmp_path / "policy")
+    # The same folder with other weights is another policy.
+    shutil.rmtree(tmp_path / "policy")
+    torch.manual_seed(1)
+    save_policy(tmp_path / "policy", "pocketvla", STATE)
+    more = command(tmp_path / "shown", 2, start=start, resume=True)
+    more.env = shown.env
+    with pytest.raises(ValueError, match=f"after the policy {origin.start_policy}, not after "):
+        record_demos(more)
     with pytest.raises(ValueError, match=r"the policy takes observation\.environment_state, which the env"):
         record_demos(pixels)
     assert not (tmp_path / "pixels").exists()
