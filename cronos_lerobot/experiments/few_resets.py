@@ -6,6 +6,7 @@ A plug is a few flags of `cronos-train` beside T = 1280 with end-effector resets
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain
 
 from cronos_lerobot.experiments.definitions import (
     BEST,
@@ -107,6 +108,8 @@ METHOD_BY_BUDGET = (
     replace(plugged("decay"), interval=None),
 )
 """In 1.3 M steps of 64 streams these are 1,008, 254 and 64 resets, and none."""
+LEARNED_BY_BUDGET = tuple(replace(row, learned_reset=True) for row in METHOD_BY_BUDGET)
+"""The same with learned resets, which are no interventions."""
 PAPER_BY_BUDGET = tuple(
     Row(interval, end_effector_reset=True, heuristic_reset=True) for interval in (1280, 5120, 10240, None)
 )
@@ -119,7 +122,12 @@ def _names(rows: tuple[Row, ...]) -> tuple[str, ...]:
     return tuple(row.name for row in rows)
 
 
-_BY_BUDGET = tuple(wide(row) for row in METHOD_BY_BUDGET), tuple(wide(row) for row in PAPER_BY_BUDGET)
+_BY_BUDGET = {
+    " + ".join(TOGETHER): tuple(map(wide, METHOD_BY_BUDGET)),
+    " + ".join((*TOGETHER, "LSR")): tuple(map(wide, LEARNED_BY_BUDGET)),
+    "EER, HSR": tuple(map(wide, PAPER_BY_BUDGET)),
+}
+"""Ways of training with ever fewer interventions."""
 
 for _experiment in (
     Experiment(
@@ -141,10 +149,10 @@ for _experiment in (
     Experiment(
         "few_resets_budgets",
         "Success against the budget of interventions",
-        (wide(EPISODIC), wide(TUNED), wide(BEST), *_BY_BUDGET[0], *_BY_BUDGET[1]),
+        (*map(wide, (EPISODIC, TUNED, BEST)), with_resets(TUNED), *chain.from_iterable(_BY_BUDGET.values())),
         budgets=(64, 254, 1000),
         by_base=True,
-        joined=((" + ".join(TOGETHER), _names(_BY_BUDGET[0])), ("EER, HSR", _names(_BY_BUDGET[1]))),
+        joined=tuple((label, _names(rows)) for label, rows in _BY_BUDGET.items()),
     ),
     *(
         Experiment(
