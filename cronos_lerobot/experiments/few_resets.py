@@ -140,7 +140,7 @@ for _experiment in (
     Experiment(
         "few_resets_best",
         "Learning with few resets, evaluated in full",
-        (*map(wide, (EPISODIC, TUNED, PLAIN, BEST, METHOD)), *map(with_resets, (TUNED, METHOD, LEARNED))),
+        (*map(wide, (EPISODIC, TUNED, PLAIN, BEST, METHOD)), *map(with_resets, (TUNED, BEST, METHOD, LEARNED))),
         splits=BOTH,
         evaluations=(CheckpointEvaluation("independent", ("held_out",)), CheckpointEvaluation("sequential", BOTH)),
         budgets=_BUDGETS,

@@ -25,6 +25,7 @@ ROWS = {
     "t4400_eer_staggered_early_decay_wide": "few resets: most of them early, each stream at a time of its own,"
     " smaller and smaller updates",
     "t80_decay_wide_resets": "episodic, from a base that was shown reset tasks as well, in more demonstrations",
+    "t1280_eer_cl_hsr_wide_resets": "the paper's best, from that base",
     "t4400_eer_staggered_early_decay_wide_resets": "few resets, from that base",
     "t4400_eer_lsr_staggered_early_decay_wide_resets": "few resets and learned ones, from that base",
 }
