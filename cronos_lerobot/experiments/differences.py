@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
 
-from cronos_lerobot.evaluation.outcomes import Outcomes, read_outcomes
+from cronos_lerobot.evaluation.outcomes import Outcomes, read_outcomes, what_differs
 from cronos_lerobot.experiments.results import ExperimentResult, RowResult
 from cronos_lerobot.report.compared_sides import Side, last_evaluation
 from cronos_lerobot.report.paired import Difference
@@ -48,7 +48,10 @@ def compare(
 ) -> RowDifference | None:
     """A row against another at the end of their runs; None unless all of them ran the same episodes."""
     sides = [_outcomes(one, suite, split) for one in (reference, row)]
-    if not all(sides) or len({frozenset(one.lengths) for side in sides for one in side}) > 1:
+    runs = [one for side in sides for one in side]
+    if not all(sides) or len({frozenset(one.lengths) for one in runs}) > 1:
+        return None
+    if any(any(what_differs(runs[0], one, suite)) for one in runs):
         return None
     return _compare(reference, sides[0], row, sides[1])
 

@@ -52,3 +52,12 @@ def test_rows_from_other_bases_have_references_of_their_own(options, tmp_path):
     metrics.write_text(metrics.read_text().replace("[1000, ", "[1001, "))
     result = results(options, "few_resets")
     assert len(to_first(result, compare_rows(result))) == 1
+
+
+def test_rows_of_other_benchmarks_are_not_compared(options):
+    specs = [make_run(options, "table1", row, 1, (2, 4, end)) for row, end in (("t80", 6), ("t1280", 3))]
+    assert len(compare_rows(results(options, "table1"))) == 1
+    manifest = specs[1].train_folder / "manifest.json"
+    start = json.loads(manifest.read_text())["starts"][0]
+    manifest.write_text(json.dumps({"starts": [start | {"benchmark": {"fingerprint": "f" * 16}}]}))
+    assert compare_rows(results(options, "table1")) == []
