@@ -124,12 +124,12 @@ CLEAN_RECIPES: dict[tuple[str, str], BaseRecipe] = {
 """The same from clean demonstrations, where that is measured."""
 WIDE_RECIPES: dict[tuple[str, str], BaseRecipe] = {
     ("kitchen_2x2", STATE): BaseRecipe(1200, 1920, checkpoint=1920, kind=WIDE),
-    ("playroom_2x2", STATE): BaseRecipe(400, 960, checkpoint=720, kind=WIDE),
-    ("kitchen_3x3", STATE): BaseRecipe(900, 1080, checkpoint=1080, kind=WIDE),
+    ("playroom_2x2", STATE): BaseRecipe(1200, 1920, checkpoint=1920, kind=WIDE),
+    ("kitchen_3x3", STATE): BaseRecipe(2700, 4320, checkpoint=4320, kind=WIDE),
     ("kitchen_2x2", PIXELS): BaseRecipe(800, 2400, checkpoint=2400, kind=WIDE),
 }
 """The same over the whole reach. What may lie anywhere takes more demonstrations: `kitchen_2x2`'s clone of 400
-came to .43 and stayed there, of 1,200 to .82 (docs/trials.md)."""
+came to .43 and stayed there, of 1,200 to .82 (docs/trials.md); the other scenes have as many for each task."""
 WIDE_RESETS_RECIPES: dict[tuple[str, str], BaseRecipe] = {
     key: replace(recipe, kind=WIDE_RESETS) for key, recipe in WIDE_RECIPES.items()
 } | {("kitchen_2x2", STATE): BaseRecipe(3600, 3840, checkpoint=3840, kind=WIDE_RESETS)}
