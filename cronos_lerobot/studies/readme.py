@@ -71,13 +71,16 @@ def _success(row: dict[str, Any], split: str) -> str:
     if mean is None:
         return ""
     spread = "" if std is None else f" ± {std:.3f}"
-    return f"{mean:.3f}{spread}" + _interval(
-        (row[f"success_{split}_ci95_low"], row[f"success_{split}_ci95_high"]), ".3f"
-    )
+    if row["seeds"] == 2:
+        # Student's interval of two seeds is as good as none: no width if they are alike, or beyond 1.
+        return f"{mean:.3f}{spread}"
+    low, high = row[f"success_{split}_ci95_low"], row[f"success_{split}_ci95_high"]
+    return f"{mean:.3f}{spread}" + _interval((low, None if high is None else min(high, 1.0)), ".3f")
 
 
 def _difference(found: dict[str, Any]) -> str:
-    return f"{found['difference']:+.3f}" + _interval((found["ci95_low"], found["ci95_high"]), "+.3f")
+    text = f"{found['difference']:+.3f}" + _interval((found["ci95_low"], found["ci95_high"]), "+.3f")
+    return text if found["of_trainings"] else f"{text}, these policies"
 
 
 def _interval(ends: tuple[float | None, float | None], form: str) -> str:
