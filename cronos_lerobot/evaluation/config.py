@@ -36,6 +36,8 @@ class SuitesConfig:
     """Configurations of each split, the first ones, for every task and ordering; null for all 64 (quick: 16)."""
     orderings: int | None = None
     """Orderings of the sequential suite, the first ones; null for all 10 (quick: 3)."""
+    repetitions: int = 1
+    """Episodes of each task and configuration in the independent suite; another repetition has the next seed."""
     temperature: float = 0.6
     """Sampling temperature of policies that have one (`sample_actions`); 0 takes the likeliest action."""
     batch_size: int = 64
@@ -52,6 +54,7 @@ class SuitesConfig:
         for name, least in (
             ("n_episodes", 1),
             ("orderings", 1),
+            ("repetitions", 1),
             ("temperature", 0),
             ("batch_size", 1),
             ("videos", 0),
@@ -59,6 +62,8 @@ class SuitesConfig:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"eval.{name} must be at least {least}, got {value}")
+        if self.repetitions > 1 and "independent" not in _words(self.suites):
+            raise ValueError("eval.repetitions is of the independent suite; eval.suites leaves it out")
 
 
 @dataclass
@@ -111,6 +116,7 @@ class CronosEvalConfig:
         if self.seed < 0:
             raise ValueError(f"seed must be at least 0, got {self.seed}")
         self._check_comparison()
+        self._check_repetitions()
         given = {flag.split("=")[0] for flag in parser.get_cli_overrides("env") or []}
         for name, other in (("suite", "eval.suites"), ("split", "eval.splits"), ("task", "eval.orderings")):
             if f"--{name}" in given:
@@ -140,6 +146,14 @@ class CronosEvalConfig:
         if not 0 < self.stop_at_error < 1:
             raise ValueError(f"stop_at_error must be between 0 and 1, got {self.stop_at_error}")
         self.eval.videos = 0
+
+    def _check_repetitions(self) -> None:
+        repetitions = self.eval.repetitions
+        if repetitions > 1 and (self.expert or not self.eval.temperature):
+            why = "--expert=true" if self.expert else "--eval.temperature=0"
+            raise ValueError(f"eval.repetitions={repetitions} would all be alike with {why}")
+        if repetitions > 1 and self.stop_at_error is not None:
+            raise ValueError("--stop_at_error looks at every episode once: leave --eval.repetitions out")
 
     def _load_policy(self) -> None:
         path = parser.get_path_arg("policy")

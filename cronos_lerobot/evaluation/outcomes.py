@@ -88,7 +88,9 @@ def _outcomes(folder: Path, results: Mapping[str, Any]) -> Outcomes:
             raise ValueError(f"{folder} has no {file.relative_to(folder)}: it is needed to pair episodes")
         part = json.loads(file.read_text())
         for chain in part["chains"]:
-            key = (part["suite"], part["split"], chain["number"], chain["configuration"], results["seed"])
+            # Parts of earlier commits do not say it; they had the evaluation's.
+            seed = part.get("seed", results["seed"])
+            key = (part["suite"], part["split"], chain["number"], chain["configuration"], seed)
             lengths[Episode(*key)] = chain["length"]
     instructions = [list(split["per_task"]) for split in results.get("independent", {}).values()]
     chains = [len(split["positions"]) for split in results.get("sequential", {}).values()]

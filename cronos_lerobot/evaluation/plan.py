@@ -24,14 +24,21 @@ class Part:
     suite: str
     split: str
     chains: tuple[Chain, ...]
+    repetition: int = 0
+    """How often the same chains come before it; each time they have the next seed."""
 
     def noise(self, seed: int) -> Noise:
-        """The randomness of its chains under the evaluation's seed."""
+        """The randomness of its chains under its seed, the evaluation's plus `repetition`."""
         return chain_noise(STEPS_PER_TASK, seed, SUITES.index(self.suite), SPLITS.index(self.split))
 
 
 def make_parts(
-    benchmark: Benchmark, suites: Sequence[str], splits: Sequence[str], num_configurations: int, num_orderings: int
+    benchmark: Benchmark,
+    suites: Sequence[str],
+    splits: Sequence[str],
+    num_configurations: int,
+    num_orderings: int,
+    repetitions: int = 1,
 ) -> list[Part]:
     """Return the parts of an evaluation, suite by suite and split by split.
 
@@ -41,6 +48,7 @@ def make_parts(
         splits: some of `train`, `held_out`.
         num_configurations: the first ones of each task and ordering.
         num_orderings: the first ones of each split.
+        repetitions: of every episode of the independent suite.
     """
     parts = []
     for suite in suites:
@@ -48,7 +56,8 @@ def make_parts(
             groups = benchmark.groups(suite, split)
             if suite == "independent":
                 chains = _chains(groups, num_configurations)
-                parts.append(Part(f"independent_{split}", suite, split, chains))
+                names = [f"independent_{split}", *(f"independent_{split}_again{i}" for i in range(1, repetitions))]
+                parts += [Part(name, suite, split, chains, i) for i, name in enumerate(names)]
                 continue
             groups = groups[:num_orderings]
             for start in range(0, len(groups), ORDERINGS_PER_PART):

@@ -70,7 +70,12 @@ class Evaluation:
     def _make_parts(self) -> list[Part]:
         config = self.config
         return make_parts(
-            self.benchmark, config.suites, config.splits, config.num_configurations, config.num_orderings
+            self.benchmark,
+            config.suites,
+            config.splits,
+            config.num_configurations,
+            config.num_orderings,
+            config.eval.repetitions,
         )
 
     def _identity(self) -> dict[str, Any]:
@@ -95,7 +100,10 @@ class Evaluation:
         write_json(self.store.folder / self.file, results)
         if self.config.eval.videos:
             results["videos"] = film_best_and_worst(
-                self.store, self.parts, self.env_config, self.config.eval.videos
+                self.store,
+                [part for part in self.parts if self._is_filmed(part)],
+                self.env_config,
+                self.config.eval.videos,
             )
             write_json(self.store.folder / self.file, results)
         return results
@@ -106,7 +114,8 @@ class Evaluation:
         with tqdm(total=total, initial=done, unit="chain", disable=None, smoothing=0.1) as bar:
             for part in missing:
                 for outdated in self.store.folder.glob(f"videos/{part.suite}_{part.split}_*.mp4"):
-                    outdated.unlink()
+                    if part.repetition == 0:
+                        outdated.unlink()
                 self._run_part(part, bar)
 
     def _run_part(self, part: Part, bar: tqdm) -> None:
@@ -126,13 +135,15 @@ class Evaluation:
         env, actor = self._env_and_actor
         env.split = part.split
         # Every part begins like this, so that it ends the same whether others ran before it or not.
-        actor.seed(self.config.seed)
-        runner = ChainRunner(env, actor, keeps_states=self.config.eval.videos > 0)
-        results = runner.run(part.chains, part.noise(self.config.seed), show)
+        seed = self.config.seed + part.repetition
+        actor.seed(seed)
+        runner = ChainRunner(env, actor, keeps_states=self._is_filmed(part))
+        results = runner.run(part.chains, part.noise(seed), show)
         records = chain_records(results)
         content = {
             "suite": part.suite,
             "split": part.split,
+            "seed": seed,
             "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             "seconds": time.perf_counter() - start,
             "made_by": self._maker,
@@ -147,6 +158,9 @@ class Evaluation:
         self.store.write(part.name, content, kept)
         if bar.disable:
             logging.info(f"{part.name}: {len(records)} chains, {summary()}, {content['seconds']:.0f} s")
+
+    def _is_filmed(self, part: Part) -> bool:
+        return self.config.eval.videos > 0 and part.repetition == 0
 
     # What is there already ---------------------------------------------------------------------------------
 
@@ -180,7 +194,7 @@ class Evaluation:
             changes = _changes(there["versions"], self._maker["versions"])
             logging.warning(f"{what} was made with other packages ({changes}): it is made again")
             return False
-        if self.config.eval.videos and not self.store.has_trajectories(part.name):
+        if self._is_filmed(part) and not self.store.has_trajectories(part.name):
             logging.info(f"{what} has no states to draw videos from: it is run again")
             return False
         return True
@@ -234,6 +248,7 @@ class Evaluation:
             # Parts of earlier commits do not say it.
             "temperature": finished[0].get("temperature", config.eval.temperature),
             "seed": config.seed,
+            "repetitions": config.eval.repetitions,
             "advance": config.advance,
             "end_effector_reset": config.end_effector_reset,
             "renderer": self.env_config.renderer,

@@ -36,9 +36,16 @@ def planned_outcomes(config: CronosEvalConfig) -> Outcomes:
         config: validated.
     """
     benchmark = config.benchmark()
-    parts = make_parts(benchmark, config.suites, config.splits, config.num_configurations, config.num_orderings)
+    parts = make_parts(
+        benchmark,
+        config.suites,
+        config.splits,
+        config.num_configurations,
+        config.num_orderings,
+        config.eval.repetitions,
+    )
     episodes = {
-        Episode(part.suite, part.split, chain.number, chain.configuration, config.seed): 0
+        Episode(part.suite, part.split, chain.number, chain.configuration, config.seed + part.repetition): 0
         for part in parts
         for chain in part.chains
     }

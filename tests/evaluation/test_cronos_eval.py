@@ -21,6 +21,8 @@ from cronos_lerobot.agents.processing import make_processors
 from cronos_lerobot.evaluation.actors import make_actor
 from cronos_lerobot.evaluation.chains import Chain, ChainRunner, chain_noise
 from cronos_lerobot.evaluation.config import CronosEvalConfig, SuitesConfig
+from cronos_lerobot.evaluation.outcomes import read_outcomes
+from cronos_lerobot.evaluation.plan import Part
 from cronos_lerobot.evaluation.policy_source import fingerprint
 from cronos_lerobot.evaluation.runner import Evaluation
 from cronos_lerobot.evaluation.store import RESULTS
@@ -81,6 +83,58 @@ def test_everything_in_one_go_then_again_after_a_kill(pocketvla, tmp_path, monke
     assert [again[suite] for suite in ("independent", "sequential")] == [
         results[suite] for suite in ("independent", "sequential")
     ]
+
+
+def test_a_repetition_is_the_evaluation_with_the_next_seed(pocketvla, tmp_path, monkeypatch):
+    flags = (f"--policy.path={pocketvla}", "--eval.n_episodes=2", "--eval.suites=independent")
+    flags += ("--eval.splits=held_out", "--env.render_size=[64, 64]")
+    noise, seeds = Part.noise, []
+
+    def spy(part, seed):
+        seeds.append((part.name, seed))
+        return noise(part, seed)
+
+    monkeypatch.setattr(Part, "noise", spy)
+    cronos_eval(monkeypatch, *flags, f"--output_dir={tmp_path / 'both'}")
+    filmed = json.loads((tmp_path / "both" / RESULTS).read_text())["videos"]
+    # Asked for later: what is there is kept.
+    first = (tmp_path / "both/parts/independent_held_out.json").stat().st_mtime_ns
+    video = tmp_path / "both" / filmed[0]["path"]
+    drawn = video.stat().st_mtime_ns
+    cronos_eval(monkeypatch, *flags, "--eval.repetitions=2", f"--output_dir={tmp_path / 'both'}")
+    assert (tmp_path / "both/parts/independent_held_out.json").stat().st_mtime_ns == first
+    assert video.stat().st_mtime_ns == drawn
+    cronos_eval(monkeypatch, *flags, "--eval.videos=0", "--seed=1001", f"--output_dir={tmp_path / 'next'}")
+    both, after = outcomes(tmp_path / "both"), outcomes(tmp_path / "next")
+    assert list(both) == ["independent_held_out.json", "independent_held_out_again1.json"]
+    assert both["independent_held_out_again1.json"] == after["independent_held_out.json"]
+    # A policy that never succeeds fails alike with every seed: what its actions were drawn from tells more.
+    names = ("independent_held_out", "independent_held_out_again1", "independent_held_out")
+    assert seeds == list(zip(names, (1000, 1001, 1001), strict=True))
+    results = json.loads((tmp_path / "both" / RESULTS).read_text())
+    assert (results["repetitions"], results["independent"]["held_out"]["n"]) == (2, 4 * 2 * 2)
+    assert results["videos"] == filmed
+    lengths = read_outcomes(tmp_path / "both").lengths
+    assert {episode.seed for episode in lengths} == {1000, 1001}
+    second = {episode: length for episode, length in lengths.items() if episode.seed == 1001}
+    assert second == read_outcomes(tmp_path / "next").lengths
+    assert len(lengths) == 16
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--eval.repetitions=0"], "eval.repetitions must be at least 1, got 0"),
+        (["--eval.repetitions=2", "--eval.suites=sequential"], "eval.repetitions is of the independent suite"),
+        (
+            ["--eval.repetitions=2", "--eval.temperature=0"],
+            "eval.repetitions=2 would all be alike with --eval.temp",
+        ),
+    ],
+)
+def test_repetitions_that_are_none_are_refused(flags, message, pocketvla, tmp_path, monkeypatch):
+    with pytest.raises(SystemExit, match=message):
+        cronos_eval(monkeypatch, f"--policy.path={pocketvla}", *flags, f"--output_dir={tmp_path / 'out'}")
 
 
 def test_an_output_folder_is_of_one_evaluation(pocketvla, tmp_path, monkeypatch):
