@@ -17,6 +17,7 @@ from lerobot_env_cronos import Benchmark, CronosEnvConfig, gymnasium_id, load_be
 from lerobot_env_cronos.benchmark.benchmark import SUITES
 from lerobot_env_cronos.benchmark.configurations import SPLITS
 
+from cronos_lerobot.evaluation.plan import Part, make_parts
 from cronos_lerobot.evaluation.policy_env import check_observations, observations_of, trained_scene
 from cronos_lerobot.evaluation.policy_source import PolicySource, find_policy, fingerprint
 
@@ -37,7 +38,8 @@ class SuitesConfig:
     orderings: int | None = None
     """Orderings of the sequential suite, the first ones; null for all 10 (quick: 3)."""
     repetitions: int = 1
-    """Episodes of each task and configuration in the independent suite; another repetition has the next seed."""
+    """Episodes of each task and configuration in the independent suite; another repetition has the next seed.
+    A policy that draws no numbers only does the same again."""
     temperature: float = 0.6
     """Sampling temperature of policies that have one (`sample_actions`); 0 takes the likeliest action."""
     batch_size: int = 64
@@ -218,6 +220,17 @@ class CronosEvalConfig:
         benchmark = self.benchmark()
         most = max(len(benchmark.groups("sequential", split)) for split in self.splits)
         return min(most, self.eval.orderings or (QUICK_ORDERINGS if self.quick else most))
+
+    def make_parts(self) -> list[Part]:
+        """All that is to be run."""
+        return make_parts(
+            self.benchmark(),
+            self.suites,
+            self.splits,
+            self.num_configurations,
+            self.num_orderings,
+            self.eval.repetitions,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The config as JSON values."""

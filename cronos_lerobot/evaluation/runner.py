@@ -19,7 +19,7 @@ from cronos_lerobot.evaluation.actors import Actor, ExpertActor, load_actor
 from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
 from cronos_lerobot.evaluation.config import CronosEvalConfig
 from cronos_lerobot.evaluation.film import film_best_and_worst
-from cronos_lerobot.evaluation.plan import Part, make_parts
+from cronos_lerobot.evaluation.plan import Part
 from cronos_lerobot.evaluation.results import independent_results, sequential_results
 from cronos_lerobot.evaluation.store import (
     ANEW,
@@ -68,15 +68,7 @@ class Evaluation:
         self._missing = [part for part in self.parts if not self._is_kept(part)]
 
     def _make_parts(self) -> list[Part]:
-        config = self.config
-        return make_parts(
-            self.benchmark,
-            config.suites,
-            config.splits,
-            config.num_configurations,
-            config.num_orderings,
-            config.eval.repetitions,
-        )
+        return self.config.make_parts()
 
     def _identity(self) -> dict[str, Any]:
         """Everything that decides what is in the folder."""
@@ -113,8 +105,8 @@ class Evaluation:
         done = total - sum(len(part.chains) for part in missing)
         with tqdm(total=total, initial=done, unit="chain", disable=None, smoothing=0.1) as bar:
             for part in missing:
-                for outdated in self.store.folder.glob(f"videos/{part.suite}_{part.split}_*.mp4"):
-                    if part.repetition == 0:
+                if part.repetition == 0:
+                    for outdated in self.store.folder.glob(f"videos/{part.suite}_{part.split}_*.mp4"):
                         outdated.unlink()
                 self._run_part(part, bar)
 

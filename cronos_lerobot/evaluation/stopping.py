@@ -16,7 +16,7 @@ from tqdm import tqdm
 from cronos_lerobot.evaluation.chains import Chain
 from cronos_lerobot.evaluation.config import CronosEvalConfig
 from cronos_lerobot.evaluation.outcomes import Episode, Outcomes, shared_episodes
-from cronos_lerobot.evaluation.plan import Part, make_parts
+from cronos_lerobot.evaluation.plan import Part
 from cronos_lerobot.evaluation.runner import Evaluation, MakeActor
 from cronos_lerobot.evaluation.sign_flip import SequentialSignTest
 from cronos_lerobot.evaluation.store import COMPARISON
@@ -36,17 +36,9 @@ def planned_outcomes(config: CronosEvalConfig) -> Outcomes:
         config: validated.
     """
     benchmark = config.benchmark()
-    parts = make_parts(
-        benchmark,
-        config.suites,
-        config.splits,
-        config.num_configurations,
-        config.num_orderings,
-        config.eval.repetitions,
-    )
     episodes = {
         Episode(part.suite, part.split, chain.number, chain.configuration, config.seed + part.repetition): 0
-        for part in parts
+        for part in config.make_parts()
         for chain in part.chains
     }
     setting = {

@@ -19,7 +19,8 @@ def train_progress(folder: Path, total: int) -> Progress | None:
         return None
     updates = [record for record in records if record["kind"] == "update"]
     done = records[-1]["interaction_steps"]
-    left, timed = None, [record for record in updates if record["time"] >= _started(folder)]
+    left, started = None, _started(folder)
+    timed = [record for record in updates if record["time"] >= started]
     if len(timed) > 1:
         steps = timed[-1]["interaction_steps"] - timed[0]["interaction_steps"]
         left = (total - done) * (timed[-1]["time"] - timed[0]["time"]) / max(steps, 1)
