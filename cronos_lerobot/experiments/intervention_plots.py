@@ -13,8 +13,8 @@ from matplotlib.transforms import ScaledTranslation
 
 from cronos_lerobot.experiments.definitions import INTERACTION_STEPS, INTERVENTIONS, NARROW
 from cronos_lerobot.experiments.plots import AXIS_LABELS, legend_below, row_curve
-from cronos_lerobot.experiments.results import ExperimentResult, RowResult
-from cronos_lerobot.protocol.metrics import Summary, summarise
+from cronos_lerobot.experiments.results import ExperimentResult, RowResult, summarise_points
+from cronos_lerobot.protocol.metrics import Summary
 from cronos_lerobot.report.figures import COLORS, INK, style_axes
 
 SPLIT = "train"
@@ -110,11 +110,9 @@ def row_styles(result: ExperimentResult) -> dict[str, Style]:
 def find_end(row: RowResult) -> End | None:
     """The last evaluations of a row's finished runs, or of all while there is none; None without any."""
     points = [curve[-1] for seed in row.drawn if (curve := seed.curve(SPLIT))]
-    success = summarise([point.success for point in points])
+    success = summarise_points(points)
     if success is None:
         return None
-    if len(points) == 1:
-        success = replace(success, ci95=points[0].ci95)
     mean = [float(np.mean([point.x(axis) for point in points])) for axis in (INTERVENTIONS, INTERACTION_STEPS)]
     return End(*mean, success)
 
@@ -132,7 +130,7 @@ def _draw_row(ax: Axes, row: RowResult, style: Style, end: End, axis: str, place
     assert figure is not None
     x, shift = place
     low, high = end.success.ci95 or (end.success.mean, end.success.mean)
-    error = [[end.success.mean - max(low, 0.0)], [min(high, 1.0) - end.success.mean]]
+    error = [[end.success.mean - low], [high - end.success.mean]]
     ax.errorbar(
         [x], [end.success.mean], yerr=error, color=style.color, marker=style.marker, ms=5.5, lw=0, elinewidth=1.4,
         label=f"{style.label} ({_seeds(row)})", zorder=4,

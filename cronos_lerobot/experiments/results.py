@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
@@ -44,6 +44,19 @@ class Point:
     def x(self, axis: str) -> int:
         """The point's place on `axis`, interaction_steps or interventions."""
         return self.interventions if axis == INTERVENTIONS else self.interaction_steps
+
+
+def summarise_points(points: Sequence[Point]) -> Summary | None:
+    """Success over the seeds, a point for each; None of none.
+
+    One alone has the interval of its evaluation. Student's of two or three can be wider than a rate can be: it ends
+    at 0 and 1.
+    """
+    summary = summarise([point.success for point in points])
+    if summary is None:
+        return None
+    low, high = summary.ci95 or points[0].ci95
+    return replace(summary, ci95=(max(low, 0.0), min(high, 1.0)))
 
 
 @dataclass(frozen=True)
@@ -123,9 +136,7 @@ class RowResult:
 
     def success(self, split: str) -> Summary | None:
         """Success at the end, over the finished seeds; one alone has the interval of its evaluation."""
-        points = self.finals(split)
-        summary = summarise([point.success for point in points])
-        return replace(summary, ci95=points[0].ci95) if summary and len(points) == 1 else summary
+        return summarise_points(self.finals(split))
 
     def gap(self, axis: str, split: str = "train", up_to: float | None = None) -> Summary | None:
         """D or C, divided by the length of the axis, over the finished seeds."""

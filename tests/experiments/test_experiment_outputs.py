@@ -27,9 +27,9 @@ def test_main_table(options):
     t80 = row["t80"]
     assert (t80["success_train_mean"], t80["n_train"], t80["seeds"]) == (0.75, 32, 2)
     assert t80["success_train_std"] == pytest.approx(0.25 / 2**0.5)
-    # Two seeds, .625 and .875: t with one degree of freedom is 12.706, the standard error 1 / 8. They tell little.
-    low, high = t80["success_train_ci95_low"], t80["success_train_ci95_high"]
-    assert (low, high) == (pytest.approx(0.75 - 12.706 / 8, abs=1e-3), pytest.approx(0.75 + 12.706 / 8, abs=1e-3))
+    # Two seeds, .625 and .875: t with one degree of freedom is 12.706, the standard error 1 / 8, and .75 +- 1.59 is
+    # wider than a rate can be.
+    assert (t80["success_train_ci95_low"], t80["success_train_ci95_high"]) == (0.0, 1.0)
     assert (t80["paper_mean"], t80["paper_std"]) == (0.897, 0.027)
     assert (t80["base_success_mean"], t80["interventions_mean"]) == (0.25, RESETS[80])
     # Gaps .75, .5, .375 and .75, .5, .125 at three evaluations equally far apart.
@@ -257,7 +257,7 @@ def test_files_of_table1(options, tmp_path):
     line = next(line for line in text.splitlines() if line.startswith("| 80 |"))
     cells = [cell.strip() for cell in line.split("|")][1:-1]
     assert cells[:13] == [
-        "80", "–", "–", "–", "–", "0.688 ± 0.088", "[-0.107, 1.482]", "32", "0", "0", "2/2", "0.897 ± 0.027",
+        "80", "–", "–", "–", "–", "0.688 ± 0.088", "[0.000, 1.000]", "32", "0", "0", "2/2", "0.897 ± 0.027",
         "0.250",
     ]  # fmt: skip
     assert (out / "table1.md").read_text() in text

@@ -127,7 +127,8 @@ def test_ends_of_the_rows(drawn):
     t80 = rows["t80"]
     # 8 streams in 1280 steps: 16 resets of each; .75 and 1.0 of two seeds.
     assert (t80.interventions, t80.steps, t80.success.mean) == (128, 10_240, 0.875)
-    assert t80.success.ci95[0] == pytest.approx(0.875 - 12.706 / 8, abs=1e-3)
+    # Student's of two seeds, 12.706 / 8 to each side, is wider than a rate can be.
+    assert t80.success.ci95 == (0.0, 1.0)
     wide_end = rows["t1280_eer_staggered_wide"]
     # One seed: Wilson's interval of 24 of 32.
     assert (wide_end.interventions, wide_end.success.mean) == (8, 0.75)
