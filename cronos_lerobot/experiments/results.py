@@ -49,8 +49,8 @@ class Point:
 def summarise_points(points: Sequence[Point]) -> Summary | None:
     """Success over the seeds, a point for each; None of none.
 
-    One alone has the interval of its evaluation. Student's of two or three can be wider than a rate can be: it ends
-    at 0 and 1.
+    One alone has the interval of its evaluation. Student's of two or three can be wider than a rate can be: it
+    ends at 0 and 1.
     """
     summary = summarise([point.success for point in points])
     if summary is None:

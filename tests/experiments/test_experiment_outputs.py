@@ -27,8 +27,8 @@ def test_main_table(options):
     t80 = row["t80"]
     assert (t80["success_train_mean"], t80["n_train"], t80["seeds"]) == (0.75, 32, 2)
     assert t80["success_train_std"] == pytest.approx(0.25 / 2**0.5)
-    # Two seeds, .625 and .875: t with one degree of freedom is 12.706, the standard error 1 / 8, and .75 +- 1.59 is
-    # wider than a rate can be.
+    # Two seeds, .625 and .875: t with one degree of freedom is 12.706, the standard error 1 / 8, and .75 +- 1.59
+    # is wider than a rate can be.
     assert (t80["success_train_ci95_low"], t80["success_train_ci95_high"]) == (0.0, 1.0)
     assert (t80["paper_mean"], t80["paper_std"]) == (0.897, 0.027)
     assert (t80["base_success_mean"], t80["interventions_mean"]) == (0.25, RESETS[80])
