@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from cronos_lerobot.evaluation.outcomes import Episode, Outcomes, read_outcomes, shared_episodes
+from cronos_lerobot.evaluation.outcomes import WORTH_SAYING, Episode, Outcomes, read_outcomes, shared_episodes
 from cronos_lerobot.evaluation.store import COMPARISON, RESULTS
 from cronos_lerobot.report.runs import TrainingRun, files_called, group_runs, read_training_run
 from cronos_lerobot.report.suites import is_results, policy_name
@@ -34,18 +34,52 @@ class Side:
         return list(dict.fromkeys(pair for o in (*self.evaluations, *self.runs) for pair in o.suites))
 
     def trainings(self, suite: str, split: str) -> list[Outcomes]:
-        """One for each policy, of several checkpoints of one run the last; of cronos-eval wherever it was run.
+        """One for each policy, of several checkpoints of one run the last.
+
+        As cronos-eval found it, wherever that was run, unless more of the side's runs have an evaluation of their
+        own.
 
         Raises:
-            ValueError: a policy has two different evaluations of the same episodes.
+            ValueError: a policy has two evaluations of the same episodes, or one name is of two policies.
         """
-        evaluated = [o for o in self.evaluations if o.of(suite, split)]
-        found: dict[str, dict[str, Outcomes]] = {}
-        for outcomes in evaluated or [o for o in self.runs if o.of(suite, split)]:
-            run, checkpoint = run_and_checkpoint(outcomes)
-            one, there = replace(outcomes, lengths=outcomes.of(suite, split)), found.setdefault(run, {})
-            there[checkpoint] = _together(there[checkpoint], one) if checkpoint in there else one
-        return [checkpoints[max(checkpoints, key=_order)] for checkpoints in found.values()]
+        evaluated, own = self._by_source(suite, split)
+        return own if len(evaluated) < len(own) else evaluated
+
+    def passed_over(self, suite: str, split: str) -> str | None:
+        """Which evaluations `trainings` does not speak of, in words; None if there are none."""
+        evaluated, own = self._by_source(suite, split)
+        if not 0 < len(evaluated) < len(self.runs):
+            return None
+        counts = f"cronos-eval has been run of {len(evaluated)} of {len(self.runs)} policies"
+        return f"{counts}: all have their runs' own evaluations here" if len(evaluated) < len(own) else counts
+
+    def _by_source(self, suite: str, split: str) -> tuple[list[Outcomes], list[Outcomes]]:
+        evaluated, own = (_by_policy(some, suite, split) for some in (self.evaluations, self.runs))
+        return evaluated, own
+
+
+def _by_policy(outcomes: Sequence[Outcomes], suite: str, split: str) -> list[Outcomes]:
+    """The episodes of each policy; of each run its last checkpoint."""
+    found: dict[str, dict[str, Outcomes]] = {}
+    for one in outcomes:
+        if lengths := one.of(suite, split):
+            run, checkpoint = run_and_checkpoint(one)
+            _add(found.setdefault(run, {}), checkpoint, replace(one, lengths=lengths))
+    policies: dict[str, Outcomes] = {}
+    for checkpoints in found.values():
+        last = checkpoints[max(checkpoints, key=_order)]
+        _add(policies, identity(last), last)
+    return list(policies.values())
+
+
+def _add(found: dict[str, Outcomes], key: str, one: Outcomes) -> None:
+    found[key] = _together(found[key], one) if key in found else one
+
+
+def identity(outcomes: Outcomes) -> str:
+    """What tells a policy, as it was evaluated, from another, wherever it lies."""
+    what = outcomes.fingerprint or outcomes.policy
+    return f"{what} {sorted((name, str(outcomes.setting.get(name))) for name in WORTH_SAYING)}"
 
 
 def _order(checkpoint: str) -> tuple[bool, str]:
@@ -63,6 +97,11 @@ def run_and_checkpoint(outcomes: Outcomes) -> tuple[str, str]:
 
 def _together(one: Outcomes, other: Outcomes) -> Outcomes:
     """Evaluations of a policy with other seeds, or of other episodes."""
+    if one.fingerprint != other.fingerprint:
+        raise ValueError(
+            f"{one.policy} was evaluated as two different policies ({one.fingerprint} and {other.fingerprint}):"
+            " name the folders of one of them"
+        )
     if one.lengths.keys() & other.lengths.keys():
         names = [name for name in one.setting if one.setting[name] != other.setting[name]]
         differ = "; ".join(f"{name}: {one.setting[name]} and {other.setting[name]}" for name in names)
@@ -100,11 +139,22 @@ def read_side(folders: Sequence[Path]) -> Side:
         labels = "; ".join(group.label for group in groups)
         raise ValueError(f"{_names(folders)}: runs of {len(groups)} experiments, not seeds of one: {labels}")
     own: list[Outcomes] = []
-    for run in groups[0].runs if groups else []:
+    for run in _as_long(groups[0].runs, notes) if groups else []:
         _keep(notes, lambda run=run: own.append(last_evaluation(run)))
     if not evaluations and not own:
         raise ValueError("; ".join(notes))
     return Side(tuple(folders), list(evaluations.values()), own, notes)
+
+
+def _as_long(runs: Sequence[TrainingRun], notes: list[str]) -> list[TrainingRun]:
+    """The runs whose last evaluation comes as late as that of the longest; the others are not at their end."""
+    ends = [run.evaluations[-1]["interaction_steps"] if run.evaluations else 0 for run in runs]
+    for run, end in zip(runs, ends, strict=True):
+        if end < max(ends):
+            notes.append(
+                f"{run.folder}: its last evaluation is after {end:,} steps, another's after {max(ends):,}"
+            )
+    return [run for run, end in zip(runs, ends, strict=True) if end == max(ends)]
 
 
 def _keep(notes: list[str], read: Any) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cronos_lerobot.evaluation.outcomes import WORTH_SAYING, Outcomes
-from cronos_lerobot.report.compared_sides import Side, paired_episodes, short_name
+from cronos_lerobot.report.compared_sides import Side, identity, paired_episodes, short_name
 from cronos_lerobot.report.paired import ALPHA, Difference, Pairs, compare_policies, compare_trainings, holm
 
 FORMAT = 1
@@ -32,7 +32,9 @@ class PairedRow:
     policies: Difference
     """Of these very policies."""
     trainings: Difference | None
-    """Of trainings like these; None if there is one of each."""
+    """Of trainings like these; None if there is one of each. A side of one is taken as it is."""
+    sampled: str = ""
+    """The sides that have several trainings, of which `trainings` speaks: `A`, `B` or `AB`."""
     p_holm: float | None = None
     """p of a single task or position, adjusted for as many tests as there are of them."""
 
@@ -40,6 +42,16 @@ class PairedRow:
     def most_general(self) -> Difference:
         """Of trainings, if there are several."""
         return self.trainings or self.policies
+
+    @property
+    def of_what(self) -> str:
+        """What `most_general` speaks of."""
+        if not self.trainings:
+            return "these policies"
+        if self.sampled == "AB":
+            return "trainings like these"
+        one = "A" if self.sampled == "B" else "B"
+        return f"trainings like those of {self.sampled} against this one policy of {one}"
 
     @property
     def more_episodes(self) -> int | None:
@@ -65,6 +77,8 @@ class PairedSuite:
     """Episodes of either side that the other does not have."""
     differs: list[str]
     """What differs between the sides beside the policies, a phrase for each."""
+    passed_over: list[str]
+    """Evaluations of either side that were not compared, a phrase for each."""
     rows: list[PairedRow]
 
 
@@ -78,10 +92,27 @@ def compare_sides(a: Side, b: Side, power: float) -> list[PairedSuite]:
     if not common:
         there, here = ([" ".join(pair) for pair in side.suites] for side in (a, b))
         raise ValueError(f"no suite and split is in both: A has {', '.join(there)}, B has {', '.join(here)}")
-    return [_suite(a.trainings(*pair), b.trainings(*pair), *pair, power) for pair in common]
+    return [_suite(a, b, *pair, power) for pair in common]
 
 
-def _suite(a: Sequence[Outcomes], b: Sequence[Outcomes], suite: str, split: str, power: float) -> PairedSuite:
+def check_apart(a: Side, b: Side) -> None:
+    """Check that no policy is on both sides.
+
+    Raises:
+        ValueError: one is, evaluated alike.
+    """
+    for pair in [pair for pair in a.suites if pair in b.suites]:
+        ours = {identity(outcomes) for outcomes in b.trainings(*pair)}
+        for outcomes in a.trainings(*pair):
+            if identity(outcomes) in ours:
+                raise ValueError(
+                    f"A and B both have {outcomes.policy}, evaluated alike: there is nothing to compare"
+                )
+
+
+def _suite(side_a: Side, side_b: Side, suite: str, split: str, power: float) -> PairedSuite:
+    a, b = side_a.trainings(suite, split), side_b.trainings(suite, split)
+    passed_over = {"A": side_a.passed_over(suite, split), "B": side_b.passed_over(suite, split)}
     episodes = paired_episodes((a, b), suite, split)
     numbers = np.array([episode.number for episode in episodes])
     lengths = [np.array([[o.lengths[e] for e in episodes] for o in side]) for side in (a, b)]
@@ -105,6 +136,7 @@ def _suite(a: Sequence[Outcomes], b: Sequence[Outcomes], suite: str, split: str,
         sorted({episode.seed for episode in episodes}),
         len(everyone) - len(episodes),
         list(_differs(a, b)),
+        [f"{side}: {words}" for side, words in passed_over.items() if words],
         [_row(first, pairs, power), *rows],
     )
 
@@ -132,6 +164,7 @@ def _row(what: str, pairs: Pairs, power: float) -> PairedRow:
         only_b,
         compare_policies(pairs, power),
         compare_trainings(pairs, power),
+        "A" * (len(pairs.a) > 1) + "B" * (len(pairs.b) > 1),
     )
 
 
@@ -182,13 +215,15 @@ def _suite_text(suite: PairedSuite, power: float) -> str:
     if suite.left_out:
         lines.append(f"  left out: {suite.left_out} that not all of them ran")
     lines += [f"  not alike: {phrase}" for phrase in suite.differs]
+    lines += [f"  passed over: {phrase}" for phrase in suite.passed_over]
     table = [("", "A", "B", "B - A [95 % interval]", "p", "p (Holm)")]
     for row in suite.rows:
         shown = row.policies if row is first else row.most_general
         cells = (row.what, f"{row.a:.3f}", f"{row.b:.3f}", *_cells(shown))
         table.append((*cells, "" if row.p_holm is None else f"{row.p_holm:.2g}"))
         if row.trainings and row is first:
-            table.append(("  trainings like these", "", "", *_cells(row.trainings), ""))
+            which = "these" if row.sampled == "AB" else f"those of {row.sampled}"
+            table.append((f"  trainings like {which}", "", "", *_cells(row.trainings), ""))
     widths = [max(len(line[i]) for line in table) for i in range(len(table[0]))]
     lines += ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in table]
     return "\n".join([*lines, *_sentences(first, power)])
@@ -203,7 +238,7 @@ def _cells(difference: Difference) -> tuple[str, str]:
 def _sentences(row: PairedRow, power: float) -> Iterator[str]:
     """What the first row decides, and what a decision would take."""
     found = row.most_general
-    of_what = "trainings like these" if row.trainings else "these policies"
+    of_what = row.of_what
     if found.is_separated:
         yield f"{'B' if found.value > 0 else 'A'} is better, of {of_what} (p = {found.p:.2g} < {ALPHA})."
     else:
@@ -212,12 +247,15 @@ def _sentences(row: PairedRow, power: float) -> Iterator[str]:
         if found.detectable is not None:
             yield f"  A difference of {found.detectable:.3f} would have been found with power {power}."
         if row.trainings and found.needed is not None:
-            yield f"  One of {abs(found.value):.3f} takes at least {found.needed} trainings of each side."
+            which = "of each side" if row.sampled == "AB" else f"of {row.sampled}"
+            yield f"  One of {abs(found.value):.3f} takes at least {found.needed} trainings {which}."
         elif not row.trainings and row.more_episodes is not None:
             yield (
                 f"  One of {abs(found.value):.3f} takes about {row.more_episodes} more episodes of each policy,"
                 f" from {found.needed} configurations in all."
             )
+    if row.trainings and row.sampled != "AB":
+        yield "  Of other trainings of the single policy this says nothing."
     if not row.trainings:
         yield "  One training each: this says nothing of how they were trained."
     yield f"  Method: {row.policies.method}" + (f"; {row.trainings.method}." if row.trainings else ".")

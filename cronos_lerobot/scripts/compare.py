@@ -57,10 +57,11 @@ def main(arguments: Sequence[str]) -> None:
     if not 0.5 <= args.power < 1:
         parser.error(f"--power must be at least 0.5 and below 1, got {args.power}")
     from cronos_lerobot.report.compared_sides import read_side
-    from cronos_lerobot.report.paired_report import compare_sides, to_json, to_text
+    from cronos_lerobot.report.paired_report import check_apart, compare_sides, to_json, to_text
 
     with error_line():
         sides = read_side(a), read_side(b)
+        check_apart(*sides)
         suites = compare_sides(*sides, args.power)
     for note in dict.fromkeys(sides[0].notes + sides[1].notes):
         print(f"left out: {note}", file=sys.stderr)

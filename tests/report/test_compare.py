@@ -11,11 +11,11 @@ from synthetic_runs import INSTRUCTIONS
 from cronos_lerobot.scripts import report
 
 
-def write_run(folder, seed, tasks, **changes):
+def write_run(folder, seed, tasks, steps=10240, **changes):
     """A run of cronos-train with one evaluation before and one after."""
     folder.mkdir(parents=True)
     lines = []
-    for step, strings in ((0, ["0" * len(tasks[0])] * len(tasks)), (10240, tasks)):
+    for step, strings in ((0, ["0" * len(tasks[0])] * len(tasks)), (steps, tasks)):
         episodes = [[1000, number, c, int(x)] for number, line in enumerate(strings) for c, x in enumerate(line)]
         line = {"kind": "evaluation", "interaction_steps": step, "interventions": 0, "split": "train"}
         line |= {
@@ -126,6 +126,66 @@ def test_run_folders_have_their_last_evaluation(tmp_path, monkeypatch, capsys):
     write_run(tmp_path / "b/other", 1, ["1111", "0000"], scene_reset_interval=1280)
     with pytest.raises(SystemExit, match=r"runs of 2 experiments, not seeds of one: .*1280"):
         compare(monkeypatch, a, tmp_path / "b")
+
+
+def test_several_trainings_against_one_policy_speak_of_the_several(tmp_path, monkeypatch, capsys):
+    write_run(tmp_path / "a", 1, ["10001000"])
+    for seed, tasks in ((1, ["11101110"]), (2, ["11111111"]), (3, ["11110111"])):
+        write_run(tmp_path / f"b/seed{seed}", seed, tasks)
+    compare(monkeypatch, tmp_path / "a", tmp_path / "b")
+    text = capsys.readouterr().out
+    assert re.search(r"trainings like those of B +\+0\.625 \[", text)
+    assert "B is better, of trainings like those of B against this one policy of A" in text
+    assert "Of other trainings of the single policy this says nothing." in text
+    compare(monkeypatch, tmp_path / "b", tmp_path / "a")
+    text = capsys.readouterr().out
+    assert "A is better, of trainings like those of A against this one policy of B" in text
+
+
+def test_a_run_that_did_not_come_as_far_is_left_out(tmp_path, monkeypatch, capsys):
+    a = write_run(tmp_path / "a", 1, ["1000", "0000"])
+    for seed, steps in ((1, 10240), (2, 5120), (3, 10240)):
+        write_run(tmp_path / f"b/seed{seed}", seed, ["1111", "0000"], steps=steps)
+    found = compared(monkeypatch, capsys, a, tmp_path / "b")
+    assert found["comparisons"][0]["b"] == ["seed1 0010240", "seed3 0010240"]
+    (note,) = found["left_out"]
+    assert note.endswith("b/seed2: its last evaluation is after 5,120 steps, another's after 10,240")
+
+
+def test_runs_without_a_cronos_eval_are_not_dropped_for_those_that_have_one(tmp_path, monkeypatch, capsys):
+    a = write_run(tmp_path / "a", 1, ["1000", "0000"])
+    for seed in (1, 2):
+        write_run(tmp_path / f"b/seed{seed}/train", seed, ["1110", "0001"])
+    of_one = {"policy": "b/seed1/train/checkpoints/last/pretrained_model", "tasks": ["1111", "1111"]}
+    write_evaluation(tmp_path / "b/seed1/eval", **of_one, split="train")
+    (suite,) = compared(monkeypatch, capsys, a, tmp_path / "b")["comparisons"]
+    assert (len(suite["b"]), suite["rows"][0]["b"]) == (2, 0.5)
+    assert suite["passed_over"] == [
+        "B: cronos-eval has been run of 1 of 2 policies: all have their runs' own evaluations here"
+    ]
+    compare(monkeypatch, a, tmp_path / "b")
+    assert "passed over: B: cronos-eval has been run of 1 of 2 policies" in capsys.readouterr().out
+    of_other = {"policy": "b/seed2/train/checkpoints/last/pretrained_model", "tasks": ["1111", "0000"]}
+    write_evaluation(tmp_path / "b/seed2/eval", **of_other, split="train")
+    (suite,) = compared(monkeypatch, capsys, a, tmp_path / "b")["comparisons"]
+    assert (suite["rows"][0]["b"], suite["passed_over"]) == (0.75, [])
+
+
+def test_policies_are_told_apart_by_what_they_are_not_by_their_names(tmp_path, monkeypatch, capsys):
+    a = write_evaluation(tmp_path / "a", "me/a", tasks=["1000"])
+    last = "out/checkpoints/last/pretrained_model"
+    for seed, fingerprint in ((1000, "1f"), (1001, "2e")):
+        write_evaluation(tmp_path / f"b/{seed}", last, tasks=["1111"], seed=seed, policy_fingerprint=fingerprint)
+    with pytest.raises(SystemExit, match=r"was evaluated as two different policies \(1f and 2e\)"):
+        compare(monkeypatch, a, tmp_path / "b")
+    # The same one by two names, with a seed each, is one policy.
+    for seed, name in ((1000, "x"), (1001, "y")):
+        write_evaluation(tmp_path / f"c/{seed}", name, tasks=["1111"], seed=seed, policy_fingerprint="3d")
+        write_evaluation(tmp_path / f"d/{seed}", "d", tasks=["1000"], seed=seed)
+    (suite,) = compared(monkeypatch, capsys, tmp_path / "c", tmp_path / "d")["comparisons"]
+    assert (suite["rows"][0]["pairs"], suite["rows"][0]["trainings"], len(suite["a"])) == (8, None, 1)
+    with pytest.raises(SystemExit, match=r"A and B both have x, evaluated alike"):
+        compare(monkeypatch, tmp_path / "c", tmp_path / "c")
 
 
 def test_what_was_left_out_and_what_is_not_alike_is_said(tmp_path, monkeypatch, capsys):
