@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 
 from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
@@ -17,6 +18,9 @@ MAX_FAILURES = 16
 
 RESET_PHASES = ("together", "staggered")
 SCENE_RESETS = ("periodic", "critic")
+SCENE_RESET_INTERVAL = 1280
+VALUELESS_ORDERS = ("heuristic", "random")
+"""Task orders that ask for no values; those of a user's may."""
 
 
 @dataclass
@@ -55,7 +59,7 @@ class ProtocolConfig:
     """K: control steps of one stream between two task switches, the length of a segment."""
     update_interval: int = 160
     """U: control steps of each stream between two policy updates; a multiple of K."""
-    scene_reset_interval: int | None = 1280
+    scene_reset_interval: int | None = SCENE_RESET_INTERVAL
     """T (H in Algorithm 1): control steps of one stream between two scene resets; a multiple of K.
     80 is episodic training, null never resets the scene."""
     curriculum: list[tuple[int, int]] = field(default_factory=list)
@@ -109,11 +113,10 @@ class ProtocolConfig:
         self._check_scene_reset()
         if self.reset_budget is not None and self.reset_budget < 1:
             raise ValueError(f"protocol.reset_budget must be >= 1 or null, got {self.reset_budget}.")
-        for name in ("takeover_after", "takeover_budget"):
-            if (value := getattr(self, name)) is not None and value < 1:
-                raise ValueError(f"protocol.{name} must be >= 1 or null, got {value}.")
-        if self.takeover_price < 1:
-            raise ValueError(f"protocol.takeover_price must be >= 1, got {self.takeover_price}.")
+        self._check_takeovers()
+        self._check_who_reads_critic()
+        if repeated := sorted({name for name in self.extra_resets if self.extra_resets.count(name) > 1}):
+            raise ValueError(f"protocol.extra_resets must name each strategy once, got {repeated} more than once.")
         if self.reward not in REWARDS:
             raise ValueError(f"protocol.reward must be one of {REWARDS}, got {self.reward!r}.")
         if not 1 <= self.num_configurations <= NUM_CONFIGURATIONS:
@@ -143,6 +146,44 @@ class ProtocolConfig:
                 "protocol.curriculum and protocol.reset_phase say when periodic scene resets come; with "
                 "protocol.scene_reset=critic there are none: leave them out."
             )
+        # The default cannot be told from one that was given.
+        if self.scene_reset_interval not in (None, SCENE_RESET_INTERVAL):
+            raise ValueError(
+                f"protocol.scene_reset_interval={self.scene_reset_interval} is for periodic scene resets; with "
+                "protocol.scene_reset=critic there are none: leave it out, or give null."
+            )
+
+    def _check_takeovers(self) -> None:
+        for name in ("takeover_after", "takeover_budget"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise ValueError(f"protocol.{name} must be >= 1 or null, got {value}.")
+        if self.takeover_price < 1:
+            raise ValueError(f"protocol.takeover_price must be >= 1, got {self.takeover_price}.")
+        if self.takeover_after is None:
+            for name, default in (("budget", None), ("price", 1), ("expert", "scripted")):
+                if (value := getattr(self, f"takeover_{name}")) != default:
+                    raise ValueError(
+                        f"protocol.takeover_{name}={value} is for takeovers, and there are none without "
+                        f"protocol.takeover_after: give that, as 2, or leave this at {default or 'null'}."
+                    )
+        if self.takeover_budget is not None and self.takeover_budget < self.takeover_price:
+            raise ValueError(
+                f"protocol.takeover_budget={self.takeover_budget} pays for no takeover at "
+                f"protocol.takeover_price={self.takeover_price}: give at least as much, or null."
+            )
+
+    def _check_who_reads_critic(self) -> None:
+        # Strategies and orders of a user's may go by values, too.
+        if self.scene_reset == "critic" or self.task_order not in VALUELESS_ORDERS or self.extra_resets:
+            return
+        default = CriticConfig()
+        for name, value in vars(self.critic).items():
+            if value != getattr(default, name):
+                raise ValueError(
+                    f"protocol.critic.{name}={json.dumps(value)} says how values choose, and none do: "
+                    "give protocol.task_order=critic or protocol.scene_reset=critic, or leave it at "
+                    f"{json.dumps(getattr(default, name))}."
+                )
 
     def _check_multiple_of_k(self, name: str, interval: int) -> None:
         if interval < 1 or interval % self.task_switch_interval:

@@ -149,6 +149,41 @@ class CriticOrder:
         return np.where(complete & ~complete.all(axis=1, keepdims=True), 0.0, weights)
 
 
+BUILT_IN = frozenset(TASK_ORDERS)
+
+
+class CheckedOrder:
+    """A user's order whose every draw is looked at: what is no task would stop the run much later, or never.
+
+    Raises:
+        ValueError: in `draw`, of anything but (N,) indices of tasks; it names the order.
+    """
+
+    def __init__(self, order: TaskOrder) -> None:
+        self.order = order
+
+    def bind(self, run: RunContext) -> None:
+        """Tell the order."""
+        bind_task_order(self.order, run)
+
+    def draw(self, loop: LoopState) -> np.ndarray:
+        """What the order draws."""
+        drawn = self.order.draw(loop)
+        wanted = (
+            f"{type(self.order).__name__}.draw must return an array ({loop.num_streams},) of ints in 0.."
+            f"{loop.num_tasks - 1}, the next task of every stream, got"
+        )
+        try:
+            task = np.asarray(drawn)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{wanted} {drawn!r}.") from error
+        if task.shape != (loop.num_streams,) or not np.issubdtype(task.dtype, np.integer):
+            raise ValueError(f"{wanted} {task.dtype} of shape {task.shape}: {drawn!r}.")
+        if wrong := sorted({*task[(task < 0) | (task >= loop.num_tasks)].tolist()}):
+            raise ValueError(f"{wanted} {wrong} among them.")
+        return task
+
+
 class LearnedReset:
     """Every second segment, the stream puts the object of its last task back on the table (paper, Section 5, LSR).
 
@@ -182,7 +217,11 @@ def bind_task_order(order: TaskOrder, run: RunContext) -> None:
 def check_task_order(name: str) -> None:
     """Raise a ValueError that lists the valid names, unless `name` is one of them."""
     if name not in TASK_ORDERS:
-        raise ValueError(f"protocol.task_order must be one of {sorted(TASK_ORDERS)}, got {name!r}.")
+        raise ValueError(
+            f"protocol.task_order must be one of {sorted(TASK_ORDERS)}, got {name!r}. Register your own with "
+            "cronos_lerobot.protocol.task_orders.register_task_order, in a module named by "
+            "--protocol.discover_packages_path."
+        )
 
 
 def make_task_order(name: str, rng: np.random.Generator, task_set: TaskSet | None = None) -> TaskOrder:
@@ -193,6 +232,8 @@ def make_task_order(name: str, rng: np.random.Generator, task_set: TaskSet | Non
     """
     check_task_order(name)
     order = TASK_ORDERS[name](rng)
+    if name not in BUILT_IN:
+        order = CheckedOrder(order)
     if task_set is None or not task_set.reset_tasks:
         return order
     return LearnedReset(order, task_set.reset_task_of())

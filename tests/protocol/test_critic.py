@@ -321,7 +321,7 @@ def test_best_value_leaves_out_what_is_complete():
     loop.switch_task(np.zeros(2, np.int64))
     values = [0.9, 0.8, -0.3, -0.2]
     for knows, expected in ((True, [0.0, 0.0]), (False, [0.8, 0.8])):
-        config = protocol(critic=CriticConfig(knows_complete=knows))
+        config = protocol(task_order="critic", critic=CriticConfig(knows_complete=knows))
         asked = TaskValues(RunContext(env, Opinionated(2, [], values), TASKS, config, 100), "a test")
         assert asked.best(loop).tolist() == pytest.approx(expected)
 
@@ -334,11 +334,34 @@ def test_best_value_leaves_out_what_is_complete():
         ({"scene_reset": "critic"}, "give protocol.reset_budget"),
         ({"scene_reset": "critic", "reset_budget": 5, "reset_phase": "staggered"}, "leave them out"),
         ({"scene_reset": "critic", "reset_budget": 5, "curriculum": [(8, 4)]}, "leave them out"),
+        (
+            {"scene_reset": "critic", "reset_budget": 5, "scene_reset_interval": 8},
+            "=8 is for periodic .* or give null",
+        ),
+        ({"critic": CriticConfig(failures=3)}, "protocol.critic.failures=3 says how values choose, and none do"),
+        (
+            {"critic": CriticConfig(knows_complete=False)},
+            "knows_complete=false .* give protocol.task_order=critic",
+        ),
     ],
 )
 def test_protocols_that_make_no_sense_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         protocol(**options)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"task_order": "critic"},
+        {"scene_reset": "critic", "reset_budget": 5, "scene_reset_interval": None},
+        # A user's may go by values, too.
+        {"task_order": "of_a_user"},
+        {"extra_resets": ["of_a_user"]},
+    ],
+)
+def test_critics_settings_are_taken_where_something_may_read_them(options):
+    assert protocol(critic=CriticConfig(certain_value=3), **options).critic.certain_value == 3
 
 
 @pytest.mark.parametrize(

@@ -220,6 +220,37 @@ def test_own_strategy_and_own_order_by_name():
         make_task_order("last", np.random.default_rng(0))
 
 
+@pytest.mark.parametrize(
+    ("drawn", "got"),
+    [
+        ([0, -1], r"\[-1\] among them"),
+        ([0, 4], r"\[4\] among them"),
+        ([0.0, 1.0], r"float64 of shape \(2,\)"),
+        ([True, False], r"bool of shape \(2,\)"),
+        ([0], r"int64 of shape \(1,\)"),
+        (0, r"int64 of shape \(\)"),
+        (None, r"object of shape \(\)"),
+        ([[0], [0, 1]], r"\[\[0\], \[0, 1\]\]"),
+    ],
+)
+@pytest.mark.parametrize("learned_reset", [False, True])
+def test_what_is_no_task_of_every_stream_is_refused_with_the_orders_name(drawn, got, learned_reset):
+    class Wrong:
+        def __init__(self, rng):
+            pass
+
+        def draw(self, loop):
+            return drawn
+
+    message = rf"Wrong\.draw must return an array \(2,\) of ints in 0\.\.3, .* got {got}"
+    register_task_order("wrong")(Wrong)
+    try:
+        with pytest.raises(ValueError, match=message):
+            run(protocol(task_order="wrong", learned_reset=learned_reset), steps=8)
+    finally:
+        del TASK_ORDERS["wrong"]
+
+
 def test_recent_history_holds_the_last_segments():
     env = DummyEnv(2)
     env.scene_reset = lambda ids, configurations: None

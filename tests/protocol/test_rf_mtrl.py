@@ -61,7 +61,8 @@ def run(protocol, steps, num_streams=2, env=None, loop=None, seed=0):
 
 
 def protocol(**options):
-    defaults = {"task_switch_interval": 2, "update_interval": 4, "scene_reset_interval": 4}
+    interval = None if options.get("scene_reset") == "critic" else 4
+    defaults = {"task_switch_interval": 2, "update_interval": 4, "scene_reset_interval": interval}
     return ProtocolConfig(**(defaults | options))
 
 
@@ -245,6 +246,7 @@ def test_loop_state_survives_json():
         ({"reward": "dense"}, "difference"),
         ({"num_configurations": 0}, "num_configurations must be 1 to 64"),
         ({"num_configurations": 65}, "num_configurations must be 1 to 64"),
+        ({"extra_resets": ["stuck", "lost", "stuck"]}, r"must name each strategy once, got \['stuck'\] more"),
     ],
 )
 def test_bad_protocols_are_named(options, message):

@@ -194,6 +194,24 @@ def test_bad_settings_are_named(name):
         protocol(**{name: 0})
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"takeover_budget": 5}, "protocol.takeover_budget=5 is for takeovers, and there are none without"),
+        ({"takeover_price": 3}, "protocol.takeover_price=3 is for takeovers"),
+        ({"takeover_expert": "guide"}, "protocol.takeover_expert=guide is for takeovers"),
+        (
+            {"takeover_after": 1, "takeover_budget": 2, "takeover_price": 3},
+            "takeover_budget=2 pays for no takeover at protocol.takeover_price=3",
+        ),
+    ],
+)
+def test_settings_that_nothing_reads_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        protocol(**options)
+    protocol(takeover_after=1, takeover_budget=3, takeover_price=3)
+
+
 def test_unknown_experts_and_taken_names_are_refused():
     with pytest.raises(ValueError, match=r"must be one of \['guide', 'scripted', 'single guide'\], got 'nobody'"):
         check_expert("nobody")

@@ -140,7 +140,7 @@ def test_resumed_run_of_two_processes_equals_the_unbroken_one(tmp_path):
 
 def test_values_may_be_switched_on_when_a_run_is_resumed(tmp_path):
     """Periodic resets until then are none of the critic's."""
-    first = {"task_order": "random", "scene_reset_interval": 16}
+    first = {"task_order": "random", "scene_reset_interval": 16, "critic": CriticConfig()}
     train(
         config(tmp_path / "run", steps=64, protocol=critic_protocol(**first), eval_freq=0), env=DummyEnv(STREAMS)
     )
@@ -189,6 +189,7 @@ def test_the_real_scene_stopped_and_resumed(tmp_path, monkeypatch):
 def test_the_real_scene_reset_by_the_critic(tmp_path, monkeypatch):
     cronos_train(
         monkeypatch, *REAL, "--protocol.scene_reset=critic", "--protocol.reset_budget=8",
+        "--protocol.scene_reset_interval=null",
         "--env.task_observation=one_hot", "--protocol.critic.knows_complete=false",
         f"--output_dir={tmp_path / 'run'}",
     )  # fmt: skip
