@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 import io
 import sys
 from argparse import ArgumentError
 from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -15,6 +14,8 @@ from draccus.utils import ParsingError
 from lerobot.configs import parser
 from lerobot.configs.parser import PluginLoadError
 from safetensors import SafetensorError
+
+from cronos_lerobot.training.resume import allow_single_file
 
 USER_ERRORS = (ValueError, OSError, ParsingError, ArgumentError, PluginLoadError, SafetensorError)
 """What a wrong flag, a missing file or a damaged one raises. Any other error is a bug and shows its traceback."""
@@ -75,7 +76,8 @@ def parse_command_line(
     if config_path is not None and not Path(config_path).exists():
         raise FileNotFoundError(f"--config_path={config_path}: no such file or folder")
     sys.argv = [*given, *_missing_types(given, types or {})]
-    _allow_single_files(given)
+    for name in parser.parse_plugin_args(parser.PLUGIN_DISCOVERY_SUFFIX, given).values():
+        allow_single_file(name)
     try:
         with redirect_stderr(said):
             config = parser.wrap()(keep)()  # ty: ignore[missing-argument]  (it reads the command line)
@@ -100,15 +102,6 @@ def parse_command_line(
         sys.argv = given
     sys.stderr.write(said.getvalue())
     return config
-
-
-def _allow_single_files(arguments: list[str]) -> None:
-    """Let `discover_packages_path` name a module as well as a package, in which LeRobot looks for more modules."""
-    for name in parser.parse_plugin_args(parser.PLUGIN_DISCOVERY_SUFFIX, arguments).values():
-        # LeRobot says what cannot be imported.
-        with suppress(ImportError):
-            module = importlib.import_module(name)
-            module.__path__ = getattr(module, "__path__", [])
 
 
 def _missing_types(arguments: list[str], types: Mapping[str, str]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import sys
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,7 +30,7 @@ from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.experts import check_expert
 from cronos_lerobot.protocol.resets import check_extra_resets
 from cronos_lerobot.protocol.task_orders import check_task_order
-from cronos_lerobot.training.resume import check_resumed, check_types
+from cronos_lerobot.training.resume import check_resumed, check_types, import_plugins
 
 
 @dataclass
@@ -291,6 +292,8 @@ class CronosTrainConfig:
         if not file.is_file():
             raise FileNotFoundError(f"No training config at {file}.")
         if parser.parse_arg("resume", cli_args or []) == "true":
+            # LeRobot's parser keeps the plugins of the command line from `cli_args`.
+            import_plugins(_checkpoint_of(file), sys.argv[1:])
             check_types(_checkpoint_of(file), cli_args or [])
         with draccus.config_type("json" if file.suffix == ".json" else "yaml"):
             return draccus.parse(cls, file, args=cli_args or [])

@@ -18,11 +18,10 @@ from cronos_lerobot.evaluation.policy_source import files_fingerprint
 from cronos_lerobot.protocol.loop_state import LoopState
 from cronos_lerobot.provenance import git_commit, package_versions
 from cronos_lerobot.training.config import CronosTrainConfig
-from cronos_lerobot.training.resume import describe_environment
+from cronos_lerobot.training.resume import MANIFEST, describe_environment, read_starts
 from cronos_lerobot.training.rollout import Count
 
 METRICS = "metrics.jsonl"
-MANIFEST = "manifest.json"
 
 
 class MetricsFile:
@@ -199,18 +198,6 @@ def _policy_fingerprint(config: CronosTrainConfig) -> str | None:
     if policy is None or not policy.pretrained_path or not Path(policy.pretrained_path).is_dir():
         return None
     return files_fingerprint(Path(policy.pretrained_path))
-
-
-def read_starts(path: Path) -> list[dict[str, Any]]:
-    """Read the starts of a run from its manifest.
-
-    Raises:
-        ValueError: the file is damaged.
-    """
-    try:
-        return json.loads(path.read_text())["starts"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
 
 
 def write_whole(path: Path, text: str) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,8 @@ FOLLOWED, REFUSED = "followed", "refused"
 
 RUN = "run.json"
 """What a checkpoint says of its run: its config, environment and benchmark, how far it is."""
+MANIFEST = "manifest.json"
+"""What a run's folder says of each time it was started: its command, versions, machine."""
 
 _TABLE = {
     "": {
@@ -120,6 +125,59 @@ def read_run(checkpoint: Path) -> dict[str, Any]:
     if run["environment"] is not None:
         check_environment_id(run["environment"], what, "begin a new run")
     return run
+
+
+def read_starts(path: Path) -> list[dict[str, Any]]:
+    """Read the starts of a run from its manifest.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    try:
+        return json.loads(path.read_text())["starts"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def import_plugins(checkpoint: Path, arguments: Sequence[str]) -> None:
+    """Import the modules that the run of a checkpoint was started with, `--<field>.discover_packages_path`.
+
+    They are no part of its config, which names what they register.
+
+    Args:
+        checkpoint: of the run, whose manifest has its commands.
+        arguments: of the command that resumes it; a flag that is among them takes the place of the run's.
+
+    Raises:
+        PluginLoadError: one of them cannot be imported.
+        ValueError: the manifest is damaged.
+    """
+    manifest = checkpoint.parents[1] / MANIFEST
+    if not manifest.is_file():
+        return
+    own: dict[str, str] = {}
+    for start in read_starts(manifest):
+        own |= parser.parse_plugin_args(parser.PLUGIN_DISCOVERY_SUFFIX, start.get("command", []))
+    given = parser.parse_plugin_args(parser.PLUGIN_DISCOVERY_SUFFIX, arguments)
+    for flag, name in own.items():
+        if flag in given:
+            continue
+        allow_single_file(name)
+        try:
+            parser.load_plugin(name)
+        except parser.PluginLoadError as error:
+            raise parser.PluginLoadError(
+                f"the run in {manifest.parent} was started with --{flag}={name}: {error}. Put it on "
+                f"PYTHONPATH, or give another --{flag}."
+            ) from error
+
+
+def allow_single_file(name: str) -> None:
+    """Let `discover_packages_path` name a module as well as a package, in which LeRobot looks for more modules."""
+    # LeRobot says what cannot be imported.
+    with suppress(ImportError):
+        module = importlib.import_module(name)
+        module.__path__ = getattr(module, "__path__", [])
 
 
 def check_types(checkpoint: Path, cli_args: list[str]) -> None:

@@ -140,16 +140,17 @@ def test_agent_of_the_docs(tmp_path):
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
 
     def run(*flags):
-        command = ["cronos-train", "--discover_packages_path=my_agent", *flags]
-        run_forked(command, check=True, env=os.environ | {"PYTHONPATH": path})
+        run_forked(["cronos-train", *flags], check=True, env=os.environ | {"PYTHONPATH": path})
 
     small = [flag for flag in SMALL if not flag.startswith("--algorithm.")]
     # Every action is cloned: no task is complete so early.
-    flags = (*small, *OBSERVATIONS["state"], "--algorithm.type=rewarded", "--algorithm.threshold=-9")
+    agent = ("--discover_packages_path=my_agent", "--algorithm.type=rewarded", "--algorithm.threshold=-9")
+    flags = (*small, *OBSERVATIONS["state"], *agent)
     run(*flags, f"--output_dir={tmp_path / 'whole'}")
     run(*flags, f"--output_dir={tmp_path / 'broken'}", "--steps=16")
     before = weights(tmp_path / "broken")
     last = tmp_path / "broken/checkpoints/last/pretrained_model"
+    # The run's manifest has the plugin.
     run("--resume=true", f"--config_path={last}/train_config.json", "--steps=32")
     after = weights(tmp_path / "whole")
     assert any(not torch.equal(before[name], after[name]) for name in before)

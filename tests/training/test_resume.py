@@ -3,11 +3,13 @@
 import dataclasses
 import json
 import re
+import sys
 from pathlib import Path
 
 import pytest
 import torch
 from dummies import DummyPolicyConfig
+from lerobot.configs.parser import PluginLoadError
 from lerobot_env_cronos import CronosEnvConfig
 from test_trainer import STEPS_PER_UPDATE, assert_same_run, config, make_trainer, metrics, train
 
@@ -107,6 +109,29 @@ def test_a_learning_rate_that_is_given_is_the_optimizers(tmp_path):
         assert groups["policy"]["lr"] == (before["policy"]["lr"] if expected is None else expected)
         assert groups["policy"]["betas"][0] == (0.9 if expected is None else 0.5)
         assert groups["value"]["lr"] == 1e-3
+
+
+def test_the_runs_plugins_are_imported_unless_others_are_given(tmp_path, monkeypatch):
+    for name in ("my_first", "my_second", "my_own"):
+        (tmp_path / f"{name}.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    starts = [
+        ["cronos-train", "--discover_packages_path=my_first", "--protocol.discover_packages_path", "my_second"]
+    ]
+    starts += [["cronos-train", "--resume=true"]]
+    manifest = tmp_path / "run" / resume.MANIFEST
+    checkpoint = tmp_path / "run/checkpoints/000016"
+    # A checkpoint by itself has no manifest.
+    resume.import_plugins(checkpoint, [])
+    manifest.parent.mkdir()
+    manifest.write_text(json.dumps({"starts": [{"command": command} for command in starts]}))
+    resume.import_plugins(checkpoint, ["--protocol.discover_packages_path=my_own"])
+    assert sys.modules.pop("my_first")
+    assert "my_second" not in sys.modules
+    (tmp_path / "my_second.py").unlink()
+    with pytest.raises(PluginLoadError, match=r"--protocol.discover_packages_path=my_second: .* No module"):
+        resume.import_plugins(checkpoint, [])
+    sys.modules.pop("my_first")
 
 
 DAMAGED = {
