@@ -11,14 +11,16 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from draccus.utils import ParsingError
+from httpx import HTTPError, TransportError
 from lerobot.configs import parser
 from lerobot.configs.parser import PluginLoadError
 from safetensors import SafetensorError
 
 from cronos_lerobot.training.resume import allow_single_file
 
-USER_ERRORS = (ValueError, OSError, ParsingError, ArgumentError, PluginLoadError, SafetensorError)
-"""What a wrong flag, a missing file or a damaged one raises. Any other error is a bug and shows its traceback."""
+USER_ERRORS = (ValueError, OSError, ParsingError, ArgumentError, PluginLoadError, SafetensorError, HTTPError)
+"""What a wrong flag, a missing file or a damaged one raises, or the Hub. Any other error is a bug and shows its
+traceback."""
 
 
 @contextmanager
@@ -46,6 +48,11 @@ def reason(error: Exception | str) -> str:
     """What an error says, on one line; draccus hides the reason in the cause."""
     if isinstance(error, ParsingError) and error.__cause__ is not None:
         return reason(error.__cause__)  # ty: ignore[invalid-argument-type]
+    if isinstance(error, TransportError):
+        return (
+            f"the Hub was not reached ({type(error).__name__}: {error}); what is not on this machine, "
+            "by its name or in the folder that a flag gives, is looked for there"
+        )
     text = " ".join(line.strip() for line in str(error).splitlines() if line.strip())
     return text or type(error).__name__
 

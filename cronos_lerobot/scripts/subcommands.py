@@ -8,6 +8,9 @@ from typing import Any
 
 import draccus
 from draccus.utils import ParsingError
+from httpx import HTTPError
+
+from cronos_lerobot.scripts.errors import stop
 
 
 def run_subcommand(
@@ -35,3 +38,5 @@ def run_subcommand(
         sys.exit(f"error: {error.__cause__ or error}")
     except errors as error:
         sys.exit(f"error: {error}")
+    except HTTPError as error:
+        stop(error)

@@ -325,7 +325,9 @@ def load_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
     try:
         config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
     except (json.JSONDecodeError, draccus.ParsingError) as error:
-        raise ValueError(f"{folder / CONFIG_NAME} is damaged, or --policy.* does not fit it: {error}") from error
+        # draccus keeps what a policy's config says of its values in the cause.
+        why = error.__cause__ or error
+        raise ValueError(f"{folder / CONFIG_NAME} is damaged, or --policy.* does not fit it: {why}") from error
     except (OSError, ValueError) as error:
         raise ValueError(
             f"--policy.path={path}: no such folder, and no such policy on the Hub ({type(error).__name__})."

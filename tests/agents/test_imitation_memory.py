@@ -2,12 +2,15 @@
 
 from types import SimpleNamespace
 
+import httpx
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.factory import resolve_delta_timestamps
 
+from cronos_lerobot.agents.imitation import batches
 from cronos_lerobot.agents.imitation.batches import Demonstrations, join_batches, segment_batch
 from cronos_lerobot.agents.imitation.config import DemosConfig, ImitationConfig
 from cronos_lerobot.agents.imitation.memory import OpenSegments, Segment, SegmentMemory
@@ -194,6 +197,32 @@ def test_a_dataset_without_what_the_policy_reads_is_refused(dataset_root):
     config.input_features["observation.environment_state"] = None
     with pytest.raises(ValueError, match=r"me/demos has no observation\.environment_state, .* it has \['action'"):
         Demonstrations(DemosConfig("me/demos", dataset_root), config)
+
+
+def test_a_dataset_of_another_shape_is_refused(dataset_root):
+    """As where the demonstrations were not told their task, and the policy is."""
+    config = policy_config("act")
+    config.input_features["observation.state"] = PolicyFeature(FeatureType.STATE, (9,))
+    # Images are scaled.
+    config.input_features["observation.images.front"] = PolicyFeature(FeatureType.VISUAL, (3, 64, 64))
+    message = r"observation\.state of shape \(4,\), the policy takes \(9,\): .*--env\.task_observation"
+    with pytest.raises(ValueError, match=message):
+        Demonstrations(DemosConfig("me/demos", dataset_root), config)
+    config.input_features["observation.state"] = PolicyFeature(FeatureType.STATE, (4,))
+    Demonstrations(DemosConfig("me/demos", dataset_root), config)
+
+
+def test_a_dataset_that_is_not_there_is_named(dataset_root, monkeypatch):
+    root = dataset_root.with_name("datasset")
+    with pytest.raises(FileNotFoundError, match=rf"demos\.root={root}: no LeRobotDataset in {root}\.$"):
+        Demonstrations(DemosConfig("me/demos", root), policy_config("act"))
+
+    def unreachable(*args, **kwargs):
+        raise httpx.ConnectError("[Errno -2] Name or service not known")
+
+    monkeypatch.setattr(batches, "LeRobotDatasetMetadata", unreachable)
+    with pytest.raises(FileNotFoundError, match=r"demos\.repo_id=me/none: no such .* the Hub \(ConnectError\)"):
+        Demonstrations(DemosConfig("me/none"), policy_config("act"))
 
 
 @pytest.mark.parametrize(

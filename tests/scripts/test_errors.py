@@ -3,9 +3,11 @@
 import sys
 from dataclasses import dataclass, field
 
+import httpx
 import pytest
 
 from cronos_lerobot.scripts.errors import error_line, parse_command_line, reason
+from cronos_lerobot.scripts.subcommands import run_subcommand
 
 
 @dataclass
@@ -66,6 +68,18 @@ def test_bugs_keep_their_traceback():
         1 / 0  # noqa: B018
     with pytest.raises(SystemExit, match=r"^error: division by zero$"), error_line(ZeroDivisionError):
         1 / 0  # noqa: B018
+
+
+def test_a_hub_that_is_not_reached_is_one_line(monkeypatch):
+    def look(config):
+        raise httpx.ConnectError("Name or service not known")
+
+    said = r"^error: the Hub was not reached \(ConnectError: Name or service not known\); what is not on this"
+    with pytest.raises(SystemExit, match=said), error_line():
+        look(Config())
+    monkeypatch.setattr(sys, "argv", ["cronos-streams", "check"])
+    with pytest.raises(SystemExit, match=said):
+        run_subcommand("", {"check": (Config, look)})
 
 
 def test_an_error_that_says_nothing_is_named():

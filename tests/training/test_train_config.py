@@ -3,11 +3,12 @@ import sys
 import pytest
 from dummies import DummyPolicyConfig
 from flags import parse_flags
+from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot_env_cronos import CronosEnvConfig
 
 from cronos_lerobot.agents.ppo.config import PaperPPOConfig, PPOConfig
 from cronos_lerobot.scripts import train as script
-from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.config import CronosTrainConfig, load_policy_config
 
 
 def parse(*arguments):
@@ -84,6 +85,13 @@ def test_bad_values_are_named_on_the_command_line(arguments, message, monkeypatc
         script.main()
     assert "\n" not in str(ended.value)
     assert sys.argv == ["cronos-train", *arguments]
+
+
+def test_what_a_policys_config_says_of_its_values_is_the_line(tmp_path):
+    ACTConfig(chunk_size=8, n_action_steps=2, device="cpu").save_pretrained(tmp_path)
+    message = r"config\.json is damaged, or --policy\.\* does not fit it: .*16 for `n_action_steps` and 8"
+    with pytest.raises(ValueError, match=message):
+        load_policy_config(str(tmp_path), ["--n_action_steps=16"])
 
 
 def test_what_is_missing_is_asked_for(tmp_path):

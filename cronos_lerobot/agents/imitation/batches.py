@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import httpx
 import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.datasets.utils import INFO_PATH
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, REWARD
 from torch.utils.data import default_collate
 
@@ -60,22 +62,15 @@ class Demonstrations:
         policy: config of the policy that learns from it.
 
     Raises:
-        ValueError: the dataset lacks a column that the policy reads, or cannot be read.
+        ValueError: the dataset lacks a column that the policy reads, has it in another shape, or cannot be read.
+        FileNotFoundError: there is no such dataset.
     """
 
     def __init__(self, config: DemosConfig, policy: PreTrainedConfig) -> None:
-        assert config.repo_id is not None
-        meta = LeRobotDatasetMetadata(config.repo_id, root=config.root)
-        wanted = {*(policy.input_features or {}), ACTION}
-        if policy.reward_delta_indices is not None:
-            wanted.add(REWARD)
-        if missing := sorted(wanted - meta.features.keys()):
-            raise ValueError(
-                f"--algorithm.demos.repo_id={config.repo_id} has no {', '.join(missing)}, which the policy reads; "
-                f"it has {sorted(meta.features)}."
-            )
+        meta = _open_metadata(config)
+        wanted = _check_columns(config, policy, meta.features)
         deltas = resolve_delta_timestamps(policy, meta)
-        self._dataset = LeRobotDataset(config.repo_id, root=config.root, delta_timestamps=deltas)
+        self._dataset = LeRobotDataset(meta.repo_id, root=config.root, delta_timestamps=deltas)
         drop_last = getattr(policy, "drop_n_last_frames", 0) or 0
         assert meta.episodes is not None
         ends = zip(meta.episodes["dataset_from_index"], meta.episodes["dataset_to_index"], strict=True)
@@ -96,6 +91,48 @@ class Demonstrations:
         frames = drawn - self._begins[numbers]
         draws = [(self._episodes[n], int(frame)) for n, frame in zip(numbers, frames, strict=True)]
         return segment_batch(draws, self._policy)
+
+
+def _open_metadata(config: DemosConfig) -> LeRobotDatasetMetadata:
+    assert config.repo_id is not None
+    # LeRobot looks for it on the Hub, too, and fails there with a long traceback.
+    if config.root is not None and not (config.root / INFO_PATH).is_file():
+        folder = config.root.absolute()
+        raise FileNotFoundError(f"--algorithm.demos.root={config.root}: no LeRobotDataset in {folder}.")
+    try:
+        return LeRobotDatasetMetadata(config.repo_id, root=config.root)
+    except (OSError, httpx.HTTPError) as error:
+        raise FileNotFoundError(
+            f"--algorithm.demos.repo_id={config.repo_id}: no such dataset on this machine, and none came from the "
+            f"Hub ({type(error).__name__}); --algorithm.demos.root names a folder."
+        ) from error
+
+
+def _check_columns(config: DemosConfig, policy: PreTrainedConfig, features: Mapping[str, Any]) -> set[str]:
+    """The columns that the policy learns from; a ValueError if one is not there, or does not fit.
+
+    Images may have another size: policies scale them.
+    """
+    taken = policy.input_features or {}
+    wanted = {*taken, ACTION}
+    if policy.reward_delta_indices is not None:
+        wanted.add(REWARD)
+    if missing := sorted(wanted - features.keys()):
+        raise ValueError(
+            f"--algorithm.demos.repo_id={config.repo_id} has no {', '.join(missing)}, which the policy reads; "
+            f"it has {sorted(features)}."
+        )
+    for name, feature in sorted(taken.items()):
+        if name.startswith(OBS_IMAGES) or feature is None:
+            continue
+        wants, has = tuple(feature.shape), tuple(features[name]["shape"])
+        if wants != has:
+            raise ValueError(
+                f"--algorithm.demos.repo_id={config.repo_id} has {name} of shape {has}, the policy takes {wants}: "
+                "record the demonstrations with the environment of the run, as with its --env.scene and "
+                "--env.task_observation."
+            )
+    return wanted
 
 
 def _read_episodes(dataset: LeRobotDataset, names: list[str], bounds: list[tuple[int, int]]) -> list[Segment]:
