@@ -147,6 +147,10 @@ class CronosEvalConfig:
             raise ValueError("--stop_at_error needs another policy's evaluation: --compare_with=<folder>")
         if not 0 < self.stop_at_error < 1:
             raise ValueError(f"stop_at_error must be between 0 and 1, got {self.stop_at_error}")
+        given = {flag.split("=")[0] for flag in parser.get_cli_overrides("eval") or []}
+        # The default cannot be told from one that a config made in Python gives.
+        if self.eval.videos and (self.eval.videos != SuitesConfig.videos or "--videos" in given):
+            raise ValueError(f"--stop_at_error films nothing: leave --eval.videos={self.eval.videos} out")
         self.eval.videos = 0
 
     def _check_repetitions(self) -> None:

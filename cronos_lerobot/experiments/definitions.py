@@ -39,7 +39,7 @@ class Row:
     """Another curriculum: up to how many steps of a run with the paper's steps, and T until then; scaled as the
     steps."""
     tag: str = ""
-    """What else tells the row from the others, one word; needed with `stages` and `flags`."""
+    """What else tells the row from the others, one word; needed with `stages`, `flags` and `budgets`."""
     flags: tuple[str, ...] = ()
     """More flags of `cronos-train`."""
     budgets: tuple[tuple[str, int], ...] = ()
@@ -261,15 +261,29 @@ EXPERIMENTS: dict[str, Experiment] = {experiment.name: experiment for experiment
 """Experiments by name. Runs with the same settings are shared between them."""
 
 
+COMMANDS = ("all", "list", "status")
+"""Words of `cronos-reproduce` that stand in the place of an experiment."""
+
+
 def register_experiment(experiment: Experiment) -> None:
     """Add an experiment of one's own; `cronos-reproduce --import=MODULE` imports the module that calls this.
 
     Raises:
-        ValueError: the name is taken, or two rows of it have the same name.
+        ValueError: the name is taken, two rows of it have the same name, or a row has no tag where its name would
+            be that of another, and with it the folder of its runs.
     """
     names = [row.name for row in experiment.rows]
-    if experiment.name in (*EXPERIMENTS, "all", "list"):
+    if experiment.name in COMMANDS:
+        raise ValueError(f"{experiment.name!r} is a word of cronos-reproduce's own: {', '.join(COMMANDS)}")
+    if experiment.name in EXPERIMENTS:
         raise ValueError(f"there is an experiment {experiment.name!r} already")
+    for row in experiment.rows:
+        untold = [name for name in ("flags", "stages", "budgets") if getattr(row, name)]
+        if untold and not row.tag:
+            raise ValueError(
+                f"the row {row.name} of {experiment.name} has {', '.join(untold)} and no tag: its runs would lie "
+                "in the folder of the row without them. Give it a tag, one word that names them."
+            )
     if not names or len(set(names)) < len(names):
         raise ValueError(f"the rows of an experiment need different names (`tag` makes them so), got {names}")
     EXPERIMENTS[experiment.name] = experiment

@@ -216,7 +216,8 @@ def _unfinished(result: ExperimentResult) -> list[str]:
                     f"- {seed.spec.name}: {seed.run.last['interaction_steps']:,} of {seed.spec.steps:,} steps"
                     f" ({seed.status or 'no note of its start'})"
                 )
-        missing = row.wanted - len(row.seeds)
+        lines += [f"- {name}: no record so far ({state})" for name, state in row.unrecorded.items()]
+        missing = row.wanted - len(row.seeds) - len(row.unrecorded)
         if missing:
             lines.append(f"- {_group(result, row)}: {missing} of {row.wanted} seeds not begun")
     if lines:

@@ -16,7 +16,7 @@ from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.experiments.definitions import INTERVENTIONS, CheckpointEvaluation, Experiment, Row
 from cronos_lerobot.experiments.jobs import Job, changes, other_commits, read_record, status
 from cronos_lerobot.experiments.plan import base_evaluation_jobs, checkpoint_evaluations, train_job
-from cronos_lerobot.experiments.runner import DONE
+from cronos_lerobot.experiments.runner import DONE, FAILED
 from cronos_lerobot.experiments.specs import Options, RunSpec, base_folder, run_specs
 from cronos_lerobot.protocol.metrics import Gap, Summary, performance_gap, success_at, summarise
 from cronos_lerobot.report.runs import Group, TrainingRun, read_training_run
@@ -114,6 +114,8 @@ class RowResult:
     seeds: list[SeedResult]
     wanted: int
     """How many seeds the experiment has."""
+    unrecorded: dict[str, str] = field(default_factory=dict)
+    """What has become of runs that were started and have no record yet, by their names; see `jobs.status`."""
 
     @property
     def finished(self) -> list[SeedResult]:
@@ -237,15 +239,25 @@ def collect(experiment: Experiment, rows: Iterable[Row], options: Options) -> Ex
     """Read every run of an experiment that has written a record."""
     result = ExperimentResult(experiment, options, [], [])
     for row in rows:
-        found = (_read_seed(spec, result) for spec in run_specs(experiment, options, [row]))
-        result.rows.append(RowResult(row, [seed for seed in found if seed], len(options.seeds)))
+        row_result = RowResult(row, [], len(options.seeds))
+        for spec in run_specs(experiment, options, [row]):
+            if seed := _read_seed(spec, result):
+                row_result.seeds.append(seed)
+            elif not _has_record(spec) and (state := status(job := train_job(spec, None))) not in (None, DONE):
+                row_result.unrecorded[spec.name] = f"{state}, see {job.log}" if state == FAILED else state
+        result.rows.append(row_result)
     return result
+
+
+def _has_record(spec: RunSpec) -> bool:
+    metrics = spec.train_folder / METRICS
+    return metrics.is_file() and b"\n" in metrics.read_bytes()
 
 
 def _read_seed(spec: RunSpec, result: ExperimentResult) -> SeedResult | None:
     """What there is of a run; None if that is nothing, or if it is not the experiment's."""
-    job, metrics = train_job(spec, None), spec.train_folder / METRICS
-    if not metrics.is_file() or not metrics.read_bytes().count(b"\n"):
+    job = train_job(spec, None)
+    if not _has_record(spec):
         return None
     if found := changes(job):
         result.changed.append(f"{spec.name}: {'; '.join(found)}")

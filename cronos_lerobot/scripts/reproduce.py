@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base, Experiment, Row, find_rows
+from cronos_lerobot.experiments.definitions import COMMANDS, EXPERIMENTS, Base, Experiment, Row, find_rows
 from cronos_lerobot.experiments.jobs import RUNNING, Job, changes, is_done, other_commits, status
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
 from cronos_lerobot.experiments.slurm import SlurmError, SlurmOptions
@@ -82,7 +82,7 @@ def make_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    names = [*EXPERIMENTS, "all", "list", "status"]
+    names = [*EXPERIMENTS, *COMMANDS]
     parser.add_argument("experiment", choices=names, metavar="EXPERIMENT", help=", ".join(names))
     parser.add_argument(
         "--scale",
@@ -147,11 +147,20 @@ def parse_bool(text: str) -> bool:
 
 
 def import_modules(arguments: list[str]) -> None:
-    """Import the modules of --import, so that the parser knows their experiments."""
+    """Import the modules of --import, so that the parser knows their experiments.
+
+    Raises:
+        ValueError: there is no such module, or it registers what cannot be.
+    """
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--import", action="append", dest="modules", default=[])
     for module in early.parse_known_args(arguments)[0].modules:
-        import_module(module)
+        try:
+            import_module(module)
+        except ImportError as error:
+            raise ValueError(
+                f"--import={module} cannot be imported ({error}): it is a module's name, and PYTHONPATH says where"
+            ) from error
 
 
 def parse_seeds(text: str | None, default: int) -> tuple[int, ...]:
@@ -180,16 +189,11 @@ def make_options(args: argparse.Namespace, extra: list[str], bases: Iterable[Bas
     taken = [flag for flag in extra if flag.split("=")[0] in RESERVED]
     if taken:
         raise ValueError(f"{taken[0]} is set by the experiment; it cannot be given after --")
-    if args.threads < 1:
-        raise ValueError(f"--threads must be at least 1, got {args.threads}")
+    if not args.temperature >= 0:
+        raise ValueError(f"--temperature must be at least 0, got {args.temperature}")
     scale = SCALES[args.scale]
     obs_type = {short: name for name, short in OBS_NAMES.items()}.get(args.obs_type, args.obs_type)
-    changes = {
-        name: value for name in ("demos", "clone_steps", "checkpoint") if (value := getattr(args, f"base_{name}"))
-    }
-    if "clone_steps" in changes:
-        changes.setdefault("checkpoint", changes["clone_steps"])
-    bases = list(bases)
+    changes, bases = base_changes(args), list(bases)
     if args.policy_path and len(kinds := sorted({base.kind for base in bases})) > 1:
         raise ValueError(
             f"--policy.path is one base policy, and these rows begin with {len(kinds)} kinds ({', '.join(kinds)}):"
@@ -217,6 +221,27 @@ def make_options(args: argparse.Namespace, extra: list[str], bases: Iterable[Bas
     )
 
 
+def base_changes(args: argparse.Namespace) -> dict[str, int]:
+    """What `--base.*` changes in the recipe of a base policy; also checks the other whole numbers.
+
+    Raises:
+        ValueError: a number is below 1, or the flags are for a policy that is not made.
+    """
+    flags = {"threads": args.threads, "jobs": args.jobs}
+    changes = {name: getattr(args, f"base_{name}") for name in ("demos", "clone_steps", "checkpoint")}
+    for flag, value in (flags | {f"base.{name}": value for name, value in changes.items()}).items():
+        if value is not None and value < 1:
+            raise ValueError(f"--{flag} must be at least 1, got {value}")
+    changes = {name: value for name, value in changes.items() if value is not None}
+    if args.policy_path and (changes or args.base_clean):
+        raise ValueError(
+            f"--base.{next(iter(changes), 'clean')} is of a base policy that is made, and --policy.path gives one"
+        )
+    if "clone_steps" in changes:
+        changes.setdefault("checkpoint", changes["clone_steps"])
+    return changes
+
+
 PACED = "--protocol.scene_reset=critic"
 """With it a budget is paced over the whole run and does not end it."""
 
@@ -234,6 +259,15 @@ def check_budget(chosen: list[tuple[Experiment, tuple[Row, ...]]], options: Opti
                 f"--protocol.reset_budget ends runs early, and {experiment.name} evaluates their checkpoints at"
                 " fixed steps; experiments without such evaluations take it, table1 for example"
             )
+
+
+def check_runs(jobs: list[Job], options: Options) -> None:
+    """End with a line, status 1, where `cronos-train` would refuse a run's flags."""
+    from cronos_lerobot.experiments.command_check import BASE_POLICY, check_commands
+    from cronos_lerobot.scripts.errors import error_line
+
+    with error_line():
+        check_commands(jobs, None if options.policy_path else BASE_POLICY)
 
 
 def print_list() -> None:
@@ -307,7 +341,10 @@ def write_reports(chosen: list[tuple[Experiment, tuple[Row, ...]]], options: Opt
 def main() -> None:
     """Entry point of `cronos-reproduce`."""
     split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
-    import_modules(sys.argv[1:split])
+    try:
+        import_modules(sys.argv[1:split])
+    except ValueError as error:
+        sys.exit(f"error: {error}")
     parser = make_parser()
     args = parser.parse_args(sys.argv[1:split])
     if args.experiment == "list":
@@ -331,6 +368,8 @@ def main() -> None:
     from cronos_lerobot.experiments.plan import make_jobs
 
     jobs = make_jobs(chosen, options)
+    if not args.report_only:
+        check_runs(jobs, options)
     if args.dry_run:
         print_plan(jobs)
         return

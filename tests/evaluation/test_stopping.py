@@ -89,6 +89,14 @@ def test_without_an_error_everything_is_evaluated_and_compared(tmp_path, monkeyp
     ("flags", "sentence"),
     [
         (["--stop_at_error=0.05"], "--stop_at_error needs another policy's evaluation: --compare_with"),
+        (
+            ["--stop_at_error=0.05", "--compare_with={}", "--eval.videos=3"],
+            "--stop_at_error films nothing: leave --eval.videos=3 out",
+        ),
+        (
+            ["--stop_at_error=0.05", "--compare_with={}", "--eval.videos=1"],
+            "--stop_at_error films nothing: leave --eval.videos=1 out",
+        ),
         (["--stop_at_error=5", "--compare_with={}"], "stop_at_error must be between 0 and 1, got 5"),
         (["--compare_with={}/nothing"], "no results.json of cronos-eval at .*nothing"),
         (["--compare_with={}", "--seed=7"], r"has other seeds: \[1000\] and \[7\]"),

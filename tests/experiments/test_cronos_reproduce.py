@@ -1,6 +1,7 @@
 """`cronos-reproduce` as one types it: two rows of Table 1 at their smallest, and its command line."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from cronos_lerobot.experiments import definitions, runner
 from cronos_lerobot.experiments.definitions import Base
 from cronos_lerobot.experiments.plan import base_jobs
 from cronos_lerobot.experiments.specs import base_policy
+from cronos_lerobot.protocol import resets
 from cronos_lerobot.scripts import reproduce as script
 
 ROWS = ("t80", "t1280_eer_cl_hsr")
@@ -98,6 +100,13 @@ def test_list_names_every_row(monkeypatch, capsys):
         (["table1", "--rows", "t81"], "no row 't81'; it has t80, t1280"),
         (["table1", "--seeds=x"], "--seeds must be a number or a list such as 1,4, got 'x'"),
         (["table1", "--threads=0"], "--threads must be at least 1, got 0"),
+        (["table1", "--jobs=0"], "--jobs must be at least 1, got 0"),
+        (["table1", "--jobs=-2"], "--jobs must be at least 1, got -2"),
+        (["table1", "--base.demos=0"], "--base.demos must be at least 1, got 0"),
+        (["table1", "--base.demos=9", "--policy.path=me/policy"], "--base.demos is of a base policy that is made"),
+        (["table1", "--base.clean", "--policy.path=me/policy"], "--base.clean is of a base policy that is made"),
+        (["table1", "--temperature=-1"], "--temperature must be at least 0, got -1.0"),
+        (["table1", "--import=no_module"], "--import=no_module cannot be imported (No module named 'no_module')"),
         (["table1", "--base.checkpoint=400"], "base.checkpoint must be one of [80, 160, 240, 320], got 400"),
         (["table1", "--", "--steps=3"], "--steps=3 is set by the experiment"),
         (["table1", "--", "--save_freq=3"], "--save_freq=3 is set by the experiment"),
@@ -155,15 +164,54 @@ def test_starting_to_explain_takes_no_pytorch():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+WOULD_NOT_BEGIN = {
+    "--foo=3": "`foo` are not valid for CronosTrainConfig",
+    "--protocol.reset_budgets=3": "`protocol`: The fields `reset_budgets` are not valid for ProtocolConfig",
+    "--policy.freeze_encodr=true": "--policy.freeze_encodr is no flag of --policy.type=pocketvla",
+    "--protocol.takeover_price=3": "protocol.takeover_price=3 is for takeovers",
+    "--protocol.extra_resets=[stock]": "protocol.extra_resets has ['stock']",
+    "--algorithm.type=nobody": "got 'nobody'",
+    "--algorithm.target_kl": "--algorithm.target_kl needs a value",
+    "target_kl": "flags begin with --, got 'target_kl'",
+}
+
+
+@pytest.mark.parametrize("flag", WOULD_NOT_BEGIN)
+def test_flags_that_no_run_takes_are_told_before_the_first(flag, tmp_path, monkeypatch, capsys):
+    flags = ["table1", f"--root={tmp_path}", "--rows", "t80", "--seeds=1"]
+    with pytest.raises(SystemExit) as stopped:
+        call(monkeypatch, *flags, "--dry_run", "--", flag)
+    said = f"error: kitchen_2x2_state_small/t80_307k/seed1 would not begin: .*{re.escape(WOULD_NOT_BEGIN[flag])}"
+    assert re.match(said, str(stopped.value))
+    assert "\n" not in str(stopped.value)
+    assert not capsys.readouterr().out
+
+
+def test_flags_of_a_policy_that_is_not_loaded_yet_are_its_own(monkeypatch, capsys):
+    flags = ["table1", "--policy.path=me/policy", "--rows", "t80", "--seeds=1", "--dry_run"]
+    # Neither the policy nor the benchmark is looked for.
+    call(monkeypatch, *flags, "--", "--policy.my_width=3", "--env.benchmark=me/kitchen")
+    assert "--policy.my_width=3" in capsys.readouterr().out
+
+
 def test_own_experiment(tmp_path, monkeypatch, capsys):
     module = """
     from cronos_lerobot.experiments import Experiment, Row, register_experiment
     from cronos_lerobot.experiments.definitions import EXPERIMENTS
-    flags = ("--protocol.extra_resets=[stuck]", "--protocol.update_interval=320")
+    flags = (
+        "--protocol.discover_packages_path=my_strategy", "--protocol.extra_resets=[stuck]",
+        "--protocol.update_interval=320",
+    )
     rows = (Row(1280, end_effector_reset=True), Row(1280, end_effector_reset=True, tag="stuck", flags=flags))
     register_experiment(Experiment("stuck", "Resetting stuck scenes", rows))
     """
     (tmp_path / "my_experiments.py").write_text(textwrap.dedent(module))
+    strategy = """
+    from cronos_lerobot.protocol.resets import EndEffectorReset, register_reset
+    register_reset("stuck")(lambda rng, protocol: EndEffectorReset())
+    """
+    (tmp_path / "my_strategy.py").write_text(textwrap.dedent(strategy))
+    monkeypatch.setattr(resets, "EXTRA_RESETS", {})
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(definitions, "EXPERIMENTS", dict(definitions.EXPERIMENTS))
     monkeypatch.setattr(script, "EXPERIMENTS", definitions.EXPERIMENTS)
@@ -183,3 +231,14 @@ def test_own_experiment(tmp_path, monkeypatch, capsys):
         definitions.register_experiment(definitions.Experiment("twice", "", (definitions.Row(80),) * 2))
     with pytest.raises(ValueError, match="'table1' already"):
         definitions.register_experiment(definitions.Experiment("table1", "", (definitions.Row(80),)))
+    for name in ("all", "list", "status"):
+        with pytest.raises(ValueError, match=f"'{name}' is a word of cronos-reproduce's own: all, list, status"):
+            definitions.register_experiment(definitions.Experiment(name, "", (definitions.Row(80),)))
+    for untagged in (
+        {"flags": ("--protocol.reward=level",)},
+        {"stages": ((10_000, 80),)},
+        {"budgets": (("--protocol.reset_budget", 100),)},
+    ):
+        row = definitions.Row(1280, **untagged)
+        with pytest.raises(ValueError, match=f"row t1280 of untold has {next(iter(untagged))} and no tag"):
+            definitions.register_experiment(definitions.Experiment("untold", "", (row,)))

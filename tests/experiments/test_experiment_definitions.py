@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from cronos_lerobot.experiments.command_check import check_commands
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, find_rows
 from cronos_lerobot.experiments.plan import make_jobs, train_flags
 from cronos_lerobot.experiments.results import paper_results
@@ -141,6 +142,14 @@ def test_protocols_are_valid_and_mean_what_the_row_says(name, scale):
         assert protocol.scene_reset_interval_at(steps) == row.interval
         early = protocol.scene_reset_interval_at(steps // 5)
         assert early == (320 if row.curriculum else row.interval)
+
+
+@pytest.mark.parametrize("scale", ["smoke", "paper"])
+def test_every_run_of_every_experiment_takes_its_flags(scale):
+    bases = {row.begins_with(experiment.scene) for experiment in EXPERIMENTS.values() for row in experiment.rows}
+    recipes = {base.recipe: base_recipe(SCALES[scale], base.scene, STATE, kind=base.kind) for base in bases}
+    chosen = [(experiment, experiment.rows) for experiment in EXPERIMENTS.values()]
+    check_commands(make_jobs(chosen, replace(options(scale), recipes=recipes)))
 
 
 def test_curriculum_ends_at_half_of_every_run():

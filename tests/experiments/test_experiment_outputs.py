@@ -1,6 +1,7 @@
 """Tables and figures say what the runs' files say, the paper's numbers beside them."""
 
 import json
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,9 @@ from synthetic_runs import INSTRUCTIONS, write_training_run
 
 from cronos_lerobot.experiments import plots, tables
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base
+from cronos_lerobot.experiments.jobs import write_record
 from cronos_lerobot.experiments.outputs import write_outputs
+from cronos_lerobot.experiments.plan import train_job
 from cronos_lerobot.experiments.scales import SCALES
 from cronos_lerobot.experiments.specs import base_evaluation_folder, run_specs
 
@@ -135,6 +138,10 @@ def test_unfinished_run_is_drawn_but_not_counted(options, tmp_path):
     make_run(options, "table1", "t80", 1, (2, 4, 6))
     make_run(options, "table1", "t80", 2, (2, 4, 8), status="running")
     make_run(options, "table1", "t1280", 1, (2, 4, 8), status="stopped")
+    # Two ended before their first record, one of them to be resumed.
+    for row, state in (("t1280_eer", "failed"), ("t1280_eer_cl_lsr", "stopped")):
+        job = train_job(next(s for s in run_specs(EXPERIMENTS["table1"], options) if s.row.name == row), None)
+        write_record(job, {"command": list(job.command), "status": state, "seconds": 3.0, "starts": 1})
     result = results(options, "table1")
     row = by_row(tables.main_rows(result))
     assert (row["t80"]["success_train_mean"], row["t80"]["seeds"], row["t80"]["seeds_wanted"]) == (0.75, 1, 2)
@@ -147,6 +154,9 @@ def test_unfinished_run_is_drawn_but_not_counted(options, tmp_path):
     text = write_outputs(EXPERIMENTS["table1"], EXPERIMENTS["table1"].rows, options, tmp_path / "out")
     assert "t80_10k/seed2: 10,240 of 10,240 steps" in text
     assert "t1280_eer_cl: 2 of 2 seeds not begun" in text
+    assert re.search(r"t1280_eer_10k/seed1: no record so far \(failed, see .*/seed1/train\.log\)", text)
+    assert "t1280_eer: 1 of 2 seeds not begun" in text
+    assert "t1280_eer_cl_lsr_10k/seed1: no record so far (stopped)\n" in text
 
 
 def test_run_without_its_last_evaluation_has_no_success_at_the_end(options):

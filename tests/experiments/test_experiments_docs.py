@@ -1,9 +1,13 @@
 """docs/experiments.md says what the code does."""
 
+import ast
 import re
+from dataclasses import MISSING, fields
 from pathlib import Path
 
-from cronos_lerobot.experiments.definitions import EXPERIMENTS
+import pytest
+
+from cronos_lerobot.experiments.definitions import EXPERIMENTS, SHORT, Experiment, Row
 from cronos_lerobot.experiments.few_resets import PLUGS, TOGETHER
 from cronos_lerobot.experiments.scales import (
     BASE_RECIPES,
@@ -22,6 +26,19 @@ def table_rows(heading):
     """Cells of the rows of the table whose first column is called `heading`."""
     lines = DOCS[DOCS.index(f"| {heading} |") :].split("\n\n")[0].splitlines()[2:]
     return [[cell.strip(" `") for cell in line.strip("|").split("|")] for line in lines]
+
+
+@pytest.mark.parametrize("kind", [Row, Experiment])
+def test_fields_of_an_experiment_of_ones_own(kind):
+    """Those without a default have none here, and simple defaults are what they are."""
+    documented = {}
+    for names, default, _ in table_rows(f"field of `{kind.__name__}`"):
+        documented |= dict.fromkeys(re.findall(r"\w+", names), default)
+    assert documented.keys() == {field.name for field in fields(kind)}
+    words = {"": MISSING, "SHORT": SHORT, "both": Experiment.axes}
+    for field in fields(kind):
+        default = documented[field.name]
+        assert (words[default] if default in words else ast.literal_eval(default)) == field.default
 
 
 def test_numbers_of_runs():

@@ -1,0 +1,94 @@
+"""Reads the flags of an experiment's runs as `cronos-train` will, before the first of them is started."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import fields
+from typing import Any
+
+import draccus
+from draccus import cfgparsing
+from draccus.utils import DecodingError, ParsingError, deflatten
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from cronos_lerobot.agents.registry import check_agent
+from cronos_lerobot.experiments.jobs import Job
+from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.resume import allow_single_file
+
+BASE_POLICY = "pocketvla"
+"""Type of the base policies that experiments make."""
+WHICH_RUN = ("seed", "output_dir", "policy.path")
+"""Flags whose values cannot be wrong: runs that differ in nothing else are read once."""
+
+
+def check_commands(jobs: Iterable[Job], policy_type: str | None = BASE_POLICY) -> None:
+    """Refuse flags that `cronos-train` would refuse when a run begins, hours later perhaps.
+
+    Modules that the flags name (`discover_packages_path`) are imported.
+
+    Args:
+        jobs: of which those of `cronos-train` are looked at.
+        policy_type: of the policy that the runs begin with, for the names of `--policy.*`; None if it is not known
+            before it is loaded, and they are not looked at.
+
+    Raises:
+        ValueError: a run has a flag that does not exist, or a value that is none; it names the run.
+        PluginLoadError: a module cannot be imported.
+    """
+    register_third_party_plugins()
+    seen = set()
+    for job in jobs:
+        if job.command[0] != "cronos-train":
+            continue
+        try:
+            given = dict(_pairs(job.command[1:]))
+            key = tuple(sorted((name, value) for name, value in given.items() if name not in WHICH_RUN))
+            if key not in seen:
+                seen.add(key)
+                _check(given, policy_type)
+        except (ValueError, OSError, ParsingError) as error:
+            raise ValueError(f"{job.name} would not begin: {_reason(error)}") from error
+
+
+def _pairs(arguments: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Name and value of `--name=value` and `--name value`."""
+    rest = list(arguments)
+    while rest:
+        flag, is_joined, value = rest.pop(0).partition("=")
+        if not flag.startswith("--"):
+            raise ValueError(f"flags begin with --, got {flag!r}")
+        if not is_joined:
+            if not rest or rest[0].startswith("--"):
+                raise ValueError(f"{flag} needs a value")
+            value = rest.pop(0)
+        yield flag.removeprefix("--"), value
+
+
+def _check(given: dict[str, str], policy_type: str | None) -> None:
+    for name in list(given):
+        if parser.PLUGIN_DISCOVERY_SUFFIX in name:
+            module = given.pop(name)
+            allow_single_file(module)
+            parser.load_plugin(module)
+    # A plan is made without the Hub: a benchmark of it is looked for when the run begins.
+    given.pop("env.benchmark", None)
+    # So is the policy's own config, for which the flags are.
+    policy = {name.split(".")[1] for name in given if name.startswith("policy.")} - {"path"}
+    if policy_type is not None:
+        valid = {field.name for field in fields(PreTrainedConfig.get_choice_class(policy_type))}
+        if unknown := sorted(policy - valid):
+            raise ValueError(f"--policy.{unknown[0]} is no flag of --policy.type={policy_type}")
+    if "algorithm.type" in given:
+        check_agent(given["algorithm.type"])
+    values: dict[str, Any] = {
+        name: cfgparsing.parse_string(value) for name, value in given.items() if not name.startswith("policy.")
+    }
+    draccus.decode(CronosTrainConfig, deflatten(values, sep="."))
+
+
+def _reason(error: Exception) -> str:
+    """What it says, on one line; draccus hides what a config says of its values in the cause."""
+    hidden = isinstance(error, ParsingError) and not isinstance(error, DecodingError)
+    return " ".join(str(error.__cause__ or error if hidden else error).split())
