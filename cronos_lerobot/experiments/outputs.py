@@ -228,6 +228,8 @@ def _unfinished(result: ExperimentResult) -> list[str]:
             "",
             *lines,
         ]
+    if early := _ended_early(result):
+        lines += ["", "## Ended by their budget of interventions", "", *early]
     if result.changed:
         lines += ["", "## Left out: made by another command or version, or damaged", ""]
         lines += [f"- {text}" for text in result.changed]
@@ -242,6 +244,15 @@ def _unfinished(result: ExperimentResult) -> list[str]:
         lines += ["", f"## Made at another commit than {this_commit() or 'this one'}", ""]
         lines += ["The versions are the same, so they count.", "", *(f"- {text}" for text in result.commits)]
     return lines
+
+
+def _ended_early(result: ExperimentResult) -> list[str]:
+    return [
+        f"- {seed.spec.name}: after {seed.run.last['interaction_steps']:,} of {seed.spec.steps:,} steps"
+        for row in result.rows
+        for seed in row.finished
+        if seed.run.last["interaction_steps"] < seed.spec.steps
+    ]
 
 
 def _names(seeds: Sequence[SeedResult]) -> str:

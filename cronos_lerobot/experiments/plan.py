@@ -178,7 +178,8 @@ def checkpoint_evaluations(spec: RunSpec, evaluation: CheckpointEvaluation) -> l
         for split in evaluation.splits:
             folder = spec.evaluation_folder(evaluation.suite, split, checkpoint)
             videos = int(evaluation.suite == "sequential" and not spec.options.scale.smoke)
-            policy = str(spec.policy(checkpoint))
+            # A budget may end the run before its last step: only the link says where.
+            policy = str(spec.train_folder / LAST_POLICY if spec.row.has_budget else spec.policy(checkpoint))
             command = eval_command(policy, spec.scene, evaluation.suite, split, folder, spec.options, videos)
             command = _with_flags(command, _env_flags(spec.row.flags), _env_flags(spec.options.extra))
             jobs.append(

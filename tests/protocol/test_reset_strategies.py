@@ -220,6 +220,23 @@ def test_own_strategy_and_own_order_by_name():
         make_task_order("last", np.random.default_rng(0))
 
 
+def test_a_stream_that_an_own_strategy_has_reset_is_not_reset_and_counted_again(monkeypatch):
+    class First(ResetStrategy):
+        kind = Intervention.SCENE_RESET
+
+        def due(self, env, loop):
+            return np.array([0])
+
+        def apply(self, env, ids):
+            env.scene_reset(ids, np.zeros(len(ids), np.int64))
+
+    monkeypatch.setitem(EXTRA_RESETS, "first", lambda rng, config: First())
+    # K = 2, two streams, T of two segments, six segments: the first stream is reset at every switch by its
+    # strategy, the second at every second one by T.
+    _, _, loop, _ = run(protocol(scene_reset_interval=4, extra_resets=["first"]), steps=24)
+    assert loop.interventions[:, Intervention.SCENE_RESET].tolist() == [6, 3]
+
+
 def test_recent_history_holds_the_last_segments():
     env = DummyEnv(2)
     env.scene_reset = lambda ids, configurations: None
