@@ -25,6 +25,8 @@ from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job, changes, is_d
 from cronos_lerobot.experiments.runner import DONE, FAILED, Runner
 from cronos_lerobot.locks import FolderLock
 
+PENDING = "PENDING"
+"""Slurm's state of an element that waits, also of one that was requeued."""
 INSTALL = "--launcher=slurm needs submitit: pip install '.[slurm]' in a clone"
 
 

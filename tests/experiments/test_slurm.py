@@ -50,8 +50,8 @@ def cluster():
 @pytest.fixture(autouse=True)
 def fast(monkeypatch):
     monkeypatch.setattr("cronos_lerobot.experiments.follow.POLL_S", 0.2)
-    # A job that is being requeued is not in the queue for a moment; 4 s, where a user's run gives it 15.
-    monkeypatch.setattr("cronos_lerobot.experiments.follow.MISSES", 20)
+    # A job that is being requeued is not in the queue for a moment; 4 s, where a user's run gives it 90.
+    monkeypatch.setattr("cronos_lerobot.experiments.follow.LATE_S", 4.0)
     monkeypatch.setattr("cronos_lerobot.experiments.runner.POLL_S", 0.05)
 
 
