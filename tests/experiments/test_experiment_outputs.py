@@ -166,7 +166,7 @@ def test_run_of_another_command_is_named_and_left_out(options):
     result = results(other, "table1")
     (text,) = result.changed
     assert "t80_10k/seed1" in text
-    assert "+--algorithm.target_kl=0.02" in text
+    assert "none there, --algorithm.target_kl=0.02 here" in text
     row = by_row(tables.main_rows(result))["t80"]
     assert (row["seeds"], row["success_train_mean"]) == (0, None)
 
