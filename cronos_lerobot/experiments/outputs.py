@@ -158,7 +158,8 @@ ORDER_NOTES = (
     "Differences as above, of the first row minus the second, on the episodes of the suite that is named: of"
     " chains, how many tasks were done before the first failure. Holds: yes"
     f" or no where p < {ALPHA}, not adjusted; of two rows that are said to do alike, where the whole interval is"
-    f" within {MARGIN} of zero, or beyond it."
+    f" within {MARGIN} of zero, or beyond it; two of these that differ (p < {ALPHA}), by more than that or by"
+    " less, are undecided."
 )
 PPO_NOTES = (
     "A scale is that of steps, streams and seeds. The learning algorithm is `ppo`, with this project's settings,"
