@@ -82,9 +82,15 @@ class SequentialSignTest:
     look, according to how many of the planned episodes have been run (Lan and DeMets 1983, "Discrete sequential
     boundaries for clinical trials"). The boundary of a look is the smallest distance from 0 for which the exact
     distribution of the sum, without the paths that were stopped before, stays within that. It is conditional on
-    how large the differences are, so it holds for any share of episodes that differ, for chain lengths as well as
-    for successes, and nothing has to be assumed or simulated. What a look cannot spend, since sums are whole
-    numbers, later ones may.
+    how large the differences are, so it holds for any share of episodes that differ, and of successes nothing has
+    to be assumed or simulated: equal rates are all that it takes for -1 to be as likely as 1. What a look cannot
+    spend, since sums are whole numbers, later ones may.
+
+    Of chain lengths it takes more than equal means: a difference must be as likely as its negative. Where one
+    policy wins seldom and by much and the other often and by little, early looks see only the latter. Of 2,000
+    pairs of equal means (+4 with probability .04, -1 with .16) it decided 264 at an error of .05, 256 of them for
+    the frequent winner, and one test at the end 103 (256 episodes looked at after every 32). Of 2,000 with
+    symmetric differences of these sizes it decided 98.
 
     The aim is STEP's (Snyder et al. 2025, "Is your imitation learning policy better than mine? Policy comparison
     with near-optimal stopping", arXiv:2503.10966): the largest number of episodes is known, so a test need not be

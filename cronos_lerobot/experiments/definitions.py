@@ -76,6 +76,12 @@ class Row:
         return Base(scene, self.num_configurations, self.base)
 
     @property
+    def has_budget(self) -> bool:
+        """Whether a budget of interventions may end its runs before their last step."""
+        given = (*self.flags, *(name for name, _ in self.budgets))
+        return any(flag.split("=")[0] == "--protocol.reset_budget" for flag in given)
+
+    @property
     def aids(self) -> list[str]:
         """The abbreviations of Table 1's columns that are ticked."""
         ticks = {
@@ -141,6 +147,14 @@ class Experiment:
     base policy."""
     joined: tuple[tuple[str, tuple[str, ...]], ...] = ()
     """Of that figure: what a line joins the ends of, as its label and the names of its rows."""
+
+    def __post_init__(self) -> None:
+        early = [row.name for row in self.rows if row.has_budget]
+        if early and any(evaluation.every_checkpoint for evaluation in self.evaluations):
+            raise ValueError(
+                f"{self.name}: a budget may end runs of {', '.join(early)} at any checkpoint, so evaluations of"
+                " every one cannot be planned: leave every_checkpoint out."
+            )
 
 
 EPISODIC = Row(80)

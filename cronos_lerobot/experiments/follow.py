@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 from cronos_lerobot.experiments.jobs import RUNNING, Job, changes, is_done, read_record
 from cronos_lerobot.experiments.runner import CHANGED, DONE, FAILED, Display
-from cronos_lerobot.experiments.slurm import Cluster, SlurmError, squeue
+from cronos_lerobot.experiments.slurm import PENDING, Cluster, SlurmError, squeue
 
 POLL_S = 5.0
 """How often the queue is asked [s]."""
-MISSES = 3
-"""A job that so many looks in a row found neither queued nor done is over: shared disks are late with notes."""
+LATE_S = 90.0
+"""A job that looks for so long [s] found neither queued nor done is over. NFS may show a note a minute late."""
 
 
 class Follower:
@@ -28,7 +28,7 @@ class Follower:
     def __init__(self, jobs: Sequence[Job], submitted: dict[str, str], cluster: Cluster, display: Display) -> None:
         self.jobs, self.submitted, self.cluster, self.display = list(jobs), submitted, cluster, display
         self.states: dict[str, str] = {}
-        self._missed: dict[str, int] = {}
+        self._missed_since: dict[str, float] = {}
         self._seen: dict[str, tuple[str | None, int]] = {}
 
     def run(self) -> dict[str, str]:
@@ -66,14 +66,16 @@ class Follower:
                 self._finish(job, DONE)
                 continue
             record = read_record(job)
-            if self.submitted.get(job.name) in queue:
-                self._missed.pop(job.name, None)
-                if record.get("status") == RUNNING:
+            queued = queue.get(self.submitted.get(job.name, ""))
+            if queued:
+                self._missed_since.pop(job.name, None)
+                # Where an element was killed and requeued, the note says `running` until the next start.
+                if record.get("status") == RUNNING and queued[0] != PENDING:
                     running.append(job)
                 self._tell(job, record)
                 continue
-            self._missed[job.name] = self._missed.get(job.name, 0) + 1
-            if self._missed[job.name] >= MISSES:
+            now = time.monotonic()
+            if now - self._missed_since.setdefault(job.name, now) >= LATE_S:
                 self._lost(job)
         return running
 

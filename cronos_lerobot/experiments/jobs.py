@@ -55,6 +55,8 @@ class Job:
     """BASE, RUN or EVALUATION: of each a cluster has an array."""
     work: int = 0
     """Interaction steps, for the time that all jobs together may still take."""
+    root: Path | None = None
+    """The folder that `output` and the paths of the command lie below; what is below it may be moved elsewhere."""
 
     @property
     def log(self) -> Path:
@@ -148,15 +150,55 @@ def changes(job: Job) -> list[str]:
 
 
 def changed_flags(job: Job) -> list[str]:
-    """How the command that made `output` differs from the job's, `-old` and `+new`; empty if it does not."""
+    """How the command that made `output` differs from the job's, such as `--lr=1 there, --lr=2 here`.
+
+    Empty if it does not. Paths below the root are compared as seen from there: runs may have been made below
+    another root, or on another machine.
+    """
     record = read_record(job)
     if not record or not job.output.exists():
         return []
-    old, new = record["command"], list(job.command)
+    new = list(job.command)
+    old = _in_root_of(job, record["command"])
     if old == new:
         return []
-    differing = [f"-{flag}" for flag in old if flag not in new] + [f"+{flag}" for flag in new if flag not in old]
+    only_old, only_new = [flag for flag in old if flag not in new], [flag for flag in new if flag not in old]
+    names = dict.fromkeys(_name(flag) for flag in (*only_old, *only_new))
+    differing = [f"{_named(name, only_old)} there, {_named(name, only_new)} here" for name in names]
     return differing or ["another order of the flags"]
+
+
+def _in_root_of(job: Job, noted: list[str]) -> list[str]:
+    """A noted command with the paths below the root that it was given in that of the job.
+
+    That root is told by the flag that names the job's output.
+    """
+    flag = next((flag for flag in job.command if flag.partition("=")[2] == str(job.output)), None)
+    if job.root is None or flag is None:
+        return noted
+    outputs = [Path(old.partition("=")[2]) for old in noted if _name(old) == _name(flag)]
+    below = job.output.relative_to(job.root).parts
+    if len(outputs) != 1 or outputs[0].parts[-len(below) :] != below:
+        return noted
+    root = Path(*outputs[0].parts[: -len(below)])
+    moved = [_moved(old, root, job.root) for old in noted]
+    # Below a root that is the working directory lies every text, paths or not.
+    return [new if new in job.command else old for old, new in zip(noted, moved, strict=True)]
+
+
+def _moved(flag: str, old_root: Path, new_root: Path) -> str:
+    """A flag whose value is a path below one root with the same path below another; any other as it is."""
+    name, _, value = flag.partition("=")
+    path = Path(value)
+    return f"{name}={new_root / path.relative_to(old_root)}" if value and path.is_relative_to(old_root) else flag
+
+
+def _name(flag: str) -> str:
+    return flag.partition("=")[0]
+
+
+def _named(name: str, flags: list[str]) -> str:
+    return " ".join(flag for flag in flags if _name(flag) == name) or "none"
 
 
 def changed_versions(job: Job) -> list[str]:

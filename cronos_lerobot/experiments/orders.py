@@ -11,7 +11,7 @@ from cronos_lerobot.report.paired import ALPHA
 
 MARGIN = 0.05
 """Rows are alike if the whole interval of their difference is within this of zero."""
-YES, NO, NOT_SEPARATED, NOT_RUN = "yes", "no", "not separated", "not run"
+YES, NO, UNDECIDED, NOT_SEPARATED, NOT_RUN = "yes", "no", "undecided", "not separated", "not run"
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,10 @@ class Order:
 
     @property
     def holds(self) -> str:
-        """`yes` and `no` where p < .05; of rows alike, where their interval is within `MARGIN`, or beyond it."""
+        """`yes` and `no` where p < .05; of rows alike, where their interval is within `MARGIN`, or beyond it.
+
+        Rows that are said to do alike and differ, nobody knows whether by more than the margin, are `undecided`.
+        """
         if self.found is None:
             return NOT_RUN
         value, p, ends = self.found.difference.value, self.found.difference.p, self.found.difference.ci95
@@ -45,7 +48,9 @@ class Order:
             low, high = ends or (-math.inf, math.inf)
             if max(-low, high) <= MARGIN:
                 return YES
-            return NO if max(low, -high) > MARGIN else NOT_SEPARATED
+            if max(low, -high) > MARGIN:
+                return NO
+            return UNDECIDED if separated else NOT_SEPARATED
         if not separated:
             return NOT_SEPARATED
         return YES if (value > 0) == (self.says == "higher") else NO

@@ -158,7 +158,8 @@ ORDER_NOTES = (
     "Differences as above, of the first row minus the second, on the episodes of the suite that is named: of"
     " chains, how many tasks were done before the first failure. Holds: yes"
     f" or no where p < {ALPHA}, not adjusted; of two rows that are said to do alike, where the whole interval is"
-    f" within {MARGIN} of zero, or beyond it."
+    f" within {MARGIN} of zero, or beyond it; two of these that differ (p < {ALPHA}), by more than that or by"
+    " less, are undecided."
 )
 PPO_NOTES = (
     "A scale is that of steps, streams and seeds. The learning algorithm is `ppo`, with this project's settings,"
@@ -229,6 +230,8 @@ def _unfinished(result: ExperimentResult) -> list[str]:
             "",
             *lines,
         ]
+    if early := _ended_early(result):
+        lines += ["", "## Ended by their budget of interventions", "", *early]
     if result.changed:
         lines += ["", "## Left out: made by another command or version, or damaged", ""]
         lines += [f"- {text}" for text in result.changed]
@@ -243,6 +246,15 @@ def _unfinished(result: ExperimentResult) -> list[str]:
         lines += ["", f"## Made at another commit than {this_commit() or 'this one'}", ""]
         lines += ["The versions are the same, so they count.", "", *(f"- {text}" for text in result.commits)]
     return lines
+
+
+def _ended_early(result: ExperimentResult) -> list[str]:
+    return [
+        f"- {seed.spec.name}: after {seed.run.last['interaction_steps']:,} of {seed.spec.steps:,} steps"
+        for row in result.rows
+        for seed in row.finished
+        if seed.run.last["interaction_steps"] < seed.spec.steps
+    ]
 
 
 def _names(seeds: Sequence[SeedResult]) -> str:

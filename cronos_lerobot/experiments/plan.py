@@ -72,9 +72,9 @@ def base_jobs(base: Base, options: Options) -> list[Job]:
     else:
         clone += ["--num_workers=0"]
     name = f"base/{folder.name}"
-    demos = Job(f"{name}/demos", tuple(record), folder / "demos", environment=gymnasium_id(scene), stage=BASE)
+    demos = Job(f"{name}/demos", tuple(record), folder / "demos", stage=BASE)
     clone_job = Job(f"{name}/clone", tuple(clone), folder / "clone", needs=(demos.name,), stage=BASE)
-    return [demos, replace(clone_job, environment=demos.environment)]
+    return [replace(job, environment=gymnasium_id(scene), root=options.root) for job in (demos, clone_job)]
 
 
 def train_flags(spec: RunSpec) -> list[str]:
@@ -140,6 +140,7 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
         progress=lambda: train_progress(spec.train_folder, spec.steps),
         environment=gymnasium_id(spec.scene),
         work=spec.steps,
+        root=options.root,
     )
 
 
@@ -178,12 +179,12 @@ def checkpoint_evaluations(spec: RunSpec, evaluation: CheckpointEvaluation) -> l
         for split in evaluation.splits:
             folder = spec.evaluation_folder(evaluation.suite, split, checkpoint)
             videos = int(evaluation.suite == "sequential" and not spec.options.scale.smoke)
-            policy = str(spec.policy(checkpoint))
+            # A budget may end the run before its last step: only the link says where.
+            policy = str(spec.train_folder / LAST_POLICY if spec.row.has_budget else spec.policy(checkpoint))
             command = eval_command(policy, spec.scene, evaluation.suite, split, folder, spec.options, videos)
             command = _with_flags(command, _env_flags(spec.row.flags), _env_flags(spec.options.extra))
-            jobs.append(
-                (_eval_job(f"{spec.name}/{folder.name}", command, folder, spec.name, spec.scene), checkpoint)
-            )
+            name, root = f"{spec.name}/{folder.name}", spec.options.root
+            jobs.append((_eval_job(name, command, folder, spec.name, spec.scene, root), checkpoint))
     return jobs
 
 
@@ -197,7 +198,8 @@ def base_evaluation_jobs(base: Base, options: Options, evaluation: CheckpointEva
         policy = base_policy(base, options)
         command = eval_command(policy, base.scene, evaluation.suite, split, folder, options)
         command = _with_flags(command, _env_flags(options.extra))
-        jobs.append(_eval_job(f"base/{folder.parent.name}/{folder.name}", command, folder, needed, base.scene))
+        name = f"base/{folder.parent.name}/{folder.name}"
+        jobs.append(_eval_job(name, command, folder, needed, base.scene, options.root))
     return jobs
 
 
@@ -221,7 +223,7 @@ def eval_command(
     return [*command, "--eval.n_episodes=1", "--eval.orderings=1"] if options.scale.smoke else command
 
 
-def _eval_job(name: str, command: list[str], folder: Path, needed: str | None, scene: str) -> Job:
+def _eval_job(name: str, command: list[str], folder: Path, needed: str | None, scene: str, root: Path) -> Job:
     # cronos-eval goes on with what it finds in its folder.
     needs = (needed,) if needed else ()
     return Job(
@@ -232,4 +234,5 @@ def _eval_job(name: str, command: list[str], folder: Path, needed: str | None, s
         resume=lambda: command,
         environment=gymnasium_id(scene),
         stage=EVALUATION,
+        root=root,
     )

@@ -25,6 +25,8 @@ from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job, changes, is_d
 from cronos_lerobot.experiments.runner import DONE, FAILED, Runner
 from cronos_lerobot.locks import FolderLock
 
+PENDING = "PENDING"
+"""Slurm's state of an element that waits, also of one that was requeued."""
 INSTALL = "--launcher=slurm needs submitit: pip install '.[slurm]' in a clone"
 
 
@@ -122,6 +124,8 @@ class Task:
         self.jobs, self.needs, self.threads = tuple(jobs), tuple(needs), threads
         self.limit_s, self.grace_s = limit_s, grace_s
         self._began = time.monotonic()
+        self._waiting: list[Job] = []
+        """What was not done at this start."""
         self._runner: Runner | None = None
 
     def __call__(self) -> dict[str, str]:
@@ -134,6 +138,7 @@ class Task:
             RuntimeError: something needed is not done, or a job failed.
         """
         self._began = time.monotonic()
+        self._waiting = [job for job in self.jobs if not is_done(job)]
         if missing := [job.name for job in self.needs if not is_done(job)]:
             raise RuntimeError(f"blocked: {', '.join(missing)} is not done")
         own = {job.name for job in self.jobs}
@@ -160,7 +165,8 @@ class Task:
     def checkpoint(self) -> Any:
         """Stop: submitit calls this shortly before the time limit, and then requeues what is returned.
 
-        None, which ends the job, where a whole time limit has left nothing to go on with: so would the next one.
+        None, which ends the job, where a whole time limit has finished no job and left nothing to go on with: so
+        would the next one.
         """
         from submitit.helpers import DelayedSubmission
 
@@ -168,7 +174,8 @@ class Task:
             self._runner.stop()
         unfinished = next((job for job in self.jobs if not is_done(job)), None)
         has_timed_out = time.monotonic() - self._began > self.limit_s / 2
-        if has_timed_out and unfinished is not None and unfinished.resume() is None:
+        has_got_on = any(map(is_done, self._waiting))
+        if has_timed_out and not has_got_on and unfinished is not None and unfinished.resume() is None:
             print(
                 f"{unfinished.name} came to its time limit before its first checkpoint: give a longer --slurm.time"
             )

@@ -12,10 +12,15 @@ from rich.table import Table
 from cronos_lerobot.experiments.display import duration
 from cronos_lerobot.experiments.jobs import RUNNING, STOPPED, Job, status
 from cronos_lerobot.experiments.progress import train_progress
-from cronos_lerobot.experiments.slurm import SlurmError, read_submitted, slurm_folder, squeue
+from cronos_lerobot.experiments.runner import DONE
+from cronos_lerobot.experiments.slurm import PENDING, SlurmError, read_submitted, slurm_folder, squeue
 
 NOTES = ("base/*/*.job.json", "runs/*/*/seed*/*.job.json", "runs/*/*/seed*/eval/*.job.json")
 """Where the notes of jobs lie in a root."""
+
+REQUEUED = "requeued"
+WAITING = (REQUEUED, PENDING.lower())
+"""States that Slurm has a reason for."""
 
 
 def read_jobs(root: Path) -> Iterator[tuple[str, Job, dict[str, Any]]]:
@@ -49,15 +54,17 @@ def make_status_table(root: Path) -> Table:
         queue = {}
     table = Table(box=None, pad_edge=False, header_style="dim")
     for column in ("job", "state", "steps", "success", "time", "starts", "element"):
-        table.add_column(column, justify="right" if column in ("steps", "time", "starts") else "left")
+        justify = "right" if column in ("steps", "time", "starts") else "left"
+        table.add_column(column, justify=justify, no_wrap=True)
     seen = set()
     for name, job, record in read_jobs(root):
         seen.add(name)
         number = submitted.get(name, "")
-        # A lock on another node is not always seen here; the queue knows.
-        state = RUNNING if record.get("status") == RUNNING and number in queue else status(job)
-        state = "requeued" if state == STOPPED and number in queue else state
+        queued = queue.get(number)
+        state = status(job) if queued is None else _queued_state(record.get("status"), queued[0])
         steps, text = _progress(job)
+        if queued and state in WAITING:
+            text = ", ".join(filter(None, (text, queued[1])))
         table.add_row(
             name, state, steps, text, duration(record.get("seconds", 0.0)), str(record.get("starts", 0)), number
         )
@@ -66,6 +73,18 @@ def make_status_table(root: Path) -> Table:
             state, reason = queue[number]
             table.add_row(name, state.lower(), "", reason, "", "", number)
     return table
+
+
+def _queued_state(noted: str | None, slurm: str) -> str | None:
+    """The state of a job whose element is in the queue, from that of its note and Slurm's.
+
+    A lock on another node is not always seen here, and a note of a job that was killed says `running` for ever.
+    """
+    if noted == DONE:
+        return noted
+    if slurm == PENDING:
+        return REQUEUED if noted in (RUNNING, STOPPED) else slurm.lower()
+    return slurm.lower() if noted == RUNNING else REQUEUED if noted == STOPPED else noted
 
 
 def _progress(job: Job) -> tuple[str, str]:

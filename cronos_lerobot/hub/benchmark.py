@@ -76,6 +76,15 @@ def write_benchmark_repository(config: BenchmarkConfig, folder: Path) -> str:
     return f"{benchmark.scene.name} ({sizes} in held_out; fingerprint {benchmark.fingerprint})"
 
 
+def benchmark_tag(config: BenchmarkConfig) -> str:
+    """The tag of a benchmark in all repositories that hold it: what decides a result is in its fingerprint.
+
+    Raises:
+        ValueError: the benchmark cannot be loaded or drawn.
+    """
+    return f"benchmark-{choose_benchmark(config).fingerprint}"
+
+
 def _describe(table: pa.Table, pictures: list[bytes] | None) -> pa.Table:
     """The table with the Hub's description of its columns, and with a picture in each row."""
     if pictures is not None:

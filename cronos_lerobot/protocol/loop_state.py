@@ -71,6 +71,8 @@ class LoopState:
     """(N,) the agent's value of the current task when it was given, where the task order asked for it; else 0."""
     reset_value: np.ndarray = field(init=False)
     """(N,) its best value over the tasks when the stream's last scene reset was asked for, if by value; else 0."""
+    asked_resets: np.ndarray = field(init=False)
+    """(N,) scene resets that were asked for by value, of all that are counted in `interventions`."""
     takeover_cost: np.ndarray = field(init=False)
     """(N,) what takeovers have counted as, each at the price of its time."""
 
@@ -93,6 +95,7 @@ class LoopState:
         self.interventions = np.zeros((n, len(Intervention)), np.int64)
         self.task_value = np.zeros(n)
         self.reset_value = np.zeros(n)
+        self.asked_resets = np.zeros(n, np.int64)
         self.takeover_cost = np.zeros(n, np.int64)
 
     @property

@@ -129,6 +129,9 @@ class PeriodicSceneReset(SceneReset):
 
     Staggered, stream i of N is reset i/N of T, in whole segments, before the multiples of T. Of the streams that
     are reset at the same moment each then goes on with another task of the heuristic order.
+
+    A stream that an extra strategy has reset at the same switch is as it should be, and is not reset and counted
+    again.
     """
 
     kind = Intervention.SCENE_RESET
@@ -147,14 +150,16 @@ class PeriodicSceneReset(SceneReset):
         streams = np.arange(loop.num_streams)
         segments = interval // self.segment
         phase = streams * segments // loop.num_streams if self.is_staggered else 0 * streams
-        return np.flatnonzero((loop.t // self.segment + phase) % segments == 0)
+        is_due = (loop.t // self.segment + phase) % segments == 0
+        return np.flatnonzero(is_due & (loop.preceded_by != Intervention.SCENE_RESET))
 
 
 class CriticSceneReset(SceneReset):
     """Streams in which nothing can be learned any more are reset, as far as a budget goes (not in the paper).
 
-    Of the streams that have failed their last tasks, those come first whose best task has the lowest value. The
-    budget is paced: after a share of the run's steps no more than that share of it is spent. What other kinds of
+    Of the streams that have failed their last tasks, those come first whose best task has the lowest value, of
+    equal ones (a critic that has learned nothing yet) those whose last reset is the longest ago. The budget is
+    paced: after a share of the run's steps no more than that share of it is spent. What other kinds of
     interventions cost is taken from it, too.
 
     Raises:
@@ -181,9 +186,15 @@ class CriticSceneReset(SceneReset):
             return np.empty(0, np.int64)
         assert self._values is not None
         best = self._values.best(loop)
-        chosen = np.sort(stuck[np.argsort(best[stuck], kind="stable")[:allowance]])
+        order = np.lexsort((-loop.segments_since_reset[stuck], best[stuck]))
+        chosen = np.sort(stuck[order[:allowance]])
         loop.reset_value[chosen] = best[chosen]
         return chosen
+
+    def count(self, loop: LoopState, ids: np.ndarray) -> None:
+        """Count them as scene resets, and apart from those of other strategies."""
+        super().count(loop, ids)
+        loop.asked_resets[ids] += 1
 
     def find_stuck(self, loop: LoopState) -> np.ndarray:
         """Ids (k,) of the streams that have failed their last tasks, all of them since their scene reset."""

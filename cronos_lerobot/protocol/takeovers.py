@@ -24,7 +24,8 @@ class Takeover(ResetStrategy):
     """Streams whose task has just been drawn, and that have failed at it often enough, get the expert.
 
     Those that have failed most often come first. The budget is paced: by the end of a segment no more of it has
-    been spent than the run's share that is over then; nor does a takeover ever exceed `protocol.reset_budget`.
+    been spent than the run's share that is over then; nor does a takeover ever exceed `protocol.reset_budget`, nor
+    the share of it that is over, where values ask for resets from the same budget.
 
     Args:
         protocol: of the run; `takeover_after` is a number.
@@ -38,6 +39,7 @@ class Takeover(ResetStrategy):
         assert protocol.takeover_after is not None
         self.after, self.price = protocol.takeover_after, protocol.takeover_price
         self.budget, self.reset_budget = protocol.takeover_budget, protocol.reset_budget
+        self.shares_budget = protocol.scene_reset == "critic"
         self.segment, self.total_steps, self.capacity = protocol.task_switch_interval, total_steps, capacity
 
     def due(self, env: Any, loop: LoopState) -> np.ndarray:
@@ -57,11 +59,13 @@ class Takeover(ResetStrategy):
     def _num_affordable(self, loop: LoopState) -> int:
         """How many streams may be taken over now."""
         counts = [loop.num_streams if self.capacity is None else self.capacity]
+        over = min(loop.n + loop.num_streams * self.segment, self.total_steps)
         if self.budget is not None:
-            over = min(loop.n + loop.num_streams * self.segment, self.total_steps)
             counts.append((self.budget * over // self.total_steps - int(loop.takeover_cost.sum())) // self.price)
         if self.reset_budget is not None:
-            counts.append((self.reset_budget - loop.b) // self.price)
+            # Spent at once, it would end the run that the critic's resets were to last for.
+            there = self.reset_budget * over // self.total_steps if self.shares_budget else self.reset_budget
+            counts.append((there - loop.b) // self.price)
         return max(0, min(counts))
 
 

@@ -19,6 +19,8 @@ from cronos_lerobot.evaluation.sign_flip import sign_flip_p
 
 ALPHA = 0.05
 """Of all intervals, and of the decision for which `needed` episodes are counted."""
+FEWEST = 6
+"""Configurations with which p of the sign-flip test, at least 2 / 2**k, can come below ALPHA."""
 MOST = 10**7
 """Configurations or trainings beyond which nobody would count."""
 
@@ -95,13 +97,14 @@ def compare_policies(pairs: Pairs, power: float) -> Difference:
         half = float(student_t.ppf(1 - ALPHA / 2, k - 1)) * spread / sqrt(k) if k > 1 else 0.0
         interval = (value - half, value + half) if half else None
         name = "t-interval over configurations"
+    needed = samples_needed(spread, value, power, lambda n: n - 1)
     return Difference(
         value,
         interval,
         sign_flip_p(pairs.whole_differences),
         f"{name}, exact sign-flip p over {k} configurations",
-        samples_needed(spread, value, power, lambda n: n - 1),
-        detectable(spread, k, power, k - 1),
+        None if needed is None else max(needed, FEWEST),
+        detectable(spread, k, power, k - 1) if k >= FEWEST else None,
     )
 
 

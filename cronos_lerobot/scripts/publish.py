@@ -39,12 +39,16 @@ from cronos_lerobot.scripts.subcommands import run_subcommand
 def publish_benchmark(config: BenchmarkConfig) -> None:
     """`cronos-publish benchmark`."""
     config.validate()
-    from cronos_lerobot.hub.benchmark import ENV_FILE, REPLACES, write_benchmark_repository
+    from cronos_lerobot.hub.benchmark import ENV_FILE, REPLACES, benchmark_tag, write_benchmark_repository
 
     if not config.dry_run:
         for target in config.targets[1:]:
             check_holds(target, ENV_FILE)
-    _publish(config, write_benchmark_repository, replaces=REPLACES)
+    # The data and what runs it are two repositories: one name for both, whatever their commits are called.
+    tag = benchmark_tag(config)
+    _publish(config, write_benchmark_repository, replaces=REPLACES, tag=tag)
+    if not config.dry_run:
+        print(f"{config.repo_id}@{tag} is this benchmark, in --env.benchmark and in LeRobot's make_env")
 
 
 def publish_stream(config: StreamConfig) -> None:

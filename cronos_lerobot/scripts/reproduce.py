@@ -324,7 +324,8 @@ def print_status(root: Path) -> None:
         sys.exit(f"error: nothing was started in {root} yet")
     # Into a file or a narrow terminal whole lines are better than columns cut short.
     console = Console()
-    console.width = max(console.width, 160)
+    whole = console.measure(table, options=console.options.update(max_width=sys.maxsize)).maximum
+    console.width = max(console.width, whole)
     console.print(table)
 
 

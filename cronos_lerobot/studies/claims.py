@@ -1,4 +1,4 @@
-"""The table of all experiments: how much was run of each, and which of the paper's claims hold here.
+"""The table of the paper's experiments: how much was run of each, and which of the paper's claims hold here.
 
     python -m cronos_lerobot.studies.claims          # write it anew, in docs/results.md
     python -m cronos_lerobot.studies.claims --check  # only say whether it is what the files say
@@ -14,6 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from cronos_lerobot.experiments.columns import MISSING, WORDS
+from cronos_lerobot.experiments.definitions import EXPERIMENTS, Experiment
+from cronos_lerobot.experiments.orders import NOT_RUN
+from cronos_lerobot.experiments.results import paper_results
 from cronos_lerobot.studies import marked_tables
 from cronos_lerobot.studies.marked_tables import MarkedTable
 
@@ -22,34 +25,56 @@ CLAIMS = MarkedTable("claims", Path("docs/results.md"), "cronos_lerobot.studies.
 
 
 def read_experiments(folder: Path) -> list[dict[str, Any]]:
-    """What `cronos-reproduce` found, of every experiment below a folder that says whether the paper's claims hold.
+    """What `cronos-reproduce` found, of every experiment of the paper below a folder, in the paper's order.
 
-    Those of version 0 do not; neither do those that are none of the paper's.
+    Files of version 0 do not say whether the paper's claims hold, and are left out.
     """
     found = [json.loads(path.read_text()) for path in sorted(folder.glob("*/*.json"))]
-    return [one for one in found if isinstance(one, dict) and one.get("orders")]
+    of_this_version = [one for one in found if isinstance(one, dict) and "orders" in one]
+    return [one for name in of_the_paper() for one in of_this_version if one["experiment"] == name]
+
+
+def of_the_paper() -> dict[str, Experiment]:
+    """The experiments that repeat a table or a figure of the paper."""
+    return {name: experiment for name, experiment in EXPERIMENTS.items() if experiment.source}
 
 
 def make_table(experiments: list[dict[str, Any]]) -> str:
-    """A line for each claim, in Markdown; the experiment stands before its first."""
+    """A line for each claim, in Markdown; the experiment stands before its first.
+
+    One for each experiment of the paper that is not among `experiments` says so.
+    """
     lines = [
-        "| experiment | rows finished | seeds | steps | hours | the paper says | suite | here [95 %] | holds |",
+        "| experiment | rows | seeds | steps | hours | the paper says | suite | here [95 %] | holds |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
-    for one in experiments:
-        cells = _experiment(one)
-        for order in one["orders"]:
-            lines.append(f"| {' | '.join((*cells, *_claim(order)))} |")
-            cells = ("",) * len(cells)
+    for name, experiment in of_the_paper().items():
+        found = [one for one in experiments if one["experiment"] == name]
+        for one in found:
+            cells = _experiment(one)
+            for claim in map(_claim, one["orders"]) if one["orders"] else [(MISSING,) * 4]:
+                lines.append(f"| {' | '.join((*cells, *claim))} |")
+                cells = ("",) * len(cells)
+        if not found:
+            lines.append(f"| {' | '.join(_not_run(experiment))} |")
     return "\n".join(lines)
 
 
 def _experiment(one: dict[str, Any]) -> tuple[str, ...]:
     begun = [row["seeds"] for row in one["rows"] if row["seeds"]]
-    seeds = MISSING if not begun else "–".join(map(str, sorted({min(begun), max(begun)})))
+    seeds = "–".join(map(str, sorted({min(begun), max(begun)}))) if begun else "0"
     kind = "pixels" if one["obs_type"].startswith("pixels") else "state"
     name = f"{one['experiment']}, {one['scene']}, {kind}"
-    return name, f"{len(begun)} of {len(one['rows'])}", seeds, f"{one['steps']:,}", f"{one['hours']:.1f}"
+    rows, seeds = f"{len(begun)} of {len(one['rows'])}", f"{seeds} of {len(one['seeds'])}"
+    return name, rows, seeds, f"{one['steps']:,}", f"{one['hours']:.1f}"
+
+
+def _not_run(experiment: Experiment) -> tuple[str, ...]:
+    """How many sentences of the paper an experiment would tell of."""
+    number = len(paper_results()["orders"].get(experiment.name, ()))
+    said = f"{number} sentence{'s' * (number > 1)}" if number else MISSING
+    rows = f"0 of {len(experiment.rows)}"
+    return f"{experiment.name}, {experiment.scene}", rows, *(MISSING,) * 3, said, *(MISSING,) * 2, NOT_RUN
 
 
 def _claim(order: dict[str, Any]) -> tuple[str, ...]:

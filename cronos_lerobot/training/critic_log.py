@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from cronos_lerobot.protocol.config import ProtocolConfig
-from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import LoopState, SegmentEnd
 
 
@@ -32,7 +31,7 @@ class CriticLog:
             for task, success, value, taken_over in zip(*columns, strict=True):
                 if task < loop.num_tasks and not taken_over:
                     self._state["values"]["success" if success else "failure"].append(float(value))
-        counts = loop.interventions[:, Intervention.SCENE_RESET]
+        counts = loop.asked_resets
         before, self._state["counted"] = self._state["counted"] or [0] * len(counts), counts.tolist()
         if self.asks_for_resets:
             resets = [

@@ -199,6 +199,7 @@ class Trainer:
                 last_save = self.loop.n
             if ends:
                 return False
+        self._say_end()
         if self._last_evaluation < self.loop.n:
             self._evaluate()
         if self.config.save_checkpoint and (last_save < self.loop.n or not self._has_checkpoint()):
@@ -206,6 +207,14 @@ class Trainer:
         if summary := self.critic_log.summary():
             self.logger.log("resets", summary)
         return True
+
+    def _say_end(self) -> None:
+        """A run that its budget ends early would look like one that broke off."""
+        if self.processes.is_main and self.loop.n < self.config.total_steps:
+            logging.warning(
+                f"The run ends after {self.loop.n:,} of {self.config.total_steps:,} steps: its "
+                f"{self.loop.b:,} interventions reach --protocol.reset_budget={self.config.protocol.reset_budget}."
+            )
 
     def _is_stopped(self, stop: StopRequest) -> bool:
         """Whether any process was told to stop; all of them then do, but not where the run ends anyway."""

@@ -92,6 +92,14 @@ def test_two_policies_that_do_alike_are_told_apart_no_more_often_than_stated(kin
     print(f"{kind}: {np.mean(decisions != 0):.4f} of {runs} decided")
 
 
+def test_lopsided_chain_lengths_of_equal_means_are_told_apart_more_often_than_stated():
+    """Not symmetric: what the docs warn of, here once more with fewer runs."""
+    rng = np.random.default_rng(7)
+    decisions, _ = simulate(lambda n: rng.choice([4, -1, 0], n, p=[0.04, 0.16, 0.8]), 300, planned=256)
+    assert 0.08 < np.mean(decisions != 0) < 0.2
+    assert np.count_nonzero(decisions == -1) > 10 * np.count_nonzero(decisions == 1)
+
+
 def test_a_difference_is_found_with_fewer_episodes(capsys):
     runs, planned = 200, 256
     saved = {}

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cronos_lerobot.experiments.command_check import check_commands
-from cronos_lerobot.experiments.definitions import EXPERIMENTS, find_rows
+from cronos_lerobot.experiments.definitions import EXPERIMENTS, CheckpointEvaluation, Experiment, Row, find_rows
 from cronos_lerobot.experiments.plan import make_jobs, train_flags
 from cronos_lerobot.experiments.results import paper_results
 from cronos_lerobot.experiments.scales import PIXELS, SCALES, STATE, base_recipe
@@ -262,6 +262,20 @@ def test_evaluations_of_checkpoints():
     assert evals[0].needs == ("kitchen_2x2_state_paper/t80_1300k/seed2",)
     figure5 = [job for job in jobs_of("figure5", rows=["t80"]).values() if job.command[0] == "cronos-eval"]
     assert len(figure5) == 2 * 5
+
+
+def test_a_run_that_a_budget_may_end_is_evaluated_where_it_ended():
+    row = Row(320, tag="short", budgets=(("--protocol.reset_budget", 1000),))
+    chains = CheckpointEvaluation("sequential", ("held_out",))
+    experiment = Experiment("short", "", (row, Row(320)), evaluations=(chains,))
+    jobs = {job.name: job for job in make_jobs([(experiment, experiment.rows)], options())}
+    run = "kitchen_2x2_state_paper/{}_1300k/seed1"
+    name = run + "/sequential_held_out_1300480"
+    policy = "--policy.path=out/runs/" + run + "/train/checkpoints/{}/pretrained_model"
+    assert policy.format("t320_short", "last") in jobs[name.format("t320_short")].command
+    assert policy.format("t320", "1300480") in jobs[name.format("t320")].command
+    with pytest.raises(ValueError, match=r"short: a budget may end runs of t320_short at any checkpoint"):
+        replace(experiment, evaluations=(replace(chains, every_checkpoint=True),))
 
 
 def test_checkpoints_lie_where_updates_pass_a_multiple():

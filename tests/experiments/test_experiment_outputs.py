@@ -176,7 +176,7 @@ def test_run_of_another_command_is_named_and_left_out(options):
     result = results(other, "table1")
     (text,) = result.changed
     assert "t80_10k/seed1" in text
-    assert "+--algorithm.target_kl=0.02" in text
+    assert "none there, --algorithm.target_kl=0.02 here" in text
     row = by_row(tables.main_rows(result))["t80"]
     assert (row["seeds"], row["success_train_mean"]) == (0, None)
 
@@ -257,6 +257,16 @@ def test_sequences(options, tmp_path):
         in text
     )
     assert (tmp_path / "out/figure5_sequential.png").exists()
+
+
+def test_runs_that_their_budget_ended_are_named(options, tmp_path):
+    make_run(options, "table1", "t80", 1, (2, 4, 5))
+    rows = EXPERIMENTS["table1"].rows
+    title = "## Ended by their budget of interventions"
+    assert title not in write_outputs(EXPERIMENTS["table1"], rows, options, tmp_path / "out")
+    make_run(options, "table1", "t1280", 1, (2, 4, 4), updates=4)
+    text = write_outputs(EXPERIMENTS["table1"], rows, options, tmp_path / "out")
+    assert f"{title}\n\n- kitchen_2x2_state_small/t1280_10k/seed1: after 5,120 of 10,240 steps\n" in text
 
 
 def test_files_of_table1(options, tmp_path):

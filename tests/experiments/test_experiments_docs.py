@@ -1,6 +1,7 @@
 """docs/experiments.md says what the code does."""
 
 import ast
+import json
 import re
 from dataclasses import MISSING, fields
 from pathlib import Path
@@ -85,6 +86,13 @@ def test_every_flag_is_there():
     flags = {flag for action in make_parser()._actions for flag in action.option_strings} - {"-h", "--help"}
     documented = set(re.findall(r"`(--[\w.]+)`", DOCS[DOCS.index("## Flags") : DOCS.index("## Where")]))
     assert documented == flags
+
+
+def test_the_page_is_drawn_anew_by_the_command_beside_the_archives():
+    page = Path(__file__).parents[2] / "docs/results/few_resets_best_paper_state/few_resets_best.json"
+    command = DOCS[DOCS.index("  cronos-reproduce few_resets_best --scale=paper --report_only") :].split("```")[0]
+    rows = command.replace("\\\n", " ").split("--rows")[1].split()
+    assert rows == [row["row"] for row in json.loads(page.read_text())["rows"]]
 
 
 def test_plugs():

@@ -32,7 +32,8 @@ def order(says, value, ends, p):
         ("higher", 0.2, (-0.1, 0.5), 0.2, "not separated"),
         # Alike: as near as the margin, whatever p says; further apart is no only if it is certain.
         ("alike", 0.02, (0.01, 0.03), 0.01, "yes"),
-        ("alike", 0.03, (0.01, 0.06), 0.01, "not separated"),
+        ("alike", 0.03, (0.01, 0.06), 0.01, "undecided"),
+        ("alike", -0.1, (-0.2, -0.04), 0.01, "undecided"),
         ("alike", -0.2, (-0.3, -0.1), 0.01, "no"),
         ("alike", 0.02, (-MARGIN, MARGIN), 0.5, "yes"),
         ("alike", 0.2, (0.1, 0.3), 0.01, "no"),

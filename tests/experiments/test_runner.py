@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from tiny_jobs import Tape, count_job, python_job, run
@@ -22,6 +23,7 @@ from cronos_lerobot.experiments.jobs import (
     other_commits,
     read_record,
     status,
+    write_record,
 )
 from cronos_lerobot.experiments.runner import Runner
 
@@ -101,14 +103,38 @@ def test_changed_command_is_reported_and_its_output_left_alone(tmp_path, capsys)
     old.record.write_text(json.dumps(record))
     assert is_done(old)
     assert not is_done(new)
-    assert changed_flags(new) == ["---lr=1", "+--lr=2"]
+    assert changed_flags(new) == ["--lr=1 there, --lr=2 here"]
     states = Runner([new, count_job(tmp_path, "b", needs=("a",))], 1, LineDisplay([])).run()
     assert states == {"a": "changed", "b": "blocked"}
-    assert "+--lr=2" in capsys.readouterr().out
+    assert "--lr=1 there, --lr=2 here" in capsys.readouterr().out
     assert json.loads(old.record.read_text()) == record
     # Once its output is out of the way it runs.
     (tmp_path / "a").rmdir()
     assert Runner([python_job(tmp_path, "a", "")], 1, LineDisplay([])).run() == {"a": "done"}
+
+
+def rooted_job(root, policy="base/clone", seed=1):
+    root = Path(root)
+    command = ("train", f"--policy.path={root / policy}", f"--seed={seed}", f"--output_dir={root / 'runs/a'}")
+    return Job("a", command, root / "runs/a", root=root)
+
+
+@pytest.mark.parametrize("noted", ["outputs/reproduce", "/elsewhere/x", ".", "outputs/runs/a"])
+def test_a_root_may_be_moved_or_named_another_way(tmp_path, noted):
+    here = rooted_job(tmp_path)
+    here.output.mkdir(parents=True)
+    record = {"command": [], "status": "done", "seconds": 1.0, "starts": 1, "made_by": made_by(here)}
+    write_record(here, record | {"command": list(rooted_job(noted).command)})
+    assert (changes(here), is_done(here)) == ([], True)
+    assert changes(rooted_job(tmp_path, seed=2)) == ["--seed=1 there, --seed=2 here"]
+    # Another policy is another policy, below the root or not.
+    (other,) = changes(rooted_job(tmp_path, policy="base/other"))
+    assert other.endswith(f"base/clone there, --policy.path={tmp_path}/base/other here")
+    assert changes(rooted_job(tmp_path, policy="/base/clone")) != []
+    # The note of another output, and of a job that has no root.
+    assert changes(replace(here, root=None)) != []
+    write_record(here, record | {"command": [flag.replace("runs/a", "runs/b") for flag in here.command]})
+    assert changes(here) == [f"--output_dir={tmp_path}/runs/b there, --output_dir={tmp_path}/runs/a here"]
 
 
 def test_lost_output_is_made_again(tmp_path):

@@ -50,8 +50,8 @@ def cluster():
 @pytest.fixture(autouse=True)
 def fast(monkeypatch):
     monkeypatch.setattr("cronos_lerobot.experiments.follow.POLL_S", 0.2)
-    # A job that is being requeued is not in the queue for a moment; 4 s, where a user's run gives it 15.
-    monkeypatch.setattr("cronos_lerobot.experiments.follow.MISSES", 20)
+    # A job that is being requeued is not in the queue for a moment; 4 s, where a user's run gives it 90.
+    monkeypatch.setattr("cronos_lerobot.experiments.follow.LATE_S", 4.0)
     monkeypatch.setattr("cronos_lerobot.experiments.runner.POLL_S", 0.05)
 
 
@@ -103,6 +103,21 @@ def test_a_time_limit_that_leaves_nothing_to_go_on_with_ends_the_job(tmp_path, c
     # It was preempted before, or goes on from where it was.
     for again in (Task([anew], [], 1, 3600, 1), Task([resumable], [], 1, 0, 1)):
         assert [j.name for j in again.checkpoint().function.jobs] == ["anew"]
+
+
+@pytest.mark.parametrize(("demos_done_before", "is_requeued"), [(False, True), (True, False)])
+def test_a_time_limit_that_finished_the_demonstrations_leaves_the_cloning(
+    tmp_path, demos_done_before, is_requeued
+):
+    """A next start that only has to clone may come to its end; another one that does only that would not."""
+    demos = job(tmp_path, "base/a/demos", stage=BASE)
+    clone = job(tmp_path, "base/a/clone", "sys.exit('stopped')", needs=(demos.name,), stage=BASE)
+    if demos_done_before:
+        Task([demos], [], 1, 60, 1)()
+    task = Task([demos, clone], [], 1, limit_s=0, grace_s=1)
+    with pytest.raises(RuntimeError, match="not done"):
+        task()
+    assert (task.checkpoint() is not None) == is_requeued
 
 
 def test_an_old_interruption_of_what_is_blocked_is_not_taken_for_a_signal(tmp_path):

@@ -1,6 +1,7 @@
 """A benchmark on the Hub makes its own environments, by LeRobot's `make_env`."""
 
 import json
+import re
 
 import pytest
 
@@ -47,22 +48,26 @@ def of_the_hub(name):
 
 @pytest.fixture(scope="module")
 def commits(served, commands):
-    """Two benchmarks of one name, one after the other: commits of the dataset and of the model repository."""
+    """Two benchmarks of one name, one after the other: commits of the dataset and of the model repository, tag."""
     found = []
     for seed in (5, 6):
         output = commands.run("cronos-publish", "benchmark", "--repo_id=me/bench", *SMALL, f"--seed={seed}")
         assert f"{served.url}/datasets/me/bench\n{served.url}/me/bench\n" in output
+        tag = re.search(r"me/bench@(benchmark-[0-9a-f]{16}) is this benchmark", output)[1]
         found.append([served.repositories[kind, "me/bench"].branches["main"] for kind in ("datasets", "models")])
+        assert [served.repositories[kind, "me/bench"].tags[tag] for kind in ("datasets", "models")] == found[-1]
+        found[-1].append(tag)
     return found
 
 
 def test_it_gives_the_environments_of_the_repository_at_that_revision(commits, hub, commands):
-    (old_data, old), (data, _) = commits
+    (_, old, tag), (data, _, _) = commits
     assert hub.tree("models", "me/bench") == hub.tree("datasets", "me/bench")
     commands.forget()
     code = f"""{SAME}
 old, new = of_the_hub("me/bench@{old}"), of_the_hub("me/bench")
-are_same = old == of_the_data("me/bench@{old_data}"), new == of_the_data("me/bench@{data}"), old == new
+tagged = of_the_data("me/bench@{tag}"), of_the_hub("me/bench@{tag}")
+are_same = (old, old) == tagged, new == of_the_data("me/bench@{data}"), old == new
 print(json.dumps([sorted(new), *are_same]))
 """
     names, old_is_old, new_is_new, is_same = json.loads(commands.run("python", code).splitlines()[-1])

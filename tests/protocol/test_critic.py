@@ -251,6 +251,14 @@ def test_the_critics_resets_by_hand():
     assert loop.n == 80
 
 
+def test_equal_values_send_the_reset_to_who_has_waited_longest():
+    """As at the start, when a critic says 0 of all: the budget is one reset for two segments of 8 steps."""
+    env, loop, _ = critic_resets(80, 5, np.zeros((4, 4)), failures=1)
+    # After segments 2, 4, 6 and 8: whoever has gone longest without one, of equals the first.
+    assert scene_resets(env) == [[0], [1], [2], [3]]
+    assert loop.asked_resets.tolist() == [1, 1, 1, 1]
+
+
 def test_streams_that_succeed_or_have_just_been_reset_are_left_alone():
     """Only streams 0 and 1 fail; a reset one has to fail three times again, however low its value."""
     env = Still(4)
@@ -266,7 +274,8 @@ def test_unspent_budget_is_kept_for_later_and_never_exceeded():
     """All succeed in the first ten of twenty segments and none later; the budget is 10, one for two segments.
 
     Six may be spent after twelve segments, when all four streams have failed twice; seven after fourteen, so
-    three of them are reset again, and one each after sixteen and eighteen. The last one is never spent.
+    three of them are reset again; the fourth, which has waited longest, after sixteen, and one after eighteen. The
+    last one is never spent.
     """
 
     class Breaks(Still):
@@ -276,9 +285,9 @@ def test_unspent_budget_is_kept_for_later_and_never_exceeded():
             return super().step(actions)
 
     env, loop, events = critic_resets(160, 10, np.zeros(4), env=Breaks(4))
-    assert scene_resets(env) == [[0, 1, 2, 3], [0, 1, 2], [0], [0]]
+    assert scene_resets(env) == [[0, 1, 2, 3], [0, 1, 2], [3], [0]]
     ages = [event.segments_since_reset.tolist() for event in events if isinstance(event, SegmentEnd)]
-    assert [number for number, age in enumerate(ages) if age[0] == 0] == [0, 12, 14, 16, 18]
+    assert [number for number, age in enumerate(ages) if age[0] == 0] == [0, 12, 14, 18]
     assert loop.b == 9
 
 

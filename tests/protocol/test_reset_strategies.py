@@ -251,6 +251,23 @@ def test_what_is_no_task_of_every_stream_is_refused_with_the_orders_name(drawn, 
         del TASK_ORDERS["wrong"]
 
 
+def test_a_stream_that_an_own_strategy_has_reset_is_not_reset_and_counted_again(monkeypatch):
+    class First(ResetStrategy):
+        kind = Intervention.SCENE_RESET
+
+        def due(self, env, loop):
+            return np.array([0])
+
+        def apply(self, env, ids):
+            env.scene_reset(ids, np.zeros(len(ids), np.int64))
+
+    monkeypatch.setitem(EXTRA_RESETS, "first", lambda rng, config: First())
+    # K = 2, two streams, T of two segments, six segments: the first stream is reset at every switch by its
+    # strategy, the second at every second one by T.
+    _, _, loop, _ = run(protocol(scene_reset_interval=4, extra_resets=["first"]), steps=24)
+    assert loop.interventions[:, Intervention.SCENE_RESET].tolist() == [6, 3]
+
+
 def test_recent_history_holds_the_last_segments():
     env = DummyEnv(2)
     env.scene_reset = lambda ids, configurations: None

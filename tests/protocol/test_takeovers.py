@@ -108,6 +108,22 @@ def test_no_budget_is_ever_exceeded(options, counts):
     assert loop.interventions_by_kind()["takeover"] == counts
 
 
+def test_takeovers_leave_the_critics_budget_for_the_rest_of_the_run():
+    """One try each, 8 interventions in 40 segments: one for five, and none of them ends the run."""
+    values = {"scene_reset": "critic", "reset_budget": 8, "scene_reset_interval": None}
+    strategy = Takeover(protocol(takeover_after=1, **values), total_steps=40 * 2 * K)
+    loop = LoopState(2, 1)
+    loop.failures[:] = 1
+    spent = []
+    for segment in range(40):
+        loop.t = segment * K
+        loop.taken_over[:] = False
+        strategy.apply_if_due(None, loop)
+        spent.append(loop.b)
+    assert spent == [(segment + 1) * 8 // 40 for segment in range(40)]
+    assert spent[-2:] == [7, 8]
+
+
 def test_of_several_those_that_failed_most_come_first_then_the_first_streams():
     loop = LoopState(5, 2)
     loop.switch_task(np.array([0, 0, 1, 0, 0]))

@@ -78,6 +78,17 @@ def test_a_decision_would_need_more_episodes(tmp_path, monkeypatch, capsys):
     assert "One of 0.050 takes about 490 more episodes of each policy, from 255 configurations in all." in text
 
 
+def test_from_five_configurations_nothing_can_be_decided(tmp_path, monkeypatch, capsys):
+    """B is better from all five: 2 of 2^5 ways are as far from even, p = .0625; six would give 2 of 2^6, .031."""
+    a = write_evaluation(tmp_path / "a", "me/a", tasks=["00000"])
+    b = write_evaluation(tmp_path / "b", "me/b", tasks=["11111"])
+    policies = compared(monkeypatch, capsys, a, b)["comparisons"][0]["rows"][0]["policies"]
+    assert (policies["p"], policies["detectable"]) == (2 / 32, None)
+    c = write_evaluation(tmp_path / "c", "me/c", tasks=["11101"])
+    row = compared(monkeypatch, capsys, a, c)["comparisons"][0]["rows"][0]
+    assert (row["policies"]["needed"], row["more_episodes"]) == (6, 1)
+
+
 def test_chains_are_paired_by_ordering_and_configuration(tmp_path, monkeypatch, capsys):
     a = write_evaluation(tmp_path / "a", "me/a", chains=[[0, 1, 2], [0, 1, 4]])
     b = write_evaluation(tmp_path / "b", "me/b", chains=[[1, 1, 4], [2, 2, 4]])

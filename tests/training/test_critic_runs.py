@@ -18,7 +18,9 @@ from cronos_lerobot.agents.steering.agent import SteeringAgent
 from cronos_lerobot.processes import Processes
 from cronos_lerobot.protocol.config import CriticConfig, ProtocolConfig
 from cronos_lerobot.protocol.interventions import Intervention
-from cronos_lerobot.protocol.loop_state import SegmentEnd, Step
+from cronos_lerobot.protocol.loop_state import LoopState, SegmentEnd, Step
+from cronos_lerobot.protocol.resets import CriticSceneReset
+from cronos_lerobot.training.critic_log import CriticLog
 from cronos_lerobot.training.seeding import NamedGenerators
 
 # Whatever threads there are wait for work when the test forks.
@@ -118,6 +120,18 @@ def in_processes(folder, minibatch_size, **options):
     cfg = settings(folder, minibatch_size, **options)
     cfg.protocol = critic_protocol(**EVERYTHING | {"reset_budget": 60}, heuristic_reset=True)
     return cfg
+
+
+def test_resets_of_other_strategies_are_not_logged_as_asked_for():
+    log, loop = CriticLog(critic_protocol(**EVERYTHING)), LoopState(2, 1)
+    strategy = CriticSceneReset(np.random.default_rng(0), critic_protocol(**EVERYTHING))
+    for ids in ([0], [1]):
+        end = loop.end_segment()
+        loop.count_intervention(np.array([0, 1]), Intervention.SCENE_RESET)
+        strategy.count(loop, np.array(ids))
+        log.on_segment(end, loop)
+    assert [reset["stream"] for reset in log.pop()["critic"]["resets"]] == [0, 1]
+    assert loop.interventions[:, Intervention.SCENE_RESET].tolist() == [3, 3]
 
 
 def test_two_processes_are_one_run(tmp_path):

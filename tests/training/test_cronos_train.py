@@ -113,7 +113,7 @@ def test_strategy_and_order_of_the_docs(tmp_path):
     output = tmp_path / "run"
     command = [
         "cronos-train", *SMALL, *OBSERVATIONS["state"], "--protocol.discover_packages_path=my_protocol",
-        "--protocol.extra_resets=[stuck]", "--protocol.task_order=weakest_first",
+        "--protocol.extra_resets=[stuck]", "--protocol.task_order=weaker_more_often",
         "--protocol.scene_reset_interval=null", "--protocol.heuristic_reset=true", f"--output_dir={output}",
         "--steps=48",
     ]  # fmt: skip
@@ -216,12 +216,14 @@ def test_what_cannot_be_is_one_line(tmp_path, monkeypatch):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_budget_between_two_updates_is_no_end(tmp_path, monkeypatch):
+def test_a_budget_between_two_updates_is_no_end(tmp_path, monkeypatch, capfd):
     """T = K: the budget of one reset of both streams is spent after half a rollout."""
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     common = (*SMALL, *OBSERVATIONS["state"], "--protocol.scene_reset_interval=4")
     cronos_train(monkeypatch, *common, f"--output_dir={whole}")
+    assert "The run ends after" not in capfd.readouterr().err
     cronos_train(monkeypatch, *common, f"--output_dir={stopped}", "--protocol.reset_budget=2")
+    assert "its 2 interventions reach --protocol.reset_budget=2." in capfd.readouterr().err
     last = (stopped / "checkpoints/last").resolve()
     assert last.name == "000008"
     cronos_train(

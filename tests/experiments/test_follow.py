@@ -1,0 +1,131 @@
+"""What becomes of jobs in a cluster's queue, told by a made-up queue and the jobs' notes."""
+
+import json
+import sys
+
+import pytest
+from tiny_jobs import Tape
+
+from cronos_lerobot.experiments import follow, status
+from cronos_lerobot.experiments.follow import Follower
+from cronos_lerobot.experiments.jobs import Job, write_record
+from cronos_lerobot.experiments.slurm import SlurmError, slurm_folder
+from cronos_lerobot.scripts import reproduce
+
+
+class MadeUpCluster:
+    def log(self, number):
+        return f"{number}.out"
+
+
+def note(job, state, **more):
+    record = {"command": list(job.command), "status": state, "seconds": 60.0, "starts": 1, "made_by": {}}
+    write_record(job, record | more)
+
+
+@pytest.fixture
+def job(tmp_path, monkeypatch):
+    monkeypatch.setattr("cronos_lerobot.experiments.jobs.changed_versions", lambda job: [])
+    made = Job("a", ("python",), tmp_path / "a")
+    made.output.mkdir()
+    return made
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Set by the test [s]."""
+    now = [0.0]
+    monkeypatch.setattr(follow.time, "monotonic", lambda: now[0])
+    return now
+
+
+def make_follower(job, monkeypatch, queue):
+    monkeypatch.setattr(follow, "squeue", lambda: queue)
+    return Follower([job], {"a": "7_0"}, MadeUpCluster(), Tape())
+
+
+def test_a_note_that_comes_late_over_nfs_is_waited_for(job, monkeypatch, clock):
+    queue = {"7_0": ("RUNNING", "None")}
+    follower = make_follower(job, monkeypatch, queue)
+    note(job, "running")
+    assert follower.look() == [job]
+    queue.clear()
+    for clock[0] in (100.0, 105.0, 160.0):
+        assert (follower.look(), follower.states) == ([], {})
+    note(job, "done")
+    follower.look()
+    assert follower.states == {"a": "done"}
+
+
+def test_what_has_left_the_queue_and_is_not_done_has_failed_in_the_end(job, monkeypatch, clock):
+    queue = {}
+    follower = make_follower(job, monkeypatch, queue)
+    note(job, "running")
+    for clock[0] in (0.0, 89.0):
+        follower.look()
+    # Requeued: not in the queue for a moment.
+    queue["7_0"] = ("PENDING", "BeginTime")
+    clock[0] = 91.0
+    assert follower.look() == []
+    queue.clear()
+    for clock[0] in (92.0, 181.0):
+        follower.look()
+    assert follower.states == {}
+    clock[0] = 182.0
+    follower.look()
+    assert follower.states == {"a": "failed"}
+    assert ("a", "left the queue and is not done, see 7_0.out") in follower.display.events
+
+
+LONG = "t4400_eer_lsr_staggered_early_decay_critic_memory_takeover_wide_resets_1300k"
+
+
+def make_root(root, monkeypatch, states, queue):
+    """Seeds 1, 2, ... with a note each, an array's elements of the same numbers, and one that has not begun."""
+    name = f"kitchen_2x2_state_paper/{LONG}/seed"
+    for seed, state in enumerate(states, 1):
+        folder = root / f"runs/{name}{seed}/train"
+        folder.mkdir(parents=True)
+        evaluation = {"kind": "evaluation", "interaction_steps": 10_240, "success": 0.5}
+        (folder / "metrics.jsonl").write_text(json.dumps(evaluation) + "\n")
+        note(Job("", ("cronos-train", "--steps=10240"), folder), state)
+    slurm = slurm_folder(root)
+    slurm.mkdir()
+    submitted = {f"{name}{seed}": f"7_{seed}" for seed in range(1, len(states) + 2)}
+    (slurm / "submitted.json").write_text(json.dumps(submitted))
+    monkeypatch.setattr(status, "squeue", lambda: queue)
+    return name
+
+
+def print_status(root, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["cronos-reproduce", "status", f"--root={root}"])
+    reproduce.main()
+    return capsys.readouterr().out.splitlines()
+
+
+def test_states_are_those_of_the_queue_and_names_are_whole(tmp_path, monkeypatch, capsys):
+    waits, runs = ("PENDING", "BeginTime"), ("RUNNING", "None")
+    notes = ("done", "running", "running", "stopped", "failed", "failed", "running", "running")
+    queue = {f"7_{n}": state for n, state in enumerate((waits, waits, runs, waits, waits, runs), 1)}
+    queue |= {"7_8": ("COMPLETING", "None"), "7_9": ("PENDING", "Dependency")}
+    name = make_root(tmp_path, monkeypatch, notes, queue)
+    lines = print_status(tmp_path, monkeypatch, capsys)
+    rows = [line.split() for line in lines[1:]]
+    assert [row[0] for row in rows] == [f"{name}{seed}" for seed in range(1, 10)]
+    # The seventh has left the queue, and nobody has its lock.
+    words = ["done", "requeued", "running", "requeued", "pending", "failed", "stopped", "completing", "pending"]
+    assert [row[1] for row in rows] == words
+    assert [seed for seed, line in enumerate(lines[1:], 1) if "BeginTime" in line] == [2, 4, 5]
+    assert "Dependency" in lines[9]
+    assert rows[2][2:7] == ["10,240", "/", "10,240", "evaluation", "0.50"]
+    assert "…" not in "".join(lines)
+
+
+def test_without_an_answer_of_the_queue_the_notes_tell(tmp_path, monkeypatch, capsys):
+    make_root(tmp_path, monkeypatch, ("done", "running"), {})
+
+    def silent():
+        raise SlurmError("squeue: no answer")
+
+    monkeypatch.setattr(status, "squeue", silent)
+    assert [line.split()[1] for line in print_status(tmp_path, monkeypatch, capsys)[1:]] == ["done", "stopped"]
