@@ -26,7 +26,7 @@ class RowDifference:
     difference: Difference
     """Of trainings like these where both rows have several seeds, else of these policies."""
     seeds: tuple[int, int]
-    """Runs of the row and of the reference whose last evaluation tells how each episode ended."""
+    """Runs of the row and of the reference that were compared."""
     episodes: int
     """Of each run's last evaluation, paired."""
 
@@ -46,8 +46,13 @@ def compare_rows(result: ExperimentResult) -> list[RowDifference]:
 def compare(
     row: RowResult, reference: RowResult, suite: str = "independent", split: str = "train"
 ) -> RowDifference | None:
-    """A row against another at the end of their runs; None unless all of them ran the same episodes."""
-    sides = [_outcomes(one, suite, split) for one in (reference, row)]
+    """A row against another at the end of their runs; None unless all of them ran the same episodes.
+
+    Of seeds that both have, if there are any: the runs of a seed are made side by side and begin with one clone.
+    """
+    found = [_outcomes(one, suite, split) for one in (reference, row)]
+    shared = [found[0].keys() & found[1].keys() or found[i].keys() for i in (0, 1)]
+    sides = [[some[seed] for seed in some if seed in shared[i]] for i, some in enumerate(found)]
     runs = [one for side in sides for one in side]
     if not all(sides) or len({frozenset(one.lengths) for one in runs}) > 1:
         return None
@@ -71,9 +76,9 @@ def _compare(reference: RowResult, before: list[Outcomes], row: RowResult, after
     return RowDifference(row, reference, difference, seeds, first.pairs)
 
 
-def _outcomes(row: RowResult, suite: str, split: str) -> list[Outcomes]:
-    """How each episode ended, of the finished runs that tell: their own evaluation, or else cronos-eval's."""
-    found = []
+def _outcomes(row: RowResult, suite: str, split: str) -> dict[int, Outcomes]:
+    """How each episode ended, by seed, of the finished runs that tell: their own evaluation, or cronos-eval's."""
+    found: dict[int, Outcomes] = {}
     for seed in row.finished:
         own = (suite, split) == ("independent", "train")
         # Only what the report has read: what another version made is left out there, too.
@@ -82,5 +87,5 @@ def _outcomes(row: RowResult, suite: str, split: str) -> list[Outcomes]:
         # A run may have been evaluated when episodes were not kept.
         with suppress(ValueError):
             folder = seed.spec.evaluation_folder(suite, split, seed.spec.steps)
-            found.append(last_evaluation(seed.run) if own else read_outcomes(folder))
+            found[seed.spec.seed] = last_evaluation(seed.run) if own else read_outcomes(folder)
     return found

@@ -147,8 +147,9 @@ DIFFERENCE_NOTES = (
     "Success of a row minus that of its reference, the first finished row from the same base policy, at the end of"
     " the runs and on the same episodes; 95 % interval and p are those of `cronos-report compare`: of trainings"
     " like these, clustered by training and configuration, or where a row has one seed of these policies alone,"
-    " which says nothing of other trainings. p (Holm) is adjusted for the lines of this table. Not separated is no"
-    " sign that two rows do alike. All pairs of rows that were evaluated on the same episodes are in the CSV file."
+    " which says nothing of other trainings. Of two rows that have seeds in common these alone are compared. p"
+    " (Holm) is adjusted for the lines of this table. Not separated is no sign that two rows do alike. All pairs"
+    " of rows that were evaluated on the same episodes are in the CSV file."
 )
 BUDGET_NOTES = (
     "A number without a mark is measured, by the evaluation at the first policy update at which so many"

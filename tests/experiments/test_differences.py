@@ -33,6 +33,22 @@ def test_rows_are_compared_as_the_report_compares_them(options, tmp_path):
     }  # fmt: skip
 
 
+def test_rows_are_compared_on_the_seeds_that_both_have(options):
+    """Another seed may have begun with another clone: 3 of 8 is compared with the 6 of its own seed."""
+    for row, seed, successes in (("t80", 1, 6), ("t80", 2, 8), ("t1280", 1, 3), ("t1280_eer", 2, 2)):
+        make_run(options, "table1", row, seed, (2, 4, successes))
+    found = [
+        (one.row.row.name, one.reference.row.name, one.difference.value, one.seeds)
+        for one in compare_rows(results(options, "table1"))
+    ]
+    # Without a seed in common all are taken.
+    assert found == [
+        ("t1280", "t80", -0.375, (1, 1)),
+        ("t1280_eer", "t80", -0.75, (1, 1)),
+        ("t1280_eer", "t1280", -0.125, (1, 1)),
+    ]
+
+
 def test_rows_from_other_bases_have_references_of_their_own(options, tmp_path):
     """p is adjusted for all lines of the table; rows of other episodes are not compared."""
     ends = {"t1280_eer": 6, "t1280_eer_critic": 2, "t80_wide": 7, "t1280_eer_wide": 1}

@@ -39,15 +39,15 @@ def test_the_table_by_hand(tmp_path):
     table = make_table(tmp_path)
     assert table.splitlines()[2:] == [
         # An interval of a rate ends at 1.
-        "| episodic: a reset every 80 steps | 3,840 | 0.750 ± 0.100 [0.500, 1.000] | 0.900 ± 0.050 [0.700, 1.000] "
-        "| 3 |  |",
-        "| a reset every 1280 steps | 192 | 0.500 [0.450, 0.550] |  | 1 "
+        "| episodic: a reset every 80 steps | 3,840 | 0.400 | 0.750 ± 0.100 [0.500, 1.000] "
+        "| 0.900 ± 0.050 [0.700, 1.000] | 3 |  |",
+        "| a reset every 1280 steps | 192 | 0.400 | 0.500 [0.450, 0.550] |  | 1 "
         "| -0.250 [-0.500, +0.000], these policies |",
         # From another base, with which the first row does not compare.
         "| episodic, from a base that was shown reset tasks as well, in more demonstrations | 3,840 "
-        "| 0.800 ± 0.000 |  | 2 |  |",
+        "| 0.300 | 0.800 ± 0.000 |  | 2 |  |",
         "",
-        "307,200 interaction steps; before training 0.400 and 0.300; n = 256 for each seed.",
+        "307,200 interaction steps; n = 256 for each seed.",
     ]
     readme = f"# Title\n\n{README.begin}\nold\n{README.end}\n\nmore\n"
     assert README.rewrite(readme, table) == f"# Title\n\n{README.begin}\n{table}\n{README.end}\n\nmore\n"
