@@ -11,6 +11,7 @@ from cronos_lerobot.experiments.orders import Order
 from cronos_lerobot.experiments.results import APART, AtBudget, ExperimentResult
 from cronos_lerobot.protocol.metrics import Summary
 from cronos_lerobot.report.paired import ALPHA, holm
+from cronos_lerobot.report.series import segment_rates, segment_spans
 from cronos_lerobot.report.statistics import Rate
 
 MISSING = "–"
@@ -153,13 +154,15 @@ def sequential_columns(rows: list[dict[str, Any]]) -> Columns:
 
 def segment_columns(result: ExperimentResult) -> Columns:
     """Success while training, by segment since the last scene reset."""
-    rates = {(row["row"], row["segment"]): row["success"] for row in tables.segment_rows(result)}
-    if not rates:
-        return {}
     rows = [row for row in result.rows if row.seeds]
+    spans = [segment_spans(segment_rates(row.group)) for row in rows]
+    if not any(spans):
+        return {}
     columns: Columns = {"": [row.row.label for row in rows]}
-    for segment in sorted({segment for _, segment in rates}):
-        columns[str(segment + 1)] = [_number(rates.get((row.row.name, segment)), 2) for row in rows]
+    for first, last in sorted({span for some in spans for span in some}):
+        rates = [some.get((first, last)) for some in spans]
+        title = str(first) if first == last else f"{first} to {last}"
+        columns[title] = [_number(rate.value if rate else None, 2) for rate in rates]
     return columns
 
 

@@ -6,11 +6,18 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from cronos_lerobot.experiments.definitions import INTERACTION_STEPS, INTERVENTIONS
 from cronos_lerobot.experiments.results import ExperimentResult, RowResult, paper_results, sequential
-from cronos_lerobot.report.figures import COLORS, INK, SPLIT_LABELS, draw_curve, style_axes
+from cronos_lerobot.report.figures import (
+    COLORS,
+    INK,
+    SPLIT_LABELS,
+    draw_curve,
+    segment_curve,
+    style_axes,
+    style_segment_axis,
+)
 from cronos_lerobot.report.series import Curve, mean_curve, segment_rates
 
 AXIS_LABELS = {INTERACTION_STEPS: "interaction steps, all streams", INTERVENTIONS: "interventions, all streams"}
@@ -135,12 +142,8 @@ def segments_figure(result: ExperimentResult) -> Figure | None:
     ax = figure.subplots()
     for i, row in enumerate(result.rows):
         if rates := segment_rates(row.group):
-            ends = np.array([rate.interval for rate in rates.values()])
-            y = np.array([rate.value for rate in rates.values()])
-            curve = Curve(np.array(list(rates)) + 1, y, ends[:, 0], ends[:, 1], is_band_over_seeds=False)
-            draw_curve(ax, curve, i, row_label(row), marker="o")
-    style_axes(ax, "segment since the last scene reset (1 is the first after it)")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+            draw_curve(ax, segment_curve(rates), i, row_label(row), marker="o")
+    style_segment_axis(ax)
     ax.set(ylabel="success while training", ylim=(0, 1.02))
     if not ax.lines:
         return None

@@ -12,12 +12,15 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from cronos_lerobot.report.runs import Group, agent_metrics
 from cronos_lerobot.report.series import (
+    SINGLE,
     Curve,
     evaluation_curve,
     segment_history,
     segment_rates,
+    segment_spans,
     update_curve,
 )
+from cronos_lerobot.report.statistics import Rate
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")
 """Okabe and Ito's palette: told apart by the colour-blind too."""
@@ -80,18 +83,30 @@ def segments_figure(groups: list[Group]) -> Figure | None:
     figure = Figure(figsize=(10, 3.2), layout="constrained")
     ax = figure.subplots()
     for i, group in enumerate(groups):
-        rates = segment_rates(group)
-        if not rates:
-            continue
-        intervals = np.array([rate.interval for rate in rates.values()])
-        y = np.array([rate.value for rate in rates.values()])
-        curve = Curve(np.array(list(rates)) + 1, y, intervals[:, 0], intervals[:, 1], is_band_over_seeds=False)
-        draw_curve(ax, curve, i, _label(group), marker="o")
-    style_axes(ax, "segment since the last scene reset (1 is the first after it)")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        if rates := segment_rates(group):
+            draw_curve(ax, segment_curve(rates), i, _label(group), marker="o")
+    style_segment_axis(ax)
     ax.set(ylabel="success of training segments", ylim=(0, 1.02))
     _legend(figure, [ax], groups)
     return figure if ax.lines else None
+
+
+def segment_curve(rates: dict[int, Rate]) -> Curve:
+    """Success by segment, a point for each of `segment_spans`."""
+    spans = segment_spans(rates)
+    ends = np.array([rate.interval for rate in spans.values()])
+    x, y = np.array([np.mean(span) for span in spans]), np.array([rate.value for rate in spans.values()])
+    return Curve(x, y, ends[:, 0], ends[:, 1], is_band_over_seeds=False)
+
+
+def style_segment_axis(ax: Axes) -> None:
+    """The axis of a `segment_curve`: by doublings where spans double."""
+    style_axes(ax, "segment since the last scene reset (1 is the first after it)")
+    if ax.lines and ax.dataLim.xmax > SINGLE:
+        ax.set_xscale("log", base=2)
+        ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    else:
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def segment_history_figure(groups: list[Group]) -> Figure | None:

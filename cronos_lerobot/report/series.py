@@ -74,6 +74,25 @@ def segment_rates(group: Group, last_part: float = LAST_PART) -> dict[int, Rate]
     return dict(sorted(rates.items()))
 
 
+SINGLE = 16
+"""Segments since a scene reset that are shown one by one: all that T = 1280 has."""
+
+
+def segment_spans(rates: dict[int, Rate]) -> dict[tuple[int, int], Rate]:
+    """The rates of `segment_rates` as they are read: by (first, last) segment, counted from 1.
+
+    Few streams come to the hundredth segment at the same time, and nobody reads a hundred columns: from the 17th
+    on they are taken together in spans that double, 17 to 32, 33 to 64 and so on.
+    """
+    spans: dict[tuple[int, int], Rate] = {}
+    for position, rate in rates.items():
+        number = position + 1
+        first = number if number <= SINGLE else 2 ** ((number - 1).bit_length() - 1) + 1
+        span = (first, number if number <= SINGLE else 2 * (first - 1))
+        spans[span] = spans.get(span, Rate(0, 0)) + rate
+    return spans
+
+
 def task_rates(group: Group, parts: int = 4) -> dict[tuple[int, str], Rate]:
     """Success while training by part of the run (0 is the first) and instruction, learned resets' among them."""
     rates: dict[tuple[int, str], Rate] = {}

@@ -6,6 +6,8 @@ from synthetic_runs import read_csv, write_training_run
 from cronos_lerobot.report.figures import agent_figure
 from cronos_lerobot.report.page import write_report
 from cronos_lerobot.report.runs import find_runs, group_runs
+from cronos_lerobot.report.series import segment_spans
+from cronos_lerobot.report.statistics import Rate
 from cronos_lerobot.scripts.report import make_report
 
 
@@ -48,3 +50,14 @@ def test_run_without_evaluations_or_finished_updates(tmp_path):
     (run / "metrics.jsonl").write_text(lines[0])
     page = write_report(make_report([run]), tmp_path / "no_update").read_text()
     assert page.count("<img") == 1
+
+
+def test_segments_are_one_by_one_and_then_in_spans_that_double():
+    """T = 1280 has 16; of 40, 17 to 32 go together, and what there is of 33 to 64."""
+    rates = {position: Rate(1, 2) for position in range(40)}
+    spans = segment_spans(rates)
+    assert list(spans) == [*((n, n) for n in range(1, 17)), (17, 32), (33, 64)]
+    assert [(rate.successes, rate.n) for rate in spans.values()] == [(1, 2)] * 16 + [(16, 32), (8, 16)]
+    assert list(segment_spans({16: Rate(0, 1), 31: Rate(1, 1), 32: Rate(1, 1), 64: Rate(0, 3)})) == [
+        (17, 32), (33, 64), (65, 128),
+    ]  # fmt: skip
