@@ -88,11 +88,18 @@ def test_every_flag_is_there():
     assert documented == flags
 
 
-def test_the_page_is_drawn_anew_by_the_command_beside_the_archives():
-    page = Path(__file__).parents[2] / "docs/results/few_resets_best_paper_state/few_resets_best.json"
-    command = DOCS[DOCS.index("  cronos-reproduce few_resets_best --scale=paper --report_only") :].split("```")[0]
-    rows = command.replace("\\\n", " ").split("--rows")[1].split()
-    assert rows == [row["row"] for row in json.loads(page.read_text())["rows"]]
+def test_pages_are_drawn_anew_by_the_commands_beside_the_archives():
+    block = DOCS[DOCS.index("  cronos-reproduce table1 --scale=small --report_only") :].split("```")[0]
+    commands = [line.split() for line in block.replace("\\\n", " ").splitlines() if line.strip()]
+    pages = {page.stem: page for page in (Path(__file__).parents[2] / "docs/results").glob("*/*.json")}
+    assert [command[1] for command in commands] == ["table1", "few_resets_best", "few_resets_budgets"]
+    for command in commands:
+        rows = command[command.index("--rows") + 1 :] if "--rows" in command else names(command[1])
+        assert rows == [row["row"] for row in json.loads(pages[command[1]].read_text())["rows"]]
+
+
+def names(experiment):
+    return [row.name for row in EXPERIMENTS[experiment].rows]
 
 
 def test_plugs():
