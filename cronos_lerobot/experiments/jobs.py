@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import fcntl
+import hashlib
+import importlib.util
 import json
 import os
 import shutil
@@ -16,6 +18,10 @@ from cronos_lerobot.provenance import git_commit, package_versions
 
 RUNNING, STOPPED = "running", "stopped"
 BASE, RUN, EVALUATION = "base", "run", "evaluation"
+PLUGIN_FLAG = "discover_packages_path"
+"""Of LeRobot's commands: imports a module that registers policies or environments."""
+PLUGIN = "the module "
+"""In a note, before the name of a module that the command imports."""
 
 
 @dataclass(frozen=True)
@@ -209,16 +215,40 @@ def changed_versions(job: Job) -> list[str]:
     if "made_by" not in record:
         return ["its note does not say which versions made it, as those of version 0"]
     old, new = record["made_by"], made_by(job)
+    # A report needs no plugin, and notes have not always named them.
+    known = [name for name in (*old, *new) if not name.startswith(PLUGIN) or (name in old and name in new)]
     return [
         f"{name} {old.get(name, 'none')} there, {new.get(name, 'none')} here"
-        for name in dict.fromkeys((*old, *new))
+        for name in dict.fromkeys(known)
         if old.get(name) != new.get(name)
     ]
 
 
 def made_by(job: Job) -> dict[str, str]:
-    """What decides a job's output besides its command: versions of packages, and the id of the environment."""
-    return this_version() | {"environment": job.environment}
+    """What decides a job's output besides its command.
+
+    Versions of packages, the id of the environment, and hashes of the modules that its flags import: a reset
+    strategy of a user's has no version.
+    """
+    flags = (flag.partition("=") for flag in job.command)
+    plugins = {value for name, _, value in flags if name.endswith(PLUGIN_FLAG)}
+    hashes = {f"{PLUGIN}{name}": found for name in sorted(plugins) if (found := _source_hash(name))}
+    return this_version() | {"environment": job.environment} | hashes
+
+
+def _source_hash(module: str) -> str | None:
+    """A short hash of a module's Python files; None where it cannot be found."""
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        return None
+    if spec is None or spec.origin is None:
+        return None
+    origin = Path(spec.origin)
+    digest = hashlib.sha256()
+    for file in sorted(origin.parent.rglob("*.py")) if spec.submodule_search_locations else [origin]:
+        digest.update(file.name.encode() + file.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def other_commits(job: Job) -> list[str]:

@@ -18,7 +18,7 @@ from cronos_lerobot.experiments.definitions import (
     Experiment,
     Row,
 )
-from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job
+from cronos_lerobot.experiments.jobs import BASE, EVALUATION, PLUGIN_FLAG, Job
 from cronos_lerobot.experiments.progress import train_progress
 from cronos_lerobot.experiments.scales import ALGORITHM_FLAGS, OBS_NAMES
 from cronos_lerobot.experiments.specs import (
@@ -31,8 +31,6 @@ from cronos_lerobot.experiments.specs import (
     run_specs,
 )
 
-PLUGIN_FLAG = "discover_packages_path"
-"""Of LeRobot's commands: imports a module that registers policies or environments."""
 LAST_POLICY = Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR)
 
 

@@ -1,7 +1,9 @@
 """The runner with tiny real commands: order, skipping, resuming, failing, stopping."""
 
 import fcntl
+import importlib
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -208,6 +210,26 @@ def test_output_of_another_version_is_not_taken_for_done(tmp_path, monkeypatch, 
     del record["made_by"]
     job.record.write_text(json.dumps(record))
     assert changes(job) == ["its note does not say which versions made it, as those of version 0"]
+
+
+def test_runs_of_an_edited_plugin_are_not_taken_for_those_of_todays(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    package = tmp_path / "a_strategy_of_mine"
+    package.mkdir()
+    (package / "__init__.py").write_text("from a_strategy_of_mine.rule import K\n")
+    (package / "rule.py").write_text("K = 3\n")
+    job = count_job(tmp_path, "a")
+    job = replace(job, command=(*job.command, "--protocol.discover_packages_path=a_strategy_of_mine"))
+    run([job])
+    assert is_done(job)
+    (package / "rule.py").write_text("K = 2\n")
+    (change,) = changes(job)
+    assert re.fullmatch(r"the module a_strategy_of_mine [0-9a-f]{16} there, [0-9a-f]{16} here", change)
+    assert not is_done(job)
+    # A report elsewhere does without it.
+    shutil.rmtree(package)
+    importlib.invalidate_caches()
+    assert is_done(job)
 
 
 def test_another_commit_alone_is_only_noted(tmp_path, monkeypatch):
