@@ -17,6 +17,10 @@ SHORT, LONG = 1_300_000, 2_900_000
 Sections 6.5 and 6.7."""
 
 
+PACED = "--protocol.scene_reset=critic"
+"""With it a budget is paced over the whole run and does not end it."""
+
+
 @dataclass(frozen=True)
 class Row:
     """One way of training: a row of the table, a line of the figure."""
@@ -77,9 +81,9 @@ class Row:
 
     @property
     def has_budget(self) -> bool:
-        """Whether a budget of interventions may end its runs before their last step."""
+        """Whether a budget of interventions may end its runs before their last step: one that is not paced."""
         given = (*self.flags, *(name for name, _ in self.budgets))
-        return any(flag.split("=")[0] == "--protocol.reset_budget" for flag in given)
+        return PACED not in given and any(flag.split("=")[0] == "--protocol.reset_budget" for flag in given)
 
     @property
     def aids(self) -> list[str]:

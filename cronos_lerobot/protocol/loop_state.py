@@ -205,6 +205,9 @@ class LoopState:
             if isinstance(template, np.ndarray):
                 value = np.asarray(value, template.dtype).reshape(template.shape)
             setattr(loop, name, value)
+        if "asked_resets" not in state:
+            # Older checkpoints told all scene resets of a run that asks for them as asked for.
+            loop.asked_resets = loop.interventions[:, Intervention.SCENE_RESET].copy()
         return loop
 
 

@@ -147,14 +147,26 @@ def read_side(folders: Sequence[Path]) -> Side:
 
 
 def _as_long(runs: Sequence[TrainingRun], notes: list[str]) -> list[TrainingRun]:
-    """The runs whose last evaluation comes as late as that of the longest; the others are not at their end."""
+    """The runs whose last evaluation comes as late as that of the longest; the others are not at their end.
+
+    A run that has spent its reset budget is at its end wherever that is.
+    """
     ends = [run.evaluations[-1]["interaction_steps"] if run.evaluations else 0 for run in runs]
+    kept = []
     for run, end in zip(runs, ends, strict=True):
-        if end < max(ends):
+        if end == max(ends) or _has_spent_its_budget(run):
+            kept.append(run)
+        else:
             notes.append(
-                f"{run.folder}: its last evaluation is after {end:,} steps, another's after {max(ends):,}"
+                f"the own evaluations of {run.folder}: the last is after {end:,} steps, another's after "
+                f"{max(ends):,}"
             )
-    return [run for run, end in zip(runs, ends, strict=True) if end == max(ends)]
+    return kept
+
+
+def _has_spent_its_budget(run: TrainingRun) -> bool:
+    budget = (run.config.get("protocol") or {}).get("reset_budget")
+    return budget is not None and bool(run.evaluations) and run.evaluations[-1]["interventions"] >= budget
 
 
 def _keep(notes: list[str], read: Any) -> None:

@@ -48,7 +48,8 @@ def publish_benchmark(config: BenchmarkConfig) -> None:
     tag = benchmark_tag(config)
     _publish(config, write_benchmark_repository, replaces=REPLACES, tag=tag)
     if not config.dry_run:
-        print(f"{config.repo_id}@{tag} is this benchmark, in --env.benchmark and in LeRobot's make_env")
+        where = "--env.benchmark" + " and in LeRobot's make_env" * config.env_hub
+        print(f"{config.repo_id}@{tag} is this benchmark, in {where}")
 
 
 def publish_stream(config: StreamConfig) -> None:

@@ -242,19 +242,16 @@ def base_changes(args: argparse.Namespace) -> dict[str, int]:
     return changes
 
 
-PACED = "--protocol.scene_reset=critic"
-"""With it a budget is paced over the whole run and does not end it."""
-
-
 def check_budget(chosen: list[tuple[Experiment, tuple[Row, ...]]], options: Options) -> None:
-    """Refuse a reset budget where checkpoints are evaluated that it may keep a run from.
+    """Refuse a reset budget for all rows where checkpoints are evaluated that it may keep a run from.
+
+    A row's own is another matter: `Row.has_budget`.
 
     Raises:
         ValueError: there is one.
     """
-    for experiment, rows in chosen:
-        flags = [*options.extra, *(flag for row in rows if PACED not in row.flags for flag in row.flags)]
-        if experiment.evaluations and any(flag.startswith("--protocol.reset_budget") for flag in flags):
+    for experiment, _ in chosen:
+        if experiment.evaluations and any(flag.startswith("--protocol.reset_budget") for flag in options.extra):
             raise ValueError(
                 f"--protocol.reset_budget ends runs early, and {experiment.name} evaluates their checkpoints at"
                 " fixed steps; experiments without such evaluations take it, table1 for example"
@@ -267,7 +264,8 @@ def check_runs(jobs: list[Job], options: Options) -> None:
     from cronos_lerobot.scripts.errors import error_line
 
     with error_line():
-        check_commands(jobs, None if options.policy_path else BASE_POLICY)
+        waiting = [job for job in jobs if not is_done(job)]
+        check_commands(waiting, None if options.policy_path else BASE_POLICY)
 
 
 def print_list() -> None:

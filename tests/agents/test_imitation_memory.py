@@ -213,16 +213,22 @@ def test_a_dataset_of_another_shape_is_refused(dataset_root):
 
 
 def test_a_dataset_that_is_not_there_is_named(dataset_root, monkeypatch):
-    root = dataset_root.with_name("datasset")
-    with pytest.raises(FileNotFoundError, match=rf"demos\.root={root}: no LeRobotDataset in {root}\.$"):
-        Demonstrations(DemosConfig("me/demos", root), policy_config("act"))
-
     def unreachable(*args, **kwargs):
         raise httpx.ConnectError("[Errno -2] Name or service not known")
 
     monkeypatch.setattr(batches, "LeRobotDatasetMetadata", unreachable)
-    with pytest.raises(FileNotFoundError, match=r"demos\.repo_id=me/none: no such .* the Hub \(ConnectError\)"):
+    # LeRobot downloads into a root what is not there, so the Hub is asked in either case.
+    root = dataset_root.with_name("datasset")
+    with pytest.raises(
+        FileNotFoundError, match=rf"no LeRobotDataset in --algorithm\.demos\.root={root} .*ConnectE"
+    ):
+        Demonstrations(DemosConfig("me/demos", root), policy_config("act"))
+    with pytest.raises(
+        FileNotFoundError, match=r"me/none: no LeRobotDataset on this machine, .* \(ConnectError\)"
+    ):
         Demonstrations(DemosConfig("me/none"), policy_config("act"))
+    with pytest.raises(FileNotFoundError, match=rf"demos\.root={dataset_root} cannot be read: "):
+        Demonstrations(DemosConfig("me/demos", dataset_root), policy_config("act"))
 
 
 @pytest.mark.parametrize(

@@ -160,7 +160,12 @@ def test_a_run_that_did_not_come_as_far_is_left_out(tmp_path, monkeypatch, capsy
     found = compared(monkeypatch, capsys, a, tmp_path / "b")
     assert found["comparisons"][0]["b"] == ["seed1 0010240", "seed3 0010240"]
     (note,) = found["left_out"]
-    assert note.endswith("b/seed2: its last evaluation is after 5,120 steps, another's after 10,240")
+    assert note.endswith("b/seed2: the last is after 5,120 steps, another's after 10,240")
+    # Runs that their budget ended are at their end.
+    for seed, steps in ((1, 10240), (2, 5120)):
+        write_run(tmp_path / f"c/seed{seed}", seed, ["1111", "0000"], steps=steps, reset_budget=0)
+    found = compared(monkeypatch, capsys, a, tmp_path / "c")
+    assert (len(found["comparisons"][0]["b"]), found["left_out"]) == (2, [])
 
 
 def test_runs_without_a_cronos_eval_are_not_dropped_for_those_that_have_one(tmp_path, monkeypatch, capsys):

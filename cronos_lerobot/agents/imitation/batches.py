@@ -95,16 +95,19 @@ class Demonstrations:
 
 def _open_metadata(config: DemosConfig) -> LeRobotDatasetMetadata:
     assert config.repo_id is not None
-    # LeRobot looks for it on the Hub, too, and fails there with a long traceback.
-    if config.root is not None and not (config.root / INFO_PATH).is_file():
-        folder = config.root.absolute()
-        raise FileNotFoundError(f"--algorithm.demos.root={config.root}: no LeRobotDataset in {folder}.")
     try:
         return LeRobotDatasetMetadata(config.repo_id, root=config.root)
     except (OSError, httpx.HTTPError) as error:
+        folder = config.root
+        if folder is not None and (folder / INFO_PATH).is_file():
+            raise FileNotFoundError(f"--algorithm.demos.root={folder} cannot be read: {error}") from error
+        # What is not in the folder LeRobot downloads into it.
+        where = (
+            "on this machine" if folder is None else f"in --algorithm.demos.root={folder} ({folder.absolute()})"
+        )
         raise FileNotFoundError(
-            f"--algorithm.demos.repo_id={config.repo_id}: no such dataset on this machine, and none came from the "
-            f"Hub ({type(error).__name__}); --algorithm.demos.root names a folder."
+            f"--algorithm.demos.repo_id={config.repo_id}: no LeRobotDataset {where}, and none came from the Hub "
+            f"({type(error).__name__})."
         ) from error
 
 
