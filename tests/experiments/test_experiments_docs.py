@@ -92,7 +92,12 @@ def test_pages_are_drawn_anew_by_the_commands_beside_the_archives():
     block = DOCS[DOCS.index("  cronos-reproduce table1 --scale=small --report_only") :].split("```")[0]
     commands = [line.split() for line in block.replace("\\\n", " ").splitlines() if line.strip()]
     pages = {page.stem: page for page in (Path(__file__).parents[2] / "docs/results").glob("*/*.json")}
-    assert [command[1] for command in commands] == ["table1", "few_resets_best", "few_resets_budgets"]
+    assert [command[1] for command in commands] == [
+        "table1",
+        "few_resets_playroom_2x2",
+        "few_resets_best",
+        "few_resets_budgets",
+    ]
     for command in commands:
         rows = command[command.index("--rows") + 1 :] if "--rows" in command else names(command[1])
         assert rows == [row["row"] for row in json.loads(pages[command[1]].read_text())["rows"]]
