@@ -11,6 +11,7 @@ from slurm_cluster import SlurmCluster, missing
 
 from cronos_lerobot.experiments.follow import Follower
 from cronos_lerobot.experiments.jobs import BASE, EVALUATION, RUN, Job, read_record, write_record
+from cronos_lerobot.experiments.runner import ENDING_SIGNALS
 from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, Task, plan_arrays, read_submitted
 
 needs_slurm = pytest.mark.skipif(
@@ -105,6 +106,16 @@ def test_a_time_limit_that_leaves_nothing_to_go_on_with_ends_the_job(tmp_path, c
         assert [j.name for j in again.checkpoint().function.jobs] == ["anew"]
 
 
+@pytest.fixture
+def signals_as_before():
+    """A runner that is stopped ignores what would end its process, which is about to end; this one goes on."""
+    before = {number: signal.getsignal(number) for number in ENDING_SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("signals_as_before")
 @pytest.mark.parametrize(("demos_done_before", "is_requeued"), [(False, True), (True, False)])
 def test_a_time_limit_that_finished_the_demonstrations_leaves_the_cloning(
     tmp_path, demos_done_before, is_requeued
