@@ -51,8 +51,8 @@ def compare(
     Of seeds that both have, if there are any: the runs of a seed are made side by side and begin with one clone.
     """
     found = [_outcomes(one, suite, split) for one in (reference, row)]
-    shared = [found[0].keys() & found[1].keys() or found[i].keys() for i in (0, 1)]
-    sides = [[some[seed] for seed in some if seed in shared[i]] for i, some in enumerate(found)]
+    shared = found[0].keys() & found[1].keys()
+    sides = [[some[seed] for seed in some if seed in shared or not shared] for some in found]
     runs = [one for side in sides for one in side]
     if not all(sides) or len({frozenset(one.lengths) for one in runs}) > 1:
         return None

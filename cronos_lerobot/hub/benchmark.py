@@ -51,13 +51,8 @@ def choose_benchmark(config: BenchmarkConfig) -> Benchmark:
     return load_benchmark(None, config.scene or DEFAULT_SCENE)
 
 
-def write_benchmark_repository(config: BenchmarkConfig, folder: Path) -> str:
-    """Write the tree of a benchmark's repository into `folder`; returns what it is, in words.
-
-    Raises:
-        ValueError: the benchmark cannot be loaded or drawn.
-    """
-    benchmark = choose_benchmark(config)
+def write_benchmark_repository(config: BenchmarkConfig, folder: Path, benchmark: Benchmark) -> str:
+    """Write the tree of the repository of a benchmark, that of the config, into `folder`; returns what it is."""
     pictures = configuration_pictures(benchmark) if config.pictures else None
     for (name, split), table in make_tables(benchmark).items():
         path = folder / name / f"{split}.parquet"
@@ -74,15 +69,6 @@ def write_benchmark_repository(config: BenchmarkConfig, folder: Path) -> str:
     (folder / "README.md").write_text(_card(benchmark, config, title))
     sizes = ", ".join(f"{benchmark.size(suite, 'held_out')} {suite}" for suite in SUITES)
     return f"{benchmark.scene.name} ({sizes} in held_out; fingerprint {benchmark.fingerprint})"
-
-
-def benchmark_tag(config: BenchmarkConfig) -> str:
-    """The tag of a benchmark in all repositories that hold it: what decides a result is in its fingerprint.
-
-    Raises:
-        ValueError: the benchmark cannot be loaded or drawn.
-    """
-    return f"benchmark-{choose_benchmark(config).fingerprint}"
 
 
 def _describe(table: pa.Table, pictures: list[bytes] | None) -> pa.Table:

@@ -18,7 +18,6 @@ MAX_FAILURES = 16
 
 RESET_PHASES = ("together", "staggered")
 SCENE_RESETS = ("periodic", "critic")
-SCENE_RESET_INTERVAL = 1280
 VALUELESS_ORDERS = ("heuristic", "random")
 """Task orders that ask for no values; those of a user's may."""
 
@@ -59,7 +58,7 @@ class ProtocolConfig:
     """K: control steps of one stream between two task switches, the length of a segment."""
     update_interval: int = 160
     """U: control steps of each stream between two policy updates; a multiple of K."""
-    scene_reset_interval: int | None = SCENE_RESET_INTERVAL
+    scene_reset_interval: int | None = 1280
     """T (H in Algorithm 1): control steps of one stream between two scene resets; a multiple of K.
     80 is episodic training, null never resets the scene."""
     curriculum: list[tuple[int, int]] = field(default_factory=list)
@@ -147,7 +146,7 @@ class ProtocolConfig:
                 "protocol.scene_reset=critic there are none: leave them out."
             )
         # The default cannot be told from one that was given.
-        if self.scene_reset_interval not in (None, SCENE_RESET_INTERVAL):
+        if self.scene_reset_interval not in (None, ProtocolConfig.scene_reset_interval):
             raise ValueError(
                 f"protocol.scene_reset_interval={self.scene_reset_interval} is for periodic scene resets; with "
                 "protocol.scene_reset=critic there are none: leave it out, or give null."
@@ -160,10 +159,11 @@ class ProtocolConfig:
         if self.takeover_price < 1:
             raise ValueError(f"protocol.takeover_price must be >= 1, got {self.takeover_price}.")
         if self.takeover_after is None:
-            for name, default in (("budget", None), ("price", 1), ("expert", "scripted")):
-                if (value := getattr(self, f"takeover_{name}")) != default:
+            for name in ("takeover_budget", "takeover_price", "takeover_expert"):
+                value, default = getattr(self, name), getattr(ProtocolConfig, name)
+                if value != default:
                     raise ValueError(
-                        f"protocol.takeover_{name}={value} is for takeovers, and there are none without "
+                        f"protocol.{name}={value} is for takeovers, and there are none without "
                         f"protocol.takeover_after: give that, as 2, or leave this at {default or 'null'}."
                     )
         if self.takeover_budget is not None and self.takeover_budget < self.takeover_price:

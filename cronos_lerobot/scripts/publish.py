@@ -26,6 +26,7 @@ goes on with what is missing. `cronos-publish policy --help` has the flags of a 
 import sys
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,14 +40,15 @@ from cronos_lerobot.scripts.subcommands import run_subcommand
 def publish_benchmark(config: BenchmarkConfig) -> None:
     """`cronos-publish benchmark`."""
     config.validate()
-    from cronos_lerobot.hub.benchmark import ENV_FILE, REPLACES, benchmark_tag, write_benchmark_repository
+    from cronos_lerobot.hub.benchmark import ENV_FILE, REPLACES, choose_benchmark, write_benchmark_repository
 
     if not config.dry_run:
         for target in config.targets[1:]:
             check_holds(target, ENV_FILE)
     # The data and what runs it are two repositories: one name for both, whatever their commits are called.
-    tag = benchmark_tag(config)
-    _publish(config, write_benchmark_repository, replaces=REPLACES, tag=tag)
+    benchmark = choose_benchmark(config)
+    tag = f"benchmark-{benchmark.fingerprint}"
+    _publish(config, partial(write_benchmark_repository, benchmark=benchmark), replaces=REPLACES, tag=tag)
     if not config.dry_run:
         where = "--env.benchmark" + " and in LeRobot's make_env" * config.env_hub
         print(f"{config.repo_id}@{tag} is this benchmark, in {where}")

@@ -194,10 +194,14 @@ def test_results_of_version_0_are_named_and_left_out(options):
     assert (row["success_train_mean"], row["success_held_out_mean"]) == (0.75, None)
 
 
-def test_run_that_its_reset_budget_ended_early_counts(options):
+def test_run_that_its_reset_budget_ended_early_counts_and_is_named(options, tmp_path):
     make_run(options, "table1", "t80", 1, (2, 4, 6), updates=4)
+    make_run(options, "table1", "t1280", 1, (2, 4, 6))
     row = by_row(tables.main_rows(results(options, "table1")))["t80"]
     assert (row["seeds"], row["success_train_mean"], row["interventions_mean"]) == (1, 0.75, RESETS[80] / 2)
+    text = write_outputs(EXPERIMENTS["table1"], EXPERIMENTS["table1"].rows, options, tmp_path / "out")
+    early = text.split("## Ended by their budget of interventions\n\n")[1].split("\n\n")[0]
+    assert early.strip() == "- kitchen_2x2_state_small/t80_10k/seed1: after 5,120 of 10,240 steps"
 
 
 def evaluation(success, n=8):
@@ -257,16 +261,6 @@ def test_sequences(options, tmp_path):
         in text
     )
     assert (tmp_path / "out/figure5_sequential.png").exists()
-
-
-def test_runs_that_their_budget_ended_are_named(options, tmp_path):
-    make_run(options, "table1", "t80", 1, (2, 4, 5))
-    rows = EXPERIMENTS["table1"].rows
-    title = "## Ended by their budget of interventions"
-    assert title not in write_outputs(EXPERIMENTS["table1"], rows, options, tmp_path / "out")
-    make_run(options, "table1", "t1280", 1, (2, 4, 4), updates=4)
-    text = write_outputs(EXPERIMENTS["table1"], rows, options, tmp_path / "out")
-    assert f"{title}\n\n- kitchen_2x2_state_small/t1280_10k/seed1: after 5,120 of 10,240 steps\n" in text
 
 
 def test_files_of_table1(options, tmp_path):
