@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from cronos_lerobot.experiments import tables
-from cronos_lerobot.experiments.differences import RowDifference
+from cronos_lerobot.experiments.differences import Gain, RowDifference
 from cronos_lerobot.experiments.orders import Order
 from cronos_lerobot.experiments.results import APART, AtBudget, ExperimentResult
 from cronos_lerobot.protocol.metrics import Summary
@@ -55,6 +55,26 @@ def main_columns(result: ExperimentResult) -> Columns:
         title = f"C up to {shared:,}"
         columns[title] = [_cell(row.gap("interventions", up_to=shared)) for row in result.rows]
     return columns
+
+
+def gain_columns(found: Sequence[Gain]) -> Columns:
+    """Success before and after, the gain with its interval, and a word."""
+    if not found:
+        return {}
+    ps = [one.difference.p for one in found]
+    adjusted = holm([1.0 if p is None else p for p in ps])
+    return {
+        "": [one.row.row.label for one in found],
+        "before": [_number(one.before, 3) for one in found],
+        "at the end": [_number(one.after, 3) for one in found],
+        "gain": [f"{one.difference.value:+.3f}" for one in found],
+        "95 %": [_signed_interval(one.difference.ci95) for one in found],
+        "p": [MISSING if p is None else f"{p:.2g}" for p in ps],
+        "p (Holm)": [f"{p:.2g}" for p in adjusted],
+        "seeds": [str(one.seeds) for one in found],
+        "of": [_of(one) for one in found],
+        "verdict": [_verdict(one.difference.value, p) for one, p in zip(found, adjusted, strict=True)],
+    }
 
 
 def difference_columns(found: Sequence[RowDifference]) -> Columns:
@@ -124,7 +144,7 @@ def order_columns(orders: Sequence[Order]) -> Columns:
     }
 
 
-def _of(found: RowDifference) -> str:
+def _of(found: RowDifference | Gain) -> str:
     return "trainings" if found.of_trainings else "these policies"
 
 

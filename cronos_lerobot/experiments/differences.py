@@ -7,10 +7,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
 
+import numpy as np
+
 from cronos_lerobot.evaluation.outcomes import Outcomes, read_outcomes, what_differs
 from cronos_lerobot.experiments.results import ExperimentResult, RowResult
-from cronos_lerobot.report.compared_sides import Side, last_evaluation
-from cronos_lerobot.report.paired import Difference
+from cronos_lerobot.report.compared_sides import Side, last_evaluation, paired_episodes, periodic_evaluation
+from cronos_lerobot.report.paired import Difference, Pairs, compare_policies, compare_trainings
 from cronos_lerobot.report.paired_report import compare_sides
 
 POWER = 0.8
@@ -34,6 +36,52 @@ class RowDifference:
     def of_trainings(self) -> bool:
         """Whether it speaks of trainings; with one seed nothing is known of how much they differ."""
         return min(self.seeds) > 1
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Success at the ends of a row's runs minus that of the base policies that they began with."""
+
+    row: RowResult
+    before: float
+    after: float
+    difference: Difference
+    """Of trainings like these from these bases where there are several seeds, else of these policies."""
+    seeds: int
+    episodes: int
+    """Of each evaluation, paired."""
+
+    @property
+    def of_trainings(self) -> bool:
+        """Whether it speaks of trainings."""
+        return self.seeds > 1
+
+
+def gains(result: ExperimentResult) -> list[Gain]:
+    """The gain of every row with a finished run whose own evaluations say how each episode ended, from step 0."""
+    return [gain for row in result.rows if (gain := _gain(row))]
+
+
+def _gain(row: RowResult) -> Gain | None:
+    runs = []
+    for seed in row.finished:
+        if seed.run.evaluations and seed.run.evaluations[0]["interaction_steps"] == 0:
+            with suppress(ValueError):
+                runs.append((periodic_evaluation(seed.run, 0), last_evaluation(seed.run)))
+    if not runs:
+        return None
+    episodes = paired_episodes(list(zip(*runs, strict=True)), "independent", "train")
+    before, after = (
+        np.array([[o.lengths[e] for e in episodes] for o in side]) for side in zip(*runs, strict=True)
+    )
+    configurations = np.array([episode.configuration for episode in episodes])
+    if len(runs) == 1:
+        difference = compare_policies(Pairs(before, after, configurations), POWER)
+    else:
+        # Each run against its own base: what differs from seed to seed is the gain.
+        gained = Pairs(np.zeros((1, len(episodes)), int), after - before, configurations)
+        difference = compare_trainings(gained, POWER)
+    return Gain(row, float(before.mean()), float(after.mean()), difference, len(runs), len(episodes))
 
 
 def compare_rows(result: ExperimentResult) -> list[RowDifference]:

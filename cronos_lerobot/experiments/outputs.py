@@ -14,6 +14,7 @@ from cronos_lerobot.experiments.columns import (
     budget_columns,
     claim_columns,
     difference_columns,
+    gain_columns,
     main_columns,
     order_columns,
     quarter_columns,
@@ -21,7 +22,7 @@ from cronos_lerobot.experiments.columns import (
     sequential_columns,
 )
 from cronos_lerobot.experiments.definitions import Experiment, Row
-from cronos_lerobot.experiments.differences import RowDifference, compare_rows, to_first
+from cronos_lerobot.experiments.differences import Gain, RowDifference, compare_rows, gains, to_first
 from cronos_lerobot.experiments.intervention_plots import interventions_figure
 from cronos_lerobot.experiments.jobs import this_commit
 from cronos_lerobot.experiments.orders import MARGIN, Order, paper_orders
@@ -46,9 +47,11 @@ def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options,
     folder.mkdir(parents=True, exist_ok=True)
     name = experiment.name
     differences = compare_rows(result)
+    learned = gains(result)
     data = {
         name: tables.main_rows(result),
         f"{name}_differences": tables.difference_rows(differences),
+        f"{name}_gains": tables.gain_rows(learned),
         f"{name}_curves": tables.curve_rows(result),
         f"{name}_segments": tables.segment_rows(result),
         f"{name}_tasks": tables.task_rows(result),
@@ -73,12 +76,13 @@ def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options,
             drawn.append(f"{file}.png")
     summary = _settings(result) | {"rows": data[name], "claims": tables.claim_rows(result)}
     orders = paper_orders(result)
-    summary |= {"differences": data[f"{name}_differences"], "orders": tables.order_rows(orders)}
+    summary |= {"gains": data[f"{name}_gains"], "differences": data[f"{name}_differences"]}
+    summary |= {"orders": tables.order_rows(orders)}
     summary["bases"] = {recipe: sorted(policies) for recipe, policies in result.bases.items()}
     summary["hours"] = round(sum(seed.seconds for row in result.rows for seed in row.seeds) / 3600, 2)
     summary |= {"segments": data[f"{name}_segments"], "sequential": data[f"{name}_sequential"]}
     (folder / f"{name}.json").write_text(json.dumps(summary, indent=2))
-    page = markdown(result, differences, orders, drawn)
+    page = markdown(result, learned, differences, orders, drawn)
     (folder / f"{name}.md").write_text(page)
     return f"{page}\nWritten to {folder}"
 
@@ -111,6 +115,7 @@ def _settings(result: ExperimentResult) -> dict[str, Any]:
 
 def markdown(
     result: ExperimentResult,
+    learned: Sequence[Gain],
     differences: Sequence[RowDifference],
     orders: Sequence[Order],
     figures: Sequence[str],
@@ -119,6 +124,8 @@ def markdown(
     lines = [*_introduction(result), "", *_table(main_columns(result)), "", NOTES, "", PPO_NOTES]
     if result.experiment.source:
         lines += _about_the_paper(result)
+    if grown := gain_columns(learned):
+        lines += [*_section("What each row has learned", grown), "", GAIN_NOTES]
     if separated := difference_columns(to_first(result, differences)):
         lines += [*_section("Which rows differ", separated), "", DIFFERENCE_NOTES]
     if spent := budget_columns(result):
@@ -142,6 +149,11 @@ NOTES = (
     " interaction steps and over interventions (Equations 3 and 4), divided by the length of the axis: smaller is"
     " better. Found complete, never grasped: of the successes at the end, all seeds together, those for which"
     " nothing had to be done, and others without a grasp."
+)
+GAIN_NOTES = (
+    "Success at the end of each run minus that of the base policy it began with, on the same episodes; 95 %"
+    " interval and p of trainings like these from these bases, clustered by training and configuration, or of one"
+    " seed of these policies alone. p (Holm) is adjusted for the lines of this table."
 )
 DIFFERENCE_NOTES = (
     "Success of a row minus that of its reference, the first finished row from the same base policy, at the end of"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cronos_lerobot.experiments.definitions import INTERACTION_STEPS, INTERVENTIONS
-from cronos_lerobot.experiments.differences import RowDifference
+from cronos_lerobot.experiments.differences import Gain, RowDifference
 from cronos_lerobot.experiments.orders import Order
 from cronos_lerobot.experiments.results import APART, ExperimentResult, RowResult, paper_results, sequential
 from cronos_lerobot.protocol.metrics import Summary, interpolate, summarise
@@ -103,6 +103,25 @@ def difference_rows(found: Sequence[RowDifference]) -> list[Row]:
             "seeds_reference": one.seeds[1],
             "episodes": one.episodes,
             "difference": one.difference.value,
+            "ci95_low": (one.difference.ci95 or (None, None))[0],
+            "ci95_high": (one.difference.ci95 or (None, None))[1],
+            "p": one.difference.p,
+            "of_trainings": one.of_trainings,
+        }
+        for one in found
+    ]
+
+
+def gain_rows(found: Sequence[Gain]) -> list[Row]:
+    """Success at the end of a row's runs minus that of the base policies, on the same episodes."""
+    return [
+        {
+            "row": one.row.row.name,
+            "seeds": one.seeds,
+            "episodes": one.episodes,
+            "before": one.before,
+            "after": one.after,
+            "gain": one.difference.value,
             "ci95_low": (one.difference.ci95 or (None, None))[0],
             "ci95_high": (one.difference.ci95 or (None, None))[1],
             "p": one.difference.p,

@@ -184,15 +184,25 @@ def last_evaluation(run: TrainingRun) -> Outcomes:
     """The episodes of a run's last periodic evaluation.
 
     Raises:
-        ValueError: it has none, or it was made before episodes were kept.
+        ValueError: see `periodic_evaluation`.
     """
-    done = [evaluation for evaluation in run.evaluations if evaluation.get("episodes")]
-    if not done or not run.evaluations[-1].get("episodes"):
+    return periodic_evaluation(run, -1)
+
+
+def periodic_evaluation(run: TrainingRun, number: int) -> Outcomes:
+    """The episodes of one of a run's own evaluations, by its place: 0 is the base policy's, -1 the last.
+
+    Raises:
+        ValueError: there is none, or it was made before episodes were kept.
+    """
+    evaluation = run.evaluations[number] if run.evaluations else {}
+    if not evaluation.get("episodes"):
+        which = {0: "first", -1: "last"}[number]
         raise ValueError(
-            f"{run.folder}: its last evaluation does not say how each episode ended; evaluate its last checkpoint"
-            " with cronos-eval"
+            f"{run.folder}: its {which} evaluation does not say how each episode ended; evaluate its {which}"
+            " checkpoint with cronos-eval"
         )
-    last, start = done[-1], run.starts[-1] if run.starts else {}
+    start = run.starts[-1] if run.starts else {}
     env = run.config.get("env") or {}
     setting = {
         "scene": env.get("scene"),
@@ -201,17 +211,17 @@ def last_evaluation(run: TrainingRun) -> Outcomes:
         # A single task has no next one.
         "advance": None,
         "end_effector_reset": None,
-        "temperature": last["temperature"],
+        "temperature": evaluation["temperature"],
         "obs_type": env.get("obs_type"),
         "renderer": env.get("renderer"),
         "versions": start.get("versions"),
     }
     lengths = {
-        Episode("independent", last["split"], number, configuration, seed): success
-        for seed, number, configuration, success in last["episodes"]
+        Episode("independent", evaluation["split"], number, configuration, seed): success
+        for seed, number, configuration, success in evaluation["episodes"]
     }
-    policy = run.folder.resolve() / "checkpoints" / f"{last['interaction_steps']:07d}" / "policy"
-    labels = {"independent": dict(enumerate(last["per_task"]))}
+    policy = run.folder.resolve() / "checkpoints" / f"{evaluation['interaction_steps']:07d}" / "policy"
+    labels = {"independent": dict(enumerate(evaluation["per_task"]))}
     return Outcomes(str(policy), "", setting, lengths, labels)
 
 

@@ -2,11 +2,14 @@
 
 import json
 
+import numpy as np
+import pytest
 from experiment_runs import make_run, read_csv, results
 from forked_commands import run_forked
+from scipy import stats
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS
-from cronos_lerobot.experiments.differences import compare_rows, to_first
+from cronos_lerobot.experiments.differences import compare_rows, gains, to_first
 from cronos_lerobot.experiments.outputs import write_outputs
 
 
@@ -61,7 +64,11 @@ def test_rows_from_other_bases_have_references_of_their_own(options, tmp_path):
     assert [one.difference.value for one in found] == [-0.5, -0.75]
     experiment = EXPERIMENTS["few_resets"]
     text = write_outputs(experiment, experiment.rows, options, tmp_path / "out")
-    lines = [line.split(" | ") for line in text.splitlines() if "these policies |" in line]
+    lines = [
+        line.split(" | ")
+        for line in text.splitlines()
+        if "| T = 1280, EER, wide base | T" in line or "critic | T" in line
+    ]
     ps = [one.difference.p for one in found]
     assert [line[5] for line in lines] == [f"{max(ps[0], 2 * ps[1]):.2g}", f"{2 * ps[1]:.2g}"]
     metrics = specs["t1280_eer_wide"].train_folder / "metrics.jsonl"
@@ -77,3 +84,38 @@ def test_rows_of_other_benchmarks_are_not_compared(options):
     start = json.loads(manifest.read_text())["starts"][0]
     manifest.write_text(json.dumps({"starts": [start | {"benchmark": {"fingerprint": "f" * 16}}]}))
     assert compare_rows(results(options, "table1")) == []
+
+
+def test_what_a_row_has_learned_is_of_each_run_against_its_own_base(options, tmp_path):
+    make_run(options, "table1", "t80", 1, (2, 4, 6))
+    make_run(options, "table1", "t80", 2, (4, 4, 7))
+    make_run(options, "table1", "t1280", 1, (2, 4, 6))
+    make_run(options, "table1", "t1280", 2, (2, 4, 6), status="stopped")
+    text = write_outputs(EXPERIMENTS["table1"], EXPERIMENTS["table1"].rows, options, tmp_path / "out")
+    t80, t1280 = read_csv(tmp_path / "out/table1_gains.csv")
+    names = ("row", "before", "after", "seeds", "episodes")
+    assert [t80[name] for name in names] == ["t80", "0.375", "0.8125", "2", "32"]
+    # Gains of .5 and .375, in some configurations and not in others: the variance of the trainings, and of the
+    # configurations, less what is in both (Cameron, Gelbach and Miller), with Satterthwaite's degrees of freedom.
+    gained = np.array([[0, 0, 1, 1, 1, 1, 0, 0], [0, 0, 0, 0, 1, 1, 1, 0]])
+    by_configuration = gained.mean(axis=0).var(ddof=1) / 8
+    trainings = gained.mean(axis=1).var(ddof=1) / 2
+    more = by_configuration - sum(((row - gained.mean()) ** 2).sum() for row in gained) / 16**2
+    df = (trainings + more) ** 2 / (trainings**2 / 1 + more**2 / 7)
+    half = stats.t.ppf(0.975, df) * np.sqrt(trainings + more)
+    assert [float(t80[name]) for name in ("gain", "ci95_low", "ci95_high")] == pytest.approx(
+        [0.4375, 0.4375 - half, 0.4375 + half]
+    )
+    # Of one policy: four configurations changed, all for the better, one way of 2**4 and its mirror image.
+    assert (t1280["gain"], t1280["p"], t1280["of_trainings"]) == ("0.5", "0.125", "False")
+    assert "| T = 1280 | 0.250 | 0.750 | +0.500 |" in text
+
+
+def test_runs_without_a_first_evaluation_have_no_gain(options):
+    spec = make_run(options, "table1", "t80", 1, (2, 4, 6))
+    assert len(gains(results(options, "table1"))) == 1
+    metrics = spec.train_folder / "metrics.jsonl"
+    lines = metrics.read_text().splitlines(keepends=True)
+    first = next(line for line in lines if '"evaluation"' in line)
+    metrics.write_text("".join(line for line in lines if line != first))
+    assert gains(results(options, "table1")) == []
