@@ -80,7 +80,7 @@ def _gain(row: RowResult) -> Gain | None:
     else:
         # Each run against its own base: what differs from seed to seed is the gain.
         gained = Pairs(np.zeros((1, len(episodes)), int), after - before, configurations)
-        difference = compare_trainings(gained, POWER)
+        difference = compare_trainings(gained, POWER) or compare_policies(gained, POWER)
     return Gain(row, float(before.mean()), float(after.mean()), difference, len(runs), len(episodes))
 
 
