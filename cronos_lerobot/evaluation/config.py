@@ -12,7 +12,7 @@ from typing import Any
 
 import draccus
 from lerobot.configs import PreTrainedConfig, parser
-from lerobot.envs.configs import EnvConfig
+from lerobot.envs.configs import EnvConfig, HubEnvConfig
 from lerobot_env_cronos import Benchmark, CronosEnvConfig, gymnasium_id, load_benchmark
 from lerobot_env_cronos.benchmark.benchmark import SUITES
 from lerobot_env_cronos.benchmark.configurations import SPLITS
@@ -113,7 +113,8 @@ class CronosEvalConfig:
         Raises:
             ValueError: a value is not valid, or there is nothing to evaluate.
         """
-        if not isinstance(self.env, CronosEnvConfig):
+        # What a repository makes itself, by code of its own, is for LeRobot's commands.
+        if not isinstance(self.env, CronosEnvConfig) or isinstance(self.env, HubEnvConfig):
             raise ValueError(f"cronos-eval evaluates --env.type=cronos, got {self.env.type!r}")
         if self.seed < 0:
             raise ValueError(f"seed must be at least 0, got {self.seed}")

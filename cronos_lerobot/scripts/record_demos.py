@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lerobot.datasets.utils import INFO_PATH
-from lerobot.envs.configs import EnvConfig
+from lerobot.envs.configs import EnvConfig, HubEnvConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
@@ -71,7 +71,8 @@ class RecordDemosConfig(DemoConfig):
     def __post_init__(self) -> None:
         """Check what draccus cannot."""
         super().__post_init__()
-        if not isinstance(self.env, CronosEnvConfig):
+        # What a repository makes itself, by code of its own, is for LeRobot's commands.
+        if not isinstance(self.env, CronosEnvConfig) or isinstance(self.env, HubEnvConfig):
             raise ValueError(f"the scripted expert needs --env.type=cronos, got {self.env.type!r}")
         for name, value in EVALUATION_ONLY.items():
             if getattr(self.env, name) != value:

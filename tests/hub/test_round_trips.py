@@ -96,6 +96,26 @@ def test_lerobot_eval_runs_the_benchmark_from_the_hub(bench, policy, commands, t
     assert info["overall"]["n_episodes"] == 2
 
 
+def test_lerobot_eval_runs_the_repositorys_own_code(bench, policy, commands, tmp_path):
+    hub_env = ("--env.type=cronos_hub", "--env.hub_path=me/bench")
+    flags = (
+        f"--policy.path={policy}", "--policy.device=cpu", *hub_env,
+        "--env.suite=sequential", "--env.split=held_out", "--env.task=1", "--env.observation_height=32",
+        "--env.observation_width=32", "--eval.n_episodes=2", "--eval.batch_size=2",
+    )  # fmt: skip
+    refused = commands.try_("lerobot-eval", *flags, f"--output_dir={tmp_path / 'refused'}")
+    assert refused.code == 1
+    assert "Refusing to execute remote code" in refused.output
+    commands.run("lerobot-eval", *flags, f"--output_dir={tmp_path / 'eval'}", "--trust_remote_code=true")
+    info = json.loads((tmp_path / "eval/eval_info.json").read_text())
+    assert [(task["task_group"], task["task_id"]) for task in info["per_task"]] == [("sequential_held_out", 1)]
+    outcome = commands.try_("cronos-eval", *flags[:4])
+    assert outcome.code == 1
+    assert "--env.type=cronos, got 'cronos_hub'" in outcome.output
+    nowhere = commands.try_("lerobot-eval", *flags[:2], "--env.type=cronos_hub")
+    assert "env.type=cronos_hub needs env.hub_path" in nowhere.output
+
+
 def test_a_stream_is_loaded_back_whole(hub, run, commands, tmp_path):
     publish = ("cronos-publish", "stream", f"--root={run / 'streams'}", "--repo_id=me/stream", "--private=true")
     commands.run(*publish, "--dry_run=true", f"--output_dir={tmp_path / 'dry'}")

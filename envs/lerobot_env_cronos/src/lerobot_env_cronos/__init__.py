@@ -10,6 +10,7 @@ from lerobot_env_cronos.benchmark.registry import register_gymnasium, register_s
 from lerobot_env_cronos.benchmark.version import VERSION, check_environment_id, gymnasium_id
 from lerobot_env_cronos.config import CronosEnvConfig
 from lerobot_env_cronos.episodic import CronosEnv, IndependentVectorEnv
+from lerobot_env_cronos.hub_config import CronosHubEnvConfig
 from lerobot_env_cronos.lerobot_log import shorten_video_backend_warning
 from lerobot_env_cronos.scene.scenes import CONTROL_HZ, SCENES, STEPS_PER_TASK, Body, Scene, Task, get_scene
 from lerobot_env_cronos.sequential import SequentialVectorEnv
@@ -28,6 +29,7 @@ __all__ = [
     "CronosEnv",
     "CronosEnvConfig",
     "CronosGymVectorEnv",
+    "CronosHubEnvConfig",
     "CronosVectorEnv",
     "EpisodeGroup",
     "IndependentVectorEnv",

@@ -102,11 +102,12 @@ def write_benchmark(benchmark: Benchmark, folder: Path) -> None:
 # Reading --------------------------------------------------------------------------------------------------
 
 
-def fetch_benchmark(name: str) -> tuple[Path, str]:
+def fetch_benchmark(name: str, repo_type: str = "dataset") -> tuple[Path, str]:
     """Download a benchmark repository from the Hub, or find it in the cache.
 
     Args:
         name: `<owner>/<repository>`, with `@<revision>` for another one than `main`.
+        repo_type: dataset, or model: LeRobot's EnvHub has them there.
 
     Returns:
         The folder, and `<repository>@<commit>`.
@@ -125,18 +126,18 @@ def fetch_benchmark(name: str) -> tuple[Path, str]:
     )
 
     repo_id, _, revision = name.partition("@")
-    hint = "expected <owner>/<repository>[@<revision>] of a dataset on the Hub, or a folder"
+    hint = f"expected <owner>/<repository>[@<revision>] of a {repo_type} on the Hub, or a folder"
     try:
         patterns = [f"{config}/*.parquet" for config in CONFIGS]
         folder = Path(
-            snapshot_download(repo_id, repo_type="dataset", revision=revision or None, allow_patterns=patterns)
+            snapshot_download(repo_id, repo_type=repo_type, revision=revision or None, allow_patterns=patterns)
         )
     except HFValidationError as error:
         raise BenchmarkError(f"no benchmark {name!r}: {hint}") from error
     except RevisionNotFoundError as error:
         raise BenchmarkError(f"benchmark {repo_id} has no revision {revision or 'main'!r}") from error
     except RepositoryNotFoundError as error:
-        reason = "no such dataset on the Hub, or it is private and HF_TOKEN gives no access to it"
+        reason = f"no such {repo_type} on the Hub, or it is private and HF_TOKEN gives no access to it"
         raise BenchmarkError(f"no benchmark {name!r}: {reason}; {hint}") from error
     except LocalEntryNotFoundError as error:
         raise BenchmarkError(f"cannot reach the Hub for benchmark {name!r}, and it is not in the cache") from error

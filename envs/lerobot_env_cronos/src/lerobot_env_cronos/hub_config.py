@@ -1,0 +1,27 @@
+"""`--env.type=cronos_hub`: the environments that a benchmark's repository makes itself, by LeRobot's EnvHub."""
+
+from dataclasses import dataclass
+
+from lerobot.envs.configs import EnvConfig, HubEnvConfig
+
+from lerobot_env_cronos.benchmark.files import fetch_benchmark
+from lerobot_env_cronos.config import CronosEnvConfig
+
+
+@EnvConfig.register_subclass("cronos_hub")
+@dataclass
+class CronosHubEnvConfig(CronosEnvConfig, HubEnvConfig):
+    """The fields of `--env.type=cronos`, but LeRobot runs the `env.py` of `--env.hub_path`.
+
+    `hub_path` is `<owner>/<repository>[@<revision>]` of a model repository that `cronos-publish benchmark`
+    has made; `--trust_remote_code=true` allows its code to run. What a policy sees follows from the data there.
+    """
+
+    def _build(self) -> None:
+        if not self.hub_path:
+            raise ValueError("env.type=cronos_hub needs env.hub_path: <owner>/<repository>[@<revision>]")
+        folder, _ = fetch_benchmark(self.hub_path.partition(":")[0], repo_type="model")
+        if self.benchmark not in (None, str(folder)):
+            raise ValueError(f"env.benchmark is that of env.hub_path={self.hub_path}; got {self.benchmark!r}")
+        self.benchmark = str(folder)
+        super()._build()
