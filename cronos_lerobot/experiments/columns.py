@@ -58,35 +58,30 @@ def main_columns(result: ExperimentResult) -> Columns:
 
 
 def gain_columns(found: Sequence[Gain]) -> Columns:
-    """Success before and after, the gain with its interval, and a word."""
+    """Success before and after, the gain with its interval, its p and a word."""
     if not found:
         return {}
-    ps = [one.difference.p for one in found]
-    adjusted = holm([1.0 if p is None else p for p in ps])
     return {
         "": [one.row.row.label for one in found],
         "before": [_number(one.before, 3) for one in found],
         "at the end": [_number(one.after, 3) for one in found],
-        "gain": [f"{one.difference.value:+.3f}" for one in found],
-        "95 %": [_signed_interval(one.difference.ci95) for one in found],
-        "p": [MISSING if p is None else f"{p:.2g}" for p in ps],
-        "p (Holm)": [f"{p:.2g}" for p in adjusted],
         "seeds": [str(one.seeds) for one in found],
-        "of": [_of(one) for one in found],
-        "verdict": [_verdict(one.difference.value, p) for one, p in zip(found, adjusted, strict=True)],
-    }
+    } | _decided("gain", found)
 
 
 def difference_columns(found: Sequence[RowDifference]) -> Columns:
     """Each difference with its interval, its p and a word."""
     if not found:
         return {}
+    rows = {"": [one.row.row.label for one in found], "reference": [one.reference.row.label for one in found]}
+    return rows | _decided("difference", found)
+
+
+def _decided(title: str, found: Sequence[RowDifference | Gain]) -> Columns:
     ps = [one.difference.p for one in found]
     adjusted = holm([1.0 if p is None else p for p in ps])
     return {
-        "": [one.row.row.label for one in found],
-        "reference": [one.reference.row.label for one in found],
-        "difference": [f"{one.difference.value:+.3f}" for one in found],
+        title: [f"{one.difference.value:+.3f}" for one in found],
         "95 %": [_signed_interval(one.difference.ci95) for one in found],
         "p": [MISSING if p is None else f"{p:.2g}" for p in ps],
         "p (Holm)": [f"{p:.2g}" for p in adjusted],

@@ -103,11 +103,8 @@ def difference_rows(found: Sequence[RowDifference]) -> list[Row]:
             "seeds_reference": one.seeds[1],
             "episodes": one.episodes,
             "difference": one.difference.value,
-            "ci95_low": (one.difference.ci95 or (None, None))[0],
-            "ci95_high": (one.difference.ci95 or (None, None))[1],
-            "p": one.difference.p,
-            "of_trainings": one.of_trainings,
         }
+        | _certainty(one)
         for one in found
     ]
 
@@ -122,13 +119,15 @@ def gain_rows(found: Sequence[Gain]) -> list[Row]:
             "before": one.before,
             "after": one.after,
             "gain": one.difference.value,
-            "ci95_low": (one.difference.ci95 or (None, None))[0],
-            "ci95_high": (one.difference.ci95 or (None, None))[1],
-            "p": one.difference.p,
-            "of_trainings": one.of_trainings,
         }
+        | _certainty(one)
         for one in found
     ]
+
+
+def _certainty(one: RowDifference | Gain) -> Row:
+    low, high = one.difference.ci95 or (None, None)
+    return {"ci95_low": low, "ci95_high": high, "p": one.difference.p, "of_trainings": one.of_trainings}
 
 
 def segment_rows(result: ExperimentResult) -> list[Row]:

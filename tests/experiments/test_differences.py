@@ -108,7 +108,7 @@ def test_what_a_row_has_learned_is_of_each_run_against_its_own_base(options, tmp
     )
     # Of one policy: four configurations changed, all for the better, one way of 2**4 and its mirror image.
     assert (t1280["gain"], t1280["p"], t1280["of_trainings"]) == ("0.5", "0.125", "False")
-    assert "| T = 1280 | 0.250 | 0.750 | +0.500 |" in text
+    assert "| T = 1280 | 0.250 | 0.750 | 1 | +0.500 |" in text
 
 
 def test_runs_without_a_first_evaluation_have_no_gain(options):
