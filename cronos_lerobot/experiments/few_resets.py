@@ -98,7 +98,8 @@ TAUGHT = plugged("takeover", "memory")
 """An expert's segments are cloned only where successes are kept."""
 TUNED = Row(80, tag="decay", flags=PLUGS["decay"].flags)
 """What settles the policy of few resets may settle that of T = 80."""
-PAIRS = (TAUGHT, plugged("critic", "staggered"), plugged("staggered", "decay"))
+ASKED = plugged("asked", "decay")
+PAIRS = (TAUGHT, plugged("critic", "staggered"), plugged("staggered", "decay"), ASKED)
 SCREENED = (*AIDS, *(plugged(name) for name in PLUGS), *PAIRS, METHOD, TUNED)
 
 METHOD_BY_BUDGET = (
@@ -140,7 +141,7 @@ for _experiment in (
     Experiment(
         "few_resets_best",
         "Learning with few resets, evaluated in full",
-        (*map(wide, (EPISODIC, TUNED, PLAIN, BEST, METHOD)), *map(with_resets, (TUNED, BEST, METHOD, LEARNED))),
+        (*map(wide, (EPISODIC, TUNED, PLAIN, BEST, METHOD, ASKED)), *map(with_resets, (TUNED, BEST, METHOD, LEARNED))),
         splits=BOTH,
         evaluations=(CheckpointEvaluation("independent", ("held_out",)), CheckpointEvaluation("sequential", BOTH)),
         budgets=_BUDGETS,
