@@ -114,6 +114,7 @@ def test_plugs():
         "takeover_memory",
         "critic_staggered",
         "staggered_decay",
+        "asked_decay",
         "_".join(TOGETHER),
         "wide",
     ]
