@@ -141,7 +141,10 @@ for _experiment in (
     Experiment(
         "few_resets_best",
         "Learning with few resets, evaluated in full",
-        (*map(wide, (EPISODIC, TUNED, PLAIN, BEST, METHOD, ASKED)), *map(with_resets, (TUNED, BEST, METHOD, LEARNED))),
+        (
+            *map(wide, (EPISODIC, TUNED, PLAIN, BEST, METHOD, ASKED)),
+            *map(with_resets, (TUNED, BEST, METHOD, LEARNED)),
+        ),
         splits=BOTH,
         evaluations=(CheckpointEvaluation("independent", ("held_out",)), CheckpointEvaluation("sequential", BOTH)),
         budgets=_BUDGETS,

@@ -24,6 +24,8 @@ PLUG_COLORS = tuple(color for color in COLORS if color != "#555555")
 """Rows of the paper's aids are grey and told apart by markers, all others have colours."""
 SAME_PLACE, MARK_POINTS = 1.2, 7.0
 """Marks whose places differ by less than this factor stand side by side, so far from each other [points]."""
+ROOM_FOR_A_MARK = 0.015
+"""Of the axis of steps, at its end, where the marks of most rows stand side by side."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,9 @@ def interventions_figure(result: ExperimentResult) -> Figure | None:
         line[0].set_title(f"{base} base policy", fontsize=9, color=INK, loc="left")
         line[0].set_ylabel("success, training configurations")
     _logarithmic(axes[:, 0], [end.interventions for end in drawn.values()])
-    axes[0, 1].set_xlim(left=0, right=1.15 * max(end.steps for end in drawn.values()))
+    most = max(sum(_panel(row) == base for row in result.rows) for base in bases)
+    room = max(0.15, ROOM_FOR_A_MARK * most)
+    axes[0, 1].set_xlim(left=0, right=(1 + room) * max(end.steps for end in drawn.values()))
     for ax in axes.flat:
         ax.label_outer()
     legend_below(figure, list(axes.flat))

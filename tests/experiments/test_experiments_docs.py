@@ -91,9 +91,11 @@ def test_every_flag_is_there():
 def test_pages_are_drawn_anew_by_the_commands_beside_the_archives():
     block = DOCS[DOCS.index("  cronos-reproduce table1 --scale=small --report_only") :].split("```")[0]
     commands = [line.split() for line in block.replace("\\\n", " ").splitlines() if line.strip()]
-    pages = {page.stem: page for page in (Path(__file__).parents[2] / "docs/results").glob("*/*.json")}
+    pages = {page.stem: page for page in (Path(__file__).parents[2] / "docs/results").glob("*_state/*.json")}
     assert [command[1] for command in commands] == [
         "table1",
+        "few_resets",
+        "few_resets_kitchen_3x3",
         "few_resets_playroom_2x2",
         "few_resets_best",
         "few_resets_budgets",
