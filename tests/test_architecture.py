@@ -44,7 +44,7 @@ FLOORS = {
     ),
     "lerobot_env_cronos": (
         "statistics", "lerobot_log", "scene", "benchmark", "simulation", "vector_env", "episodic", "autoreset",
-        "sequential", "config", "__init__", "expert",
+        "sequential", "config", "hub_config", "__init__", "expert",
     ),
 }  # fmt: skip
 """The rooms of a package from the ground up: what a file imports lies in its own room or below it."""
