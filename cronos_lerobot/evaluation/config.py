@@ -12,10 +12,11 @@ from typing import Any
 
 import draccus
 from lerobot.configs import PreTrainedConfig, parser
-from lerobot.envs.configs import EnvConfig, HubEnvConfig
+from lerobot.envs.configs import EnvConfig
 from lerobot_env_cronos import Benchmark, CronosEnvConfig, gymnasium_id, load_benchmark
 from lerobot_env_cronos.benchmark.benchmark import SUITES
 from lerobot_env_cronos.benchmark.configurations import SPLITS
+from lerobot_env_cronos.hub_config import is_of_this_package
 
 from cronos_lerobot.evaluation.plan import Part, make_parts
 from cronos_lerobot.evaluation.policy_env import check_observations, observations_of, trained_scene
@@ -113,8 +114,7 @@ class CronosEvalConfig:
         Raises:
             ValueError: a value is not valid, or there is nothing to evaluate.
         """
-        # What a repository makes itself, by code of its own, is for LeRobot's commands.
-        if not isinstance(self.env, CronosEnvConfig) or isinstance(self.env, HubEnvConfig):
+        if not is_of_this_package(self.env):
             raise ValueError(f"cronos-eval evaluates --env.type=cronos, got {self.env.type!r}")
         if self.seed < 0:
             raise ValueError(f"seed must be at least 0, got {self.seed}")

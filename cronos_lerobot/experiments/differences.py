@@ -58,7 +58,7 @@ class Gain:
 
 
 def gains(result: ExperimentResult) -> list[Gain]:
-    """The gain of every row with a finished run whose own evaluations say how each episode ended, from step 0."""
+    """The gain of every row with finished runs whose own evaluations, from step 0 on, are of the same episodes."""
     return [gain for row in result.rows if (gain := _gain(row))]
 
 
@@ -70,17 +70,21 @@ def _gain(row: RowResult) -> Gain | None:
                 runs.append((periodic_evaluation(seed.run, 0), last_evaluation(seed.run)))
     if not runs:
         return None
-    episodes = paired_episodes(list(zip(*runs, strict=True)), "independent", "train")
-    before, after = (
-        np.array([[o.lengths[e] for e in episodes] for o in side]) for side in zip(*runs, strict=True)
-    )
+    sides = list(zip(*runs, strict=True))
+    try:
+        episodes = paired_episodes(sides, "independent", "train")
+    except ValueError:
+        # Another version's, or of another benchmark.
+        return None
+    before, after = (np.array([[o.lengths[e] for e in episodes] for o in side]) for side in sides)
     configurations = np.array([episode.configuration for episode in episodes])
     if len(runs) == 1:
         difference = compare_policies(Pairs(before, after, configurations), POWER)
     else:
         # Each run against its own base: what differs from seed to seed is the gain.
         gained = Pairs(np.zeros((1, len(episodes)), int), after - before, configurations)
-        difference = compare_trainings(gained, POWER) or compare_policies(gained, POWER)
+        difference = compare_trainings(gained, POWER)
+        assert difference is not None, "there are several trainings"
     return Gain(row, float(before.mean()), float(after.mean()), difference, len(runs), len(episodes))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -77,7 +78,7 @@ def interventions_figure(result: ExperimentResult) -> Figure | None:
         line[0].set_title(f"{base} base policy", fontsize=9, color=INK, loc="left")
         line[0].set_ylabel("success, training configurations")
     _logarithmic(axes[:, 0], [end.interventions for end in drawn.values()])
-    most = max(sum(_panel(row) == base for row in result.rows) for base in bases)
+    most = max(Counter(_panel(row) for row in result.rows if row.row.name in drawn).values())
     room = max(0.15, ROOM_FOR_A_MARK * most)
     axes[0, 1].set_xlim(left=0, right=(1 + room) * max(end.steps for end in drawn.values()))
     for ax in axes.flat:

@@ -13,13 +13,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lerobot.datasets.utils import INFO_PATH
-from lerobot.envs.configs import EnvConfig, HubEnvConfig
+from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.config import CronosEnvConfig
 from lerobot_env_cronos.episodic import find_task
+from lerobot_env_cronos.hub_config import is_of_this_package
 from tqdm import tqdm
 
 from cronos_lerobot.data.demos import DemoCollector, DemoConfig, ExpertError
@@ -71,8 +72,7 @@ class RecordDemosConfig(DemoConfig):
     def __post_init__(self) -> None:
         """Check what draccus cannot."""
         super().__post_init__()
-        # What a repository makes itself, by code of its own, is for LeRobot's commands.
-        if not isinstance(self.env, CronosEnvConfig) or isinstance(self.env, HubEnvConfig):
+        if not is_of_this_package(self.env):
             raise ValueError(f"the scripted expert needs --env.type=cronos, got {self.env.type!r}")
         for name, value in EVALUATION_ONLY.items():
             if getattr(self.env, name) != value:

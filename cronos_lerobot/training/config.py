@@ -16,11 +16,12 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.datasets.utils import INFO_PATH
-from lerobot.envs import EnvConfig, HubEnvConfig
+from lerobot.envs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 from lerobot.utils.constants import OBS_ENV_STATE, PRETRAINED_MODEL_DIR
 from lerobot_env_cronos import CronosEnvConfig, load_benchmark
 from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
+from lerobot_env_cronos.hub_config import is_of_this_package
 
 from cronos_lerobot.agents import builtin  # noqa: F401  (registers the agents)
 from cronos_lerobot.agents.ppo.config import PPOConfig
@@ -223,8 +224,7 @@ class CronosTrainConfig:
             self._resolve_checkpoint()
         if self.env is None:
             raise ValueError("Choose an environment: --env.type=cronos --env.scene=kitchen_2x2.")
-        # What a repository makes itself, by code of its own, is for LeRobot's commands.
-        if not isinstance(self.env, CronosEnvConfig) or isinstance(self.env, HubEnvConfig):
+        if not is_of_this_package(self.env):
             raise ValueError(f"--env.type must be cronos to train in, got {self.env.type!r}.")
         check_agent(self.algorithm.type)
         self._pin_benchmark(self.env)

@@ -15,6 +15,7 @@ from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import ACTION
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, SequentialVectorEnv, get_scene
+from lerobot_env_cronos.hub_config import is_of_this_package
 from safetensors import SafetensorError
 
 from cronos_lerobot.agents.steering.steered import STEERING
@@ -58,7 +59,7 @@ def make_eval_env(config: CronosTrainConfig, num_envs: int, local_processes: int
 
 
 def _cronos(config: CronosTrainConfig) -> CronosEnvConfig:
-    if not isinstance(config.env, CronosEnvConfig):
+    if not is_of_this_package(config.env):
         name = config.env.type if config.env else None
         raise ValueError(f"Reset-free training needs --env.type=cronos, got {name!r}.")
     return config.env

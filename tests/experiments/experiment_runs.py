@@ -18,12 +18,11 @@ RESETS = {80: 128, 320: 32, 1280: 8}
 
 
 def make_run(options, name, row, seed, successes, status="done", updates=8):
-    """A run whose evaluations had so many successes of 8, in each of the four tasks."""
+    """A run whose evaluations had so many successes of 8, of each task; without T it is reset as with 1280."""
     specs = run_specs(EXPERIMENTS[name], options)
     (spec,) = [s for s in specs if (s.row.name, s.seed) == (row, seed)]
-    write_training_run(
-        spec.train_folder, seed=seed, interval=spec.row.interval, successes=successes, updates=updates
-    )
+    interval = spec.row.interval or 1280
+    write_training_run(spec.train_folder, seed=seed, interval=interval, successes=successes, updates=updates)
     job = train_job(spec, None)
     record = {"command": list(job.command), "status": status, "seconds": 1800.0, "starts": 1}
     write_record(job, record | {"made_by": made_by(job)})

@@ -64,11 +64,8 @@ def test_rows_from_other_bases_have_references_of_their_own(options, tmp_path):
     assert [one.difference.value for one in found] == [-0.5, -0.75]
     experiment = EXPERIMENTS["few_resets"]
     text = write_outputs(experiment, experiment.rows, options, tmp_path / "out")
-    lines = [
-        line.split(" | ")
-        for line in text.splitlines()
-        if "| T = 1280, EER, wide base | T" in line or "critic | T" in line
-    ]
+    starts = ("| T = 1280, EER, critic | T", "| T = 1280, EER, wide base | T")
+    lines = [line.split(" | ") for line in text.splitlines() if line.startswith(starts)]
     ps = [one.difference.p for one in found]
     assert [line[5] for line in lines] == [f"{max(ps[0], 2 * ps[1]):.2g}", f"{2 * ps[1]:.2g}"]
     metrics = specs["t1280_eer_wide"].train_folder / "metrics.jsonl"
@@ -109,6 +106,15 @@ def test_what_a_row_has_learned_is_of_each_run_against_its_own_base(options, tmp
     # Of one policy: four configurations changed, all for the better, one way of 2**4 and its mirror image.
     assert (t1280["gain"], t1280["p"], t1280["of_trainings"]) == ("0.5", "0.125", "False")
     assert "| T = 1280 | 0.250 | 0.750 | 1 | +0.500 |" in text
+
+
+def test_runs_of_other_benchmarks_have_no_gain_together(options):
+    specs = [make_run(options, "table1", "t80", seed, (2, 4, 6)) for seed in (1, 2)]
+    assert [gain.seeds for gain in gains(results(options, "table1"))] == [2]
+    manifest = specs[1].train_folder / "manifest.json"
+    start = json.loads(manifest.read_text())["starts"][0]
+    manifest.write_text(json.dumps({"starts": [start | {"benchmark": {"fingerprint": "f" * 16}}]}))
+    assert gains(results(options, "table1")) == []
 
 
 def test_runs_without_a_first_evaluation_have_no_gain(options):

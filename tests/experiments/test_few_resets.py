@@ -7,7 +7,13 @@ from flags import parse_flags
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base
 from cronos_lerobot.experiments.few_resets import BUDGET, METHOD_BY_BUDGET, PLUGS, plugged, wide
-from cronos_lerobot.experiments.intervention_plots import find_end, interventions_figure, row_styles, side_by_side
+from cronos_lerobot.experiments.intervention_plots import (
+    MARKERS,
+    find_end,
+    interventions_figure,
+    row_styles,
+    side_by_side,
+)
 from cronos_lerobot.experiments.outputs import write_outputs
 from cronos_lerobot.experiments.plan import make_jobs
 from cronos_lerobot.experiments.plots import AXIS_LABELS
@@ -160,6 +166,22 @@ def test_one_way_of_training_from_two_wide_bases_has_a_line_of_panels_for_each(t
     first, _, second, _ = interventions_figure(collect(experiment, experiment.rows, options)).axes
     assert [ax.get_title(loc="left") for ax in (first, second)] == ["wide base policy", "wide resets base policy"]
     assert [box[0].get_ydata()[0] for ax in (first, second) for box in ax.containers] == [0.75, 0.5]
+
+
+def test_marks_of_many_rows_stay_in_the_panel_of_steps(options):
+    """All rows end after as many steps."""
+    experiment = EXPERIMENTS["few_resets"]
+    narrow = [row for row in experiment.rows if "wide" not in row.name]
+    for row in narrow:
+        make_run(options, "few_resets", row.name, 1, (2, 4, 6))
+    figure = interventions_figure(collect(experiment, experiment.rows, options))
+    figure.draw_without_rendering()
+    _, ax = figure.axes
+    marks = [mark for mark in ax.lines if mark.get_marker() in MARKERS]
+    places = [mark.get_transform().transform((mark.get_xdata()[0], 0))[0] for mark in marks]
+    assert len(places) == len(narrow)
+    assert ax.bbox.x0 < min(places)
+    assert max(places) < ax.bbox.x1
 
 
 def test_marks_at_one_place_stand_side_by_side():

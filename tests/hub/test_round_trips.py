@@ -109,9 +109,12 @@ def test_lerobot_eval_runs_the_repositorys_own_code(bench, policy, commands, tmp
     commands.run("lerobot-eval", *flags, f"--output_dir={tmp_path / 'eval'}", "--trust_remote_code=true")
     info = json.loads((tmp_path / "eval/eval_info.json").read_text())
     assert [(task["task_group"], task["task_id"]) for task in info["per_task"]] == [("sequential_held_out", 1)]
-    outcome = commands.try_("cronos-eval", *flags[:4])
-    assert outcome.code == 1
-    assert "--env.type=cronos, got 'cronos_hub'" in outcome.output
+    for command in ("cronos-eval", "cronos-train"):
+        outcome = commands.try_(command, *flags[:4])
+        assert outcome.code == 1
+        assert "got 'cronos_hub'" in outcome.output
+    another = commands.try_("lerobot-eval", *flags[:4], "--env.benchmark=me/other")
+    assert "env.benchmark is that of env.hub_path=me/bench; got 'me/other'" in another.output
     nowhere = commands.try_("lerobot-eval", *flags[:2], "--env.type=cronos_hub")
     assert "env.type=cronos_hub needs env.hub_path" in nowhere.output
 

@@ -1,6 +1,7 @@
 """`--env.type=cronos_hub`: the environments that a benchmark's repository makes itself, by LeRobot's EnvHub."""
 
 from dataclasses import dataclass
+from typing import Any, TypeGuard
 
 from lerobot.envs.configs import EnvConfig, HubEnvConfig
 
@@ -13,9 +14,11 @@ from lerobot_env_cronos.config import CronosEnvConfig
 class CronosHubEnvConfig(CronosEnvConfig, HubEnvConfig):
     """The fields of `--env.type=cronos`, but LeRobot runs the `env.py` of `--env.hub_path`.
 
-    `hub_path` is `<owner>/<repository>[@<revision>]` of a model repository that `cronos-publish benchmark`
-    has made; `--trust_remote_code=true` allows its code to run. What a policy sees follows from the data there.
+    `--trust_remote_code=true` allows its code to run. What a policy sees follows from the data beside it.
     """
+
+    hub_path: str | None = None
+    """<owner>/<repository>[@<revision>] of a model repository that `cronos-publish benchmark` has made."""
 
     def _build(self) -> None:
         if not self.hub_path:
@@ -25,3 +28,8 @@ class CronosHubEnvConfig(CronosEnvConfig, HubEnvConfig):
             raise ValueError(f"env.benchmark is that of env.hub_path={self.hub_path}; got {self.benchmark!r}")
         self.benchmark = str(folder)
         super()._build()
+
+
+def is_of_this_package(env: Any) -> TypeGuard[CronosEnvConfig]:
+    """Whether an environment config is of environments that this package makes, not a repository's own code."""
+    return isinstance(env, CronosEnvConfig) and not isinstance(env, HubEnvConfig)
