@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from cronos_lerobot.experiments.jobs import Job, changes
+from cronos_lerobot.experiments.jobs import Job, changes, missing
 from cronos_lerobot.experiments.runner import BLOCKED, CHANGED, DONE, FAILED
 
 TAIL_LINES = 20
@@ -39,8 +39,18 @@ def describe(job: Job, what: str) -> str:
             f" another --root, or go back to what made it. What differs:\n    " + "\n    ".join(changes(job))
         )
     if what == BLOCKED:
-        return f"{job.name}: blocked, it needs a job that is not done"
+        return f"{job.name}: blocked, {missing_inputs(job) or 'it needs a job that is not done'}"
     return f"{job.name}: {what}"
+
+
+def missing_inputs(job: Job) -> str:
+    """What a job reads and does not find, and what to do about it; empty if everything is there."""
+    if not (paths := missing(job)):
+        return ""
+    return (
+        f"{', '.join(map(str, paths))} is not there: {' and '.join(job.needs)} came without checkpoints. Copy them"
+        " from where it was made, or delete its folder here to make it again"
+    )
 
 
 def progress_line(job: Job) -> tuple[str, str, str]:

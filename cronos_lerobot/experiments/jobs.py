@@ -52,6 +52,8 @@ class Job:
     """What other jobs have made of the output, which is removed with it."""
     needs: tuple[str, ...] = ()
     """Names of the jobs whose outputs it uses."""
+    reads: tuple[Path, ...] = ()
+    """What of those outputs it reads: they may have come from another machine without their checkpoints."""
     resume: Callable[[], list[str] | None] = lambda: None
     """The command that goes on with an unfinished `output`, None if there is nothing to go on with."""
     progress: Callable[[], Progress | None] = lambda: None
@@ -144,6 +146,11 @@ def status(job: Job) -> str | None:
 def is_done(job: Job) -> bool:
     """Whether this very command has run to its end, in this version, and its output is still there."""
     return read_record(job).get("status") == "done" and not changes(job) and job.output.exists()
+
+
+def missing(job: Job) -> list[Path]:
+    """What a job whose needs are done reads and does not find, such as a checkpoint that was not carried along."""
+    return [path for path in job.reads if not path.exists()]
 
 
 def changes(job: Job) -> list[str]:

@@ -134,6 +134,7 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
         spec.train_folder,
         made_from_it=(spec.evaluations_folder,),
         needs=(base,) if base else (),
+        reads=(Path(base_policy(spec.base, options)),) if base else (),
         resume=lambda: resume_command(spec.train_folder, command),
         progress=lambda: train_progress(spec.train_folder, spec.steps),
         environment=gymnasium_id(spec.scene),
@@ -182,7 +183,7 @@ def checkpoint_evaluations(spec: RunSpec, evaluation: CheckpointEvaluation) -> l
             command = eval_command(policy, spec.scene, evaluation.suite, split, folder, spec.options, videos)
             command = _with_flags(command, _env_flags(spec.row.flags), _env_flags(spec.options.extra))
             name, root = f"{spec.name}/{folder.name}", spec.options.root
-            jobs.append((_eval_job(name, command, folder, spec.name, spec.scene, root), checkpoint))
+            jobs.append((_eval_job(name, command, folder, (spec.name, policy), spec.scene, root), checkpoint))
     return jobs
 
 
@@ -190,10 +191,10 @@ def base_evaluation_jobs(base: Base, options: Options, evaluation: CheckpointEva
     """`cronos-eval` of the base policy, where curves begin."""
     if not evaluation.every_checkpoint:
         return []
-    jobs, needed = [], None if options.policy_path else base_jobs(base, options)[-1].name
+    jobs, policy = [], base_policy(base, options)
+    needed = None if options.policy_path else (base_jobs(base, options)[-1].name, policy)
     for split in evaluation.splits:
         folder = base_evaluation_folder(base, evaluation.suite, split, options)
-        policy = base_policy(base, options)
         command = eval_command(policy, base.scene, evaluation.suite, split, folder, options)
         command = _with_flags(command, _env_flags(options.extra))
         name = f"base/{folder.parent.name}/{folder.name}"
@@ -221,14 +222,17 @@ def eval_command(
     return [*command, "--eval.n_episodes=1", "--eval.orderings=1"] if options.scale.smoke else command
 
 
-def _eval_job(name: str, command: list[str], folder: Path, needed: str | None, scene: str, root: Path) -> Job:
+def _eval_job(
+    name: str, command: list[str], folder: Path, needed: tuple[str, str] | None, scene: str, root: Path
+) -> Job:
+    """`needed`: the job that makes the policy, and the policy's folder."""
     # cronos-eval goes on with what it finds in its folder.
-    needs = (needed,) if needed else ()
     return Job(
         name,
         tuple(command),
         folder,
-        needs=needs,
+        needs=needed[:1] if needed else (),
+        reads=(Path(needed[1]),) if needed else (),
         resume=lambda: command,
         environment=gymnasium_id(scene),
         stage=EVALUATION,

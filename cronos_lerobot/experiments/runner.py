@@ -23,6 +23,7 @@ from cronos_lerobot.experiments.jobs import (
     is_done,
     lock,
     made_by,
+    missing,
     read_record,
     this_commit,
     write_record,
@@ -69,7 +70,8 @@ class Runner:
     """Runs jobs whose needs are done, at most `parallel` at a time.
 
     Jobs that are done are skipped, unfinished ones resumed, those that were made by another command or
-    version left alone and reported. What needs a job that is not done is blocked; everything else goes on.
+    version left alone and reported. What needs a job that is not done, or that has come without its
+    checkpoints, is blocked; everything else goes on.
 
     Args:
         jobs: each name once; needs come before those who need them.
@@ -134,9 +136,10 @@ class Runner:
             if job.name in self.states or job.name in busy:
                 continue
             needs = [self.states.get(name) for name in job.needs]
-            if any(state not in (None, DONE) for state in needs):
+            are_done = all(state == DONE for state in needs)
+            if any(state not in (None, DONE) for state in needs) or (are_done and missing(job)):
                 self._finish(job, BLOCKED)
-            elif all(state == DONE for state in needs) and len(self._children) < self.parallel:
+            elif are_done and len(self._children) < self.parallel:
                 self._start(job)
 
     def _start(self, job: Job) -> None:

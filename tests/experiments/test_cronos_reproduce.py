@@ -13,7 +13,8 @@ from forked_commands import ForkedPopen
 
 from cronos_lerobot.experiments import definitions, runner
 from cronos_lerobot.experiments.definitions import Base
-from cronos_lerobot.experiments.plan import base_jobs
+from cronos_lerobot.experiments.jobs import made_by, write_record
+from cronos_lerobot.experiments.plan import base_jobs, make_jobs
 from cronos_lerobot.experiments.specs import base_policy
 from cronos_lerobot.protocol import resets
 from cronos_lerobot.scripts import reproduce as script
@@ -85,6 +86,24 @@ def test_dry_run_prints_commands_that_can_be_copied(tmp_path, monkeypatch, capsy
     assert "--seed=4 --steps=1300000" in listing[2]
     assert listing[2].endswith("--algorithm.target_kl=0.02")
     assert not root.exists()
+
+
+def test_dry_run_tells_what_came_without_its_checkpoints(tmp_path, monkeypatch, capsys):
+    experiment = definitions.EXPERIMENTS["figure5"]
+    flags = ["figure5", f"--root={tmp_path}", "--seeds=1", "--rows", "t80"]
+    args = script.make_parser().parse_args(flags)
+    rows = definitions.find_rows(experiment, args.rows)
+    options = script.make_options(args, [], [rows[0].begins_with(experiment.scene)])
+    for job in make_jobs([(experiment, rows)], options):
+        if "/sequential" not in job.name:
+            job.output.mkdir(parents=True)
+            note = {"command": list(job.command), "status": "done", "seconds": 1.0, "starts": 1}
+            write_record(job, note | {"made_by": made_by(job)})
+    call(monkeypatch, *flags, "--dry_run")
+    lines = [line for line in capsys.readouterr().out.splitlines() if line]
+    assert [line.split(":")[1].split(",")[0].split(" (")[0] for line in lines] == 3 * [" done"] + 2 * [" blocked"]
+    run = "kitchen_2x2_state_small/t80_307k/seed1"
+    assert f"checkpoints/307200/pretrained_model is not there: {run} came without checkpoints" in lines[-1]
 
 
 def test_list_names_every_row(monkeypatch, capsys):

@@ -71,6 +71,24 @@ def test_failure_blocks_what_needs_it_and_nothing_else(tmp_path, capsys):
     assert (read_record(jobs[0])["status"], read_record(jobs[0])["returncode"]) == ("failed", 1)
 
 
+def test_what_came_without_its_checkpoint_blocks_those_who_read_it_and_is_left_alone(tmp_path, capsys):
+    made = python_job(tmp_path, "a", "(out / 'metrics').touch(); (out / 'checkpoint').touch()")
+    read = tmp_path / "a/checkpoint"
+    assert Runner([made], 1, LineDisplay([])).run() == {"a": "done"}
+    read.unlink()
+    reader, other = count_job(tmp_path, "b", needs=("a",), reads=(read,)), count_job(tmp_path, "c", needs=("a",))
+    jobs = [made, reader, other]
+    assert Runner(jobs, 1, LineDisplay([])).run() == {"a": "done", "b": "blocked", "c": "done"}
+    assert f"b: blocked, {read} is not there: a came without checkpoints" in capsys.readouterr().out
+    assert (tmp_path / "a/metrics").exists()
+    assert not (tmp_path / "b").exists()
+    # What was made of it before is as good as ever.
+    read.touch()
+    assert Runner(jobs, 1, LineDisplay([])).run()["b"] == "done"
+    read.unlink()
+    assert Runner(jobs, 1, LineDisplay([])).run() == {"a": "done", "b": "done", "c": "done"}
+
+
 def test_failed_job_is_resumed_where_it_can_be(tmp_path):
     half = "(out / 'n').open('a').write('half'); raise SystemExit(1)"
     rest = ["python", "-c", f"open({str(tmp_path / 'a/n')!r}, 'a').write(' and half')"]
