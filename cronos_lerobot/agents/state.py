@@ -26,3 +26,8 @@ def to_tensors(tree: Any) -> Any:
 def to_arrays(tree: Any) -> Any:
     """Inverse of `to_tensors`, where there were no tensors before."""
     return map_leaves(tree, torch.Tensor, lambda tensor: tensor.numpy())
+
+
+def to_comparable(tree: Any) -> Any:
+    """Arrays as what `==` compares bit for bit: their type, shape and bytes."""
+    return map_leaves(tree, np.ndarray, lambda array: (str(array.dtype), array.shape, array.tobytes()))

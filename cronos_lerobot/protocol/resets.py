@@ -14,14 +14,15 @@ from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import LoopState
+from cronos_lerobot.protocol.own_state import load_own_state, own_state
 from cronos_lerobot.protocol.task_values import RunContext, TaskValues
 
 
 class ResetStrategy(ABC):
     """One kind of intervention: which streams need it now, and how it is applied to them.
 
-    It keeps nothing of its own besides its generator; what it has to remember of a stream is in `LoopState`, so
-    that a run can be resumed.
+    What it has to remember of a stream is in `LoopState`; what it keeps besides that and its generator it tells in
+    `state_dict`, or a resumed run goes on without it.
     """
 
     kind: Intervention
@@ -29,6 +30,14 @@ class ResetStrategy(ABC):
 
     def bind(self, run: RunContext) -> None:
         """Told once, before the run begins or goes on, what it is made of. A ValueError refuses the run."""
+        return
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint has to hold of it: dicts and lists of numbers, strings and NumPy arrays."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from `state_dict`, if that was not empty; called after `bind`."""
         return
 
     @abstractmethod
@@ -246,10 +255,26 @@ class Resets:
 
     def bind(self, run: RunContext) -> None:
         """Tell every strategy what the run is made of; a ValueError refuses the run."""
-        for strategy in (
-            self.initial, self.divergence, self.end_effector, self.heuristic, *self.extra, self.scene
-        ):  # fmt: skip
+        for strategy in self._all():
             strategy.bind(run)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What the strategies keep of their own, {} where none keeps anything.
+
+        Raises:
+            ValueError: a strategy keeps what a checkpoint cannot hold.
+        """
+        states = [own_state(strategy) for strategy in self._all()]
+        return {"strategies": states} if any(states) else {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from `state_dict` of the same strategies."""
+        for strategy, own in zip(self._all(), state["strategies"], strict=True):
+            load_own_state(strategy, own)
+
+    def _all(self) -> list[ResetStrategy]:
+        first = [self.initial, self.divergence, self.end_effector, self.heuristic]
+        return [*first, *self.extra, self.scene, self.takeover]
 
 
 ResetFactory = Callable[[np.random.Generator, ProtocolConfig], ResetStrategy]

@@ -10,6 +10,7 @@ import numpy as np
 
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.loop_state import LoopState
+from cronos_lerobot.protocol.own_state import load_own_state, own_state
 from cronos_lerobot.protocol.task_values import RunContext, TaskValues
 
 
@@ -44,7 +45,8 @@ class TaskOrder(Protocol):
     """TASKSCHEDULER of Algorithm 1.
 
     `loop` has each stream's history: `attempts` and `successes` by task, `recent_task` and `recent_success` one by
-    one. An order keeps nothing of its own besides its generator, so that a run can be resumed.
+    one. What an order keeps besides that and its generator it tells in `state_dict()` and takes back in
+    `load_state_dict(state)`, as a `ResetStrategy` does, or a resumed run goes on without it.
 
     An order may also have `bind(run)`: it is then told once, before the run begins or goes on, what the run is
     made of, a `RunContext`; a ValueError refuses the run.
@@ -166,6 +168,14 @@ class CheckedOrder:
         """Tell the order."""
         bind_task_order(self.order, run)
 
+    def state_dict(self) -> dict[str, Any]:
+        """What the order keeps of its own."""
+        return own_state(self.order)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Let the order go on from it."""
+        load_own_state(self.order, state)
+
     def draw(self, loop: LoopState) -> np.ndarray:
         """What the order draws."""
         drawn = self.order.draw(loop)
@@ -199,6 +209,14 @@ class LearnedReset:
     def bind(self, run: RunContext) -> None:
         """Tell the order of the tasks in between."""
         bind_task_order(self.order, run)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What the order of the tasks in between keeps of its own."""
+        return own_state(self.order)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Let that order go on from it."""
+        load_own_state(self.order, state)
 
     def draw(self, loop: LoopState) -> np.ndarray:
         """A task for every stream, or the reset task of every stream, in turns."""

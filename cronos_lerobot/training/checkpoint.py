@@ -4,7 +4,7 @@ checkpoints/
   0102400/
     pretrained_model/   config.json, model.safetensors, processors, train_config.json: what LeRobot loads
     training_state/     optimizer, RNGs, loop.json, env_state.npz, observers.pt, training_step.json, run.json;
-                        agent.pt: what the agent keeps of its own
+                        agent.pt: what the agent keeps of its own; strategies.pt: task order and resets
   last -> 0102400
 
 Of a run on many processes it holds the streams and random numbers of all of them, written by the first one.
@@ -46,6 +46,7 @@ from cronos_lerobot.agents.state import to_arrays, to_tensors
 from cronos_lerobot.agents.weights import load_weights, weights_file
 from cronos_lerobot.processes import Processes
 from cronos_lerobot.protocol.loop_state import LoopState
+from cronos_lerobot.protocol.own_state import load_own_state, own_state
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.resume import RUN, check_resumed, describe_run
 from cronos_lerobot.training.seeding import NamedGenerators
@@ -57,6 +58,7 @@ AGENT = "agent.pt"
 ENV_STATE = "env_state.npz"
 LOOP = "loop.json"
 OBSERVERS = "observers.pt"
+STRATEGIES = "strategies.pt"
 PROCESS_RNG = "rng_state_process_{rank}.safetensors"
 """State of Python's, NumPy's and PyTorch's own generators of the processes after the first."""
 PARTIAL = ".partial_"
@@ -74,6 +76,16 @@ class RunState:
     preprocessor: Any
     postprocessor: Any
     processes: Processes = field(default_factory=Processes)
+    strategies: dict[str, Any] = field(default_factory=dict)
+    """Task order and resets, by name: they may keep something of their own."""
+
+    def strategies_state(self) -> dict[str, Any]:
+        """What each of them keeps.
+
+        Raises:
+            ValueError: one keeps what a checkpoint cannot hold.
+        """
+        return {name: own_state(part) for name, part in self.strategies.items()}
 
 
 def save_checkpoint(
@@ -148,6 +160,7 @@ def load_checkpoint(run: RunState, config: CronosTrainConfig, folder: Path) -> d
     with _reading(state_dir / ENV_STATE) as path, np.load(path) as arrays:
         run.env.set_state(dict(arrays))
     run.agent.load_state_dict(_load_agent(state_dir / AGENT))
+    _load_strategies(run, state_dir / STRATEGIES)
     _load_rng_state(state_dir, run.processes.rank)
     with _reading(state_dir / OBSERVERS) as path:
         return to_arrays(torch.load(path))
@@ -179,6 +192,7 @@ def _write_training_state(
     save_training_step(run.loop.n, folder, num_processes=run.processes.count)
     np.savez(folder / ENV_STATE, allow_pickle=False, **env_state)
     torch.save(to_tensors(observers), folder / OBSERVERS)
+    torch.save(to_tensors(run.strategies_state()), folder / STRATEGIES)
     state = {"loop": run.loop.state_dict(), "generators": generators}
     (folder / LOOP).write_text(json.dumps(state))
 
@@ -191,6 +205,16 @@ def _load_agent(path: Path) -> dict[str, Any]:
         )
     with _reading(path):
         return torch.load(path, map_location="cpu")
+
+
+def _load_strategies(run: RunState, path: Path) -> None:
+    # Checkpoints were once without: strategies kept nothing then.
+    if not path.is_file():
+        return
+    with _reading(path):
+        states = to_arrays(torch.load(path))
+    for name, part in run.strategies.items():
+        load_own_state(part, states[name])
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from lerobot.envs import EnvConfig
 from cronos_lerobot.agents.base import Agent, LearningAgent
 from cronos_lerobot.agents.processing import make_processors
 from cronos_lerobot.agents.registry import AgentContext, make_agent
+from cronos_lerobot.agents.state import to_comparable
 from cronos_lerobot.evaluation.independent import evaluate_independent
 from cronos_lerobot.processes import Processes, bit_sum
 from cronos_lerobot.protocol.loop_state import Event, SegmentEnd, Step, Update
@@ -93,8 +94,11 @@ class Trainer:
         self._num_recorded = config.num_envs if isinstance(recorded, str) else recorded
         self._observers: dict[str, Any] = {}
         self.run_state = RunState(
-            self.agent, self.loop, self.generators, self.env, preprocessor, postprocessor, self.processes
-        )
+            self.agent, self.loop, self.generators, self.env, preprocessor, postprocessor, self.processes,
+            {"task_order": self._task_order, "resets": self._resets},
+        )  # fmt: skip
+        # What no checkpoint can hold is told now, and not hours later.
+        self.run_state.strategies_state()
         self.statistics = RolloutStatistics([t.instruction for t in self.task_set.all], len(self.task_set.tasks))
         self.critic_log = CriticLog(config.protocol)
         self._smoothed = SmoothedSuccess(config.protocol, len(self.task_set.tasks))
@@ -264,6 +268,7 @@ class Trainer:
             {
                 "the loop's state": self.loop.state_dict(),
                 "the random numbers": {name: states[name] for name in sorted(self._drawn_alike)},
+                "the strategies' own state": to_comparable(self.run_state.strategies_state()),
                 "the policy": bit_sum(self.agent.shared_tensors()),
             }
         )
