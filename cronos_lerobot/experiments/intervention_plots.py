@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -25,8 +24,8 @@ PLUG_COLORS = tuple(color for color in COLORS if color != "#555555")
 """Rows of the paper's aids are grey and told apart by markers, all others have colours."""
 SAME_PLACE, MARK_POINTS = 1.2, 7.0
 """Marks whose places differ by less than this factor stand side by side, so far from each other [points]."""
-ROOM_FOR_A_MARK = 0.015
-"""Of the axis of steps, at its end, where the marks of most rows stand side by side."""
+MOST_MARKS = 9
+"""Of one base policy in a panel of steps, where nobody could tell more of them apart."""
 
 
 @dataclass(frozen=True)
@@ -57,34 +56,79 @@ def interventions_figure(result: ExperimentResult) -> Figure | None:
     """A line of panels for each kind of base policy: success against interventions, and against steps.
 
     Faint lines are runs from their beginning, means over the seeds; marks are their ends, with intervals, side by
-    side where they would cover each other.
+    side where they would cover each other. Many rows have a list of their ends in place of the panel of steps.
     """
-    bases = list(dict.fromkeys(_panel(row) for row in result.rows if row.drawn))
-    if not bases:
-        return None
-    styles = row_styles(result)
-    figure = Figure(figsize=(10, 3.4 * len(bases) + 0.11 * len(result.rows) + 0.4), layout="constrained")
-    axes = figure.subplots(len(bases), 2, squeeze=False, sharey=True, sharex="col")
     drawn = {row.row.name: end for row in result.rows if (end := find_end(row))}
-    for base, line in zip(bases, axes, strict=True):
-        rows = [row for row in result.rows if _panel(row) == base and row.row.name in drawn]
+    by_base: dict[str, list[RowResult]] = {}
+    for row in result.rows:
+        if row.row.name in drawn:
+            by_base.setdefault(_panel(row), []).append(row)
+    if not by_base:
+        return None
+    most = max(map(len, by_base.values()))
+    figure = _with_list(result, by_base, drawn) if most > MOST_MARKS else _with_steps(result, by_base, drawn)
+    panels = figure.axes[::2]
+    for ax, (base, rows) in zip(panels, by_base.items(), strict=True):
+        _join_ends(ax, rows, result, row_styles(result))
+        ax.set_title(f"{base} base policy", fontsize=9, color=INK, loc="left")
+        ax.set_ylabel("success, training configurations")
+    _logarithmic(panels, [end.interventions for end in drawn.values()])
+    for ax in panels:
+        ax.label_outer()
+    return figure
+
+
+def _with_steps(result: ExperimentResult, by_base: dict[str, list[RowResult]], drawn: dict[str, End]) -> Figure:
+    size = (10, 3.4 * len(by_base) + 0.11 * len(result.rows) + 0.4)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(len(by_base), 2, squeeze=False, sharey=True, sharex="col")
+    for rows, line in zip(by_base.values(), axes, strict=True):
         for ax, axis in zip(line, (INTERVENTIONS, INTERACTION_STEPS), strict=True):
-            places = [drawn[row.row.name].x(axis) for row in rows]
-            for row, x, shift in zip(rows, places, side_by_side(places), strict=True):
-                _draw_row(ax, row, styles[row.row.name], drawn[row.row.name], axis, (x, shift))
-            style_axes(ax, AXIS_LABELS[axis])
-            ax.set_ylim(-0.03, 1.03)
-        _join_ends(line[0], rows, result, styles)
-        line[0].set_title(f"{base} base policy", fontsize=9, color=INK, loc="left")
-        line[0].set_ylabel("success, training configurations")
-    _logarithmic(axes[:, 0], [end.interventions for end in drawn.values()])
-    most = max(Counter(_panel(row) for row in result.rows if row.row.name in drawn).values())
-    room = max(0.15, ROOM_FOR_A_MARK * most)
-    axes[0, 1].set_xlim(left=0, right=(1 + room) * max(end.steps for end in drawn.values()))
-    for ax in axes.flat:
+            _draw_rows(ax, rows, row_styles(result), drawn, axis)
+    axes[0, 1].set_xlim(left=0, right=1.15 * max(end.steps for end in drawn.values()))
+    for ax in axes[:, 1]:
         ax.label_outer()
     legend_below(figure, list(axes.flat))
     return figure
+
+
+def _with_list(result: ExperimentResult, by_base: dict[str, list[RowResult]], drawn: dict[str, End]) -> Figure:
+    heights = [0.21 * len(rows) + 0.7 for rows in by_base.values()]
+    figure = Figure(figsize=(11, sum(heights) + 0.5), layout="constrained")
+    grid = {"height_ratios": heights, "width_ratios": (5, 4)}
+    axes = figure.subplots(len(by_base), 2, squeeze=False, sharex="col", gridspec_kw=grid)
+    for rows, (left, right) in zip(by_base.values(), axes, strict=True):
+        _draw_rows(left, rows, row_styles(result), drawn, INTERVENTIONS, with_intervals=False)
+        for place, row in enumerate(rows):
+            style, success = row_styles(result)[row.row.name], drawn[row.row.name].success
+            look = {"color": style.color, "marker": style.marker, "ms": 5.5, "lw": 0, "elinewidth": 1.4}
+            right.errorbar([success.mean], [place], xerr=_error(success), **look)
+        begins = [curve[0].success for row in rows for seed in row.drawn if (curve := seed.curve(SPLIT))]
+        right.axvline(float(np.mean(begins)), color=INK, lw=1.0, ls=":", zorder=1)
+        style_axes(right, "success at the end; dotted, before training")
+        labels = [f"{row_styles(result)[row.row.name].label} ({_seeds(row)})" for row in rows]
+        right.set_yticks(range(len(rows)), labels, fontsize=7.5)
+        right.set_ylim(len(rows) - 0.4, -0.6)
+    for ax in axes[:-1, 1]:
+        ax.set_xlabel("")
+    return figure
+
+
+def _draw_rows(
+    ax: Axes,
+    rows: list[RowResult],
+    styles: dict[str, Style],
+    drawn: dict[str, End],
+    axis: str,
+    *,
+    with_intervals: bool = True,
+) -> None:
+    places = [drawn[row.row.name].x(axis) for row in rows]
+    for row, x, shift in zip(rows, places, side_by_side(places), strict=True):
+        place = (x, shift if with_intervals else 0.0)
+        _draw_row(ax, row, styles[row.row.name], drawn[row.row.name], axis, place, with_intervals)
+    style_axes(ax, AXIS_LABELS[axis])
+    ax.set_ylim(-0.03, 1.03)
 
 
 def side_by_side(places: list[float]) -> list[float]:
@@ -127,18 +171,29 @@ def _panel(row: RowResult) -> str:
     return row.row.base.replace("_", " ")
 
 
-def _draw_row(ax: Axes, row: RowResult, style: Style, end: End, axis: str, place: tuple[float, float]) -> None:
+def _error(success: Summary) -> list[list[float]]:
+    low, high = success.ci95 or (success.mean, success.mean)
+    return [[success.mean - low], [high - success.mean]]
+
+
+def _draw_row(
+    ax: Axes,
+    row: RowResult,
+    style: Style,
+    end: End,
+    axis: str,
+    place: tuple[float, float],
+    with_interval: bool,
+) -> None:
     """A row's curve, and its end at a place on the axis, so many points to the right of it."""
     if curve := row_curve(row, SPLIT, axis):
         ax.plot(curve.x, curve.y, color=style.color, lw=1.0, alpha=0.4, zorder=2)
     figure = ax.get_figure(root=True)
     assert figure is not None
     x, shift = place
-    low, high = end.success.ci95 or (end.success.mean, end.success.mean)
-    error = [[end.success.mean - low], [high - end.success.mean]]
     ax.errorbar(
-        [x], [end.success.mean], yerr=error, color=style.color, marker=style.marker, ms=5.5, lw=0, elinewidth=1.4,
-        label=f"{style.label} ({_seeds(row)})", zorder=4,
+        [x], [end.success.mean], yerr=_error(end.success) if with_interval else None, color=style.color,
+        marker=style.marker, ms=5.5, lw=0, elinewidth=1.4, label=f"{style.label} ({_seeds(row)})", zorder=4,
         transform=ax.transData + ScaledTranslation(shift / 72, 0, figure.dpi_scale_trans),
     )  # fmt: skip
 

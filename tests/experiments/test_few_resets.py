@@ -8,7 +8,6 @@ from flags import parse_flags
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base
 from cronos_lerobot.experiments.few_resets import BUDGET, METHOD_BY_BUDGET, PLUGS, plugged, wide
 from cronos_lerobot.experiments.intervention_plots import (
-    MARKERS,
     find_end,
     interventions_figure,
     row_styles,
@@ -168,20 +167,23 @@ def test_one_way_of_training_from_two_wide_bases_has_a_line_of_panels_for_each(t
     assert [box[0].get_ydata()[0] for ax in (first, second) for box in ax.containers] == [0.75, 0.5]
 
 
-def test_marks_of_many_rows_stay_in_the_panel_of_steps(options):
-    """All rows end after as many steps."""
+def test_many_rows_are_listed_by_name_beside_their_interventions(options):
     experiment = EXPERIMENTS["few_resets"]
     narrow = [row for row in experiment.rows if "wide" not in row.name]
-    for row in narrow:
-        make_run(options, "few_resets", row.name, 1, (2, 4, 6))
+    for number, row in enumerate(narrow):
+        make_run(options, "few_resets", row.name, 1, (2, 4, number % 8))
     figure = interventions_figure(collect(experiment, experiment.rows, options))
-    figure.draw_without_rendering()
-    _, ax = figure.axes
-    marks = [mark for mark in ax.lines if mark.get_marker() in MARKERS]
-    places = [mark.get_transform().transform((mark.get_xdata()[0], 0))[0] for mark in marks]
-    assert len(places) == len(narrow)
-    assert ax.bbox.x0 < min(places)
-    assert max(places) < ax.bbox.x1
+    assert not figure.legends
+    by_interventions, ends = figure.axes
+    assert len(by_interventions.containers) == len(narrow)
+    # From above, as in the experiment: place and success.
+    listed = [(mark[0].get_ydata()[0], mark[0].get_xdata()[0]) for mark in ends.containers]
+    assert listed == [(number, number % 8 / 8) for number in range(len(narrow))]
+    labels = [text.get_text() for text in ends.get_yticklabels()]
+    assert labels == [f"{row.label} (1 seed)" for row in narrow]
+    assert ends.yaxis_inverted()
+    (begin,) = [line for line in ends.lines if line.get_linestyle() == ":"]
+    assert begin.get_xdata()[0] == 2 / 8
 
 
 def test_marks_at_one_place_stand_side_by_side():
