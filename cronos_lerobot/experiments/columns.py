@@ -40,6 +40,10 @@ def main_columns(result: ExperimentResult) -> Columns:
         summaries = [row.success(split) for row in result.rows]
         columns[f"success{suffix}"] = [_cell(summary) for summary in summaries]
         columns[f"95 %{suffix}"] = [_interval(summary) for summary in summaries]
+        if any(row[f"seeds_{split}"] not in (0, row["seeds"]) for row in rows):
+            columns[f"seeds{suffix}" if suffix else "evaluated"] = [
+                f"{row[f'seeds_{split}']}/{row['seeds']}" for row in rows
+            ]
         columns[f"n{suffix}"] = [str(row[f"n_{split}"] or MISSING) for row in rows]
         for name in APART:
             columns[f"{name.replace('_', ' ')}{suffix}"] = [_number(row[f"{name}_{split}"], 0) for row in rows]
@@ -79,12 +83,14 @@ def difference_columns(found: Sequence[RowDifference]) -> Columns:
 
 def _decided(title: str, found: Sequence[RowDifference | Gain]) -> Columns:
     ps = [one.difference.p for one in found]
-    adjusted = holm([1.0 if p is None else p for p in ps])
+    # Where nothing varies, as between trainings that all succeed at everything, there is no p.
+    known = iter(holm([p for p in ps if p is not None]))
+    adjusted = [None if p is None else next(known) for p in ps]
     return {
         title: [f"{one.difference.value:+.3f}" for one in found],
         "95 %": [_signed_interval(one.difference.ci95) for one in found],
         "p": [MISSING if p is None else f"{p:.2g}" for p in ps],
-        "p (Holm)": [f"{p:.2g}" for p in adjusted],
+        "p (Holm)": [MISSING if p is None else f"{p:.2g}" for p in adjusted],
         "of": [_of(one) for one in found],
         "verdict": [_verdict(one.difference.value, p) for one, p in zip(found, adjusted, strict=True)],
     }
@@ -94,7 +100,9 @@ def _signed_interval(ends: tuple[float, float] | None) -> str:
     return MISSING if ends is None else f"[{ends[0]:+.3f}, {ends[1]:+.3f}]"
 
 
-def _verdict(difference: float, p: float) -> str:
+def _verdict(difference: float, p: float | None) -> str:
+    if p is None:
+        return MISSING
     if p >= ALPHA:
         return "not separated"
     return "better" if difference > 0 else "worse"

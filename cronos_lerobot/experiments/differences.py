@@ -77,12 +77,11 @@ def _gain(row: RowResult) -> Gain | None:
         # Another version's, or of another benchmark.
         return None
     before, after = (np.array([[o.lengths[e] for e in episodes] for o in side]) for side in sides)
-    configurations = np.array([episode.configuration for episode in episodes])
     if len(runs) == 1:
-        difference = compare_policies(Pairs(before, after, configurations), POWER)
+        difference = compare_policies(Pairs.of(before, after, episodes), POWER)
     else:
         # Each run against its own base: what differs from seed to seed is the gain.
-        gained = Pairs(np.zeros((1, len(episodes)), int), after - before, configurations)
+        gained = Pairs.of(np.zeros((1, len(episodes)), int), after - before, episodes)
         difference = compare_trainings(gained, POWER)
         assert difference is not None, "there are several trainings"
     return Gain(row, float(before.mean()), float(after.mean()), difference, len(runs), len(episodes))
@@ -134,7 +133,7 @@ def _outcomes(row: RowResult, suite: str, split: str) -> dict[int, Outcomes]:
     for seed in row.finished:
         own = (suite, split) == ("independent", "train")
         # Only what the report has read: what another version made is left out there, too.
-        if not own and seed.spec.steps not in seed.evaluations.get((suite, split), {}):
+        if not own and seed.end not in seed.evaluations.get((suite, split), {}):
             continue
         # A run may have been evaluated when episodes were not kept.
         with suppress(ValueError):

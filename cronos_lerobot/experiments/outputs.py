@@ -230,6 +230,7 @@ def _unfinished(result: ExperimentResult) -> list[str]:
                     f"- {seed.spec.name}: {seed.run.last['interaction_steps']:,} of {seed.spec.steps:,} steps"
                     f" ({seed.status or 'no note of its start'})"
                 )
+            lines += [f"- {name}: not evaluated" for name in seed.missing if seed.finished]
         lines += [f"- {name}: no record so far ({state})" for name, state in row.unrecorded.items()]
         missing = row.wanted - len(row.seeds) - len(row.unrecorded)
         if missing:
@@ -241,7 +242,7 @@ def _unfinished(result: ExperimentResult) -> list[str]:
             "",
             "Unfinished runs are drawn only where a row has no finished one.",
             "",
-            *lines,
+            *dict.fromkeys(lines),
         ]
     if early := _ended_early(result):
         lines += ["", "## Ended by their budget of interventions", "", *early]

@@ -102,9 +102,10 @@ def train_flags(spec: RunSpec) -> list[str]:
 def train_job(spec: RunSpec, base: str | None) -> Job:
     """One run of `cronos-train`."""
     options = spec.options
-    episodes = min(options.scale.eval_episodes, spec.row.num_configurations)
+    extra, wanted = _eval_episodes(options)
+    episodes = min(wanted, spec.row.num_configurations)
     # From few configurations as many episodes as from all.
-    repetitions = options.scale.eval_episodes // episodes if options.temperature else 1
+    repetitions = wanted // episodes if options.temperature else 1
     command = [
         "cronos-train",
         f"--policy.path={base_policy(spec.base, options)}",
@@ -126,7 +127,7 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
     ]
     # A smoke run's share of a budget may be none, which is no budget.
     budgets = [f"{flag}={max(1, spec.scaled(number))}" for flag, number in spec.row.budgets]
-    command = _with_flags(command, spec.row.flags, budgets, options.extra)
+    command = _with_flags(command, spec.row.flags, budgets, extra)
 
     return Job(
         spec.name,
@@ -141,6 +142,16 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
         work=spec.steps,
         root=options.root,
     )
+
+
+def _eval_episodes(options: Options) -> tuple[list[str], int]:
+    """The other flags that were given for every run, and the episodes of each task in its evaluations."""
+    name = "--eval.n_episodes="
+    given = [flag.removeprefix(name) for flag in options.extra if flag.startswith(name)]
+    if not given or not given[-1].isdigit() or not int(given[-1]):
+        # What is no number is told when the command is checked.
+        return list(options.extra), options.scale.eval_episodes
+    return [flag for flag in options.extra if not flag.startswith(name)], int(given[-1])
 
 
 def resume_command(folder: Path, command: Iterable[str]) -> list[str] | None:

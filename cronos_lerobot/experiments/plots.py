@@ -38,9 +38,9 @@ def row_curve(row: RowResult, split: str, axis: str, task: str | None = None) ->
     return mean_curve([([p.x(axis) for p in c], [p.success for p in c]) for c in curves]) if curves else None
 
 
-def row_label(row: RowResult) -> str:
-    """The legend's entry: settings and seeds."""
-    number = len(row.drawn)
+def row_label(row: RowResult, number: int | None = None) -> str:
+    """The legend's entry: settings and seeds, all that are drawn or `number` of them."""
+    number = len(row.drawn) if number is None else number
     seeds = f"{number} seed{'s' * (number != 1)}"
     return f"{row.row.label} ({seeds}{'' if row.finished else ', unfinished'})"
 
@@ -68,7 +68,8 @@ def _grid(result: ExperimentResult, panels: list[list[Panel]]) -> Figure | None:
         for (split, axis, task), ax in zip(line, line_axes, strict=True):
             for i, row in enumerate(result.rows):
                 curve = row_curve(row, split, axis, task)
-                draw_curve(ax, curve, i, row_label(row), marker="o", width=1.5, marker_size=3)
+                number = sum(bool(seed.curve(split, task)) for seed in row.drawn)
+                draw_curve(ax, curve, i, row_label(row, number), marker="o", width=1.5, marker_size=3)
             style_axes(ax, AXIS_LABELS[axis])
             if axis == INTERVENTIONS:
                 _spread_interventions(ax)
@@ -184,7 +185,7 @@ def _sequential_panel(ax: Axes, rows: list) -> None:
             yerr=spread,
             color=COLORS[i % len(COLORS)],
             ecolor=INK,
-            label=row_label(row),
+            label=row_label(row, found["seeds"]),
         )
     style_axes(ax, "task in the sequence")
     ax.set_xticks(x, [f"SEQ {position}" for position in x])

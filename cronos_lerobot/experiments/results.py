@@ -84,18 +84,31 @@ class SeedResult:
     """What cronos-eval found: by suite and split, then by checkpoint [interaction steps], the base policy at 0."""
     seconds: float = 0.0
     """That its training took, all starts together."""
+    missing: list[str] = field(default_factory=list)
+    """Names of the evaluations by cronos-eval that are not there yet."""
 
     @property
     def finished(self) -> bool:
         """Whether the run came to its end."""
         return self.status == DONE
 
+    @property
+    def end(self) -> int:
+        """Interaction steps at its last checkpoint, which a reset budget may have brought early."""
+        return (
+            self.run.last["interaction_steps"] if self.finished and self.spec.row.has_budget else self.spec.steps
+        )
+
+    def place(self, checkpoint: int) -> int:
+        """Where an evaluation of a checkpoint stands on the axis of steps [interaction steps]."""
+        return self.end if checkpoint == self.spec.steps else checkpoint
+
     def curve(self, split: str, task: str | None = None) -> list[Point]:
         """Success of a task, or of all together, over the run: its own evaluations, or else cronos-eval's."""
         own = [e for e in self.run.evaluations if e["split"] == split]
         if own:
             return [_point(e["interaction_steps"], e["interventions"], e, task) for e in own]
-        counts = {0: 0} | {u["interaction_steps"]: u["interventions"] for u in self.run.updates}
+        counts = {0: 0} | {u["interaction_steps"]: u["interventions"] for u in (*self.run.updates, self.run.last)}
         found = self.evaluations.get(("independent", split), {})
         return [_point(n, counts[n], result, task) for n, result in sorted(found.items()) if n in counts]
 
@@ -157,10 +170,10 @@ class RowResult:
         finished = [
             (curve, seed.run.last["interventions"]) for seed in self.finished if (curve := seed.curve(split))
         ]
-        if finished and max(last for _, last in finished) < interventions:
-            return AtBudget(
-                None, reason=f"the runs ended after {max(last for _, last in finished):,} interventions"
-            )
+        early = [last for _, last in finished if last < interventions]
+        if early:
+            which = "the runs" if len(early) == len(finished) else f"{len(early)} of {len(finished)} runs"
+            return AtBudget(None, reason=f"{which} ended after {max(early):,} interventions")
         values: list[float] = []
         gaps: list[tuple[int, int]] = []
         for curve, _ in finished:
@@ -273,7 +286,7 @@ def _read_seed(spec: RunSpec, result: ExperimentResult) -> SeedResult | None:
         for job in base_evaluation_jobs(spec.base, spec.options, evaluation):
             _read_evaluation(job, 0, evaluation, seed, result)
         for job, checkpoint in checkpoint_evaluations(spec, evaluation):
-            _read_evaluation(job, checkpoint, evaluation, seed, result)
+            _read_evaluation(job, seed.place(checkpoint), evaluation, seed, result)
     return seed
 
 
@@ -282,6 +295,7 @@ def _read_evaluation(
 ) -> None:
     """Add what an evaluation of a checkpoint, or of the base policy, found on its splits, if it is there."""
     if not (job.output / RESULTS).is_file():
+        seed.missing.append(job.name)
         return
     try:
         if found := changes(job):
@@ -319,9 +333,9 @@ def sequential(row: RowResult, split: str, orderings: str = "all") -> dict[str, 
         no result.
     """
     whole = [
-        results[seed.spec.steps]
+        results[seed.end]
         for seed in row.finished
-        if seed.spec.steps in (results := seed.evaluations.get(("sequential", split), {}))
+        if seed.end in (results := seed.evaluations.get(("sequential", split), {}))
     ]
     found = whole if orderings == "all" else [part for result in whole if (part := result.get(orderings))]
     if not found:
@@ -335,6 +349,7 @@ def sequential(row: RowResult, split: str, orderings: str = "all") -> dict[str, 
         "positions": [summarise(column) for column in rates.T],
         "chain_length": summarise(lengths),
         "n": found[0]["n"],
+        "seeds": len(found),
     }
 
 

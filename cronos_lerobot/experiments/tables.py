@@ -55,6 +55,7 @@ def _main_row(result: ExperimentResult, row: RowResult, shared: float | None) ->
     }
     for split in result.experiment.splits:
         cells |= _numbers(f"success_{split}", row.success(split))
+        cells[f"seeds_{split}"] = len(row.finals(split))
         cells[f"n_{split}"] = next((point.n for point in row.finals(split)), None)
         cells |= {f"{name}_{split}": row.apart(split).get(name) for name in APART}
     paper = paper_results()["final_success"].get(result.experiment.name, {}).get(setting.name)

@@ -73,8 +73,14 @@ def success_at(x: Numbers, y: Numbers, at: float) -> float:
     return float(interpolate(x, y, [at])[0])
 
 
-def interpolate(x: Numbers, y: Numbers, at: Numbers) -> np.ndarray:
+def interpolate(x: Numbers, y: Numbers, at: Numbers, *, is_first: bool = False) -> np.ndarray:
     """`success_at` for several places: (len(at),), NaN beyond the curve's ends.
+
+    Args:
+        x: interaction steps or interventions at each evaluation.
+        y: success at each evaluation.
+        at: the places.
+        is_first: of several evaluations at a place take the first one, in place of the last.
 
     Raises:
         ValueError: there is no point, or `x` falls.
@@ -91,6 +97,9 @@ def interpolate(x: Numbers, y: Numbers, at: Numbers) -> np.ndarray:
     width = np.where(right > left, unique[right] - unique[left], 1.0)
     share = (places[inside] - unique[left]) / width
     result[inside] = values_after[left] + share * (values_before[right] - values_after[left]) * (right > left)
+    if is_first:
+        exact = np.flatnonzero(inside)[places[inside] == unique[left]]
+        result[exact] = values_before[np.searchsorted(unique, places[exact])]
     return result
 
 

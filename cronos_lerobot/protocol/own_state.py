@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -9,12 +11,41 @@ import numpy as np
 LEAVES = (bool, int, float, str, np.ndarray, type(None))
 
 
-def own_state(part: Any) -> dict[str, Any]:
-    """Return what `part.state_dict()` says, {} of a part that has no such method.
+def own_states(parts: Iterable[Any]) -> dict[str, dict[str, Any]]:
+    """Return what each of `parts` says in `state_dict()`, by its class, of those that say anything.
 
     Raises:
-        ValueError: it says what a checkpoint cannot hold; the part, the place and the type are named.
+        ValueError: one says what a checkpoint cannot hold; the part, the place and the type are named.
     """
+    return {name: state for name, part in _named(parts).items() if (state := _own_state(part))}
+
+
+def load_own_states(parts: Iterable[Any], states: dict[str, dict[str, Any]]) -> None:
+    """Let those of `parts` that `own_states` has something of go on from it.
+
+    A resumed run may have other strategies than before: they begin anew, and what is of none of them is dropped.
+    """
+    named = _named(parts)
+    for name, state in states.items():
+        if name in named:
+            named[name].load_state_dict(state)
+        else:
+            logging.warning(
+                f"The checkpoint has the state of {name}, which this run does not have: it is dropped."
+            )
+
+
+def _named(parts: Iterable[Any]) -> dict[str, Any]:
+    """By their classes; of one class the second and later ones with a number."""
+    named: dict[str, Any] = {}
+    for part in parts:
+        name = type(part).__name__
+        same = sum(other.partition(" ")[0] == name for other in named)
+        named[f"{name} {same + 1}" if same else name] = part
+    return named
+
+
+def _own_state(part: Any) -> dict[str, Any]:
     method = getattr(part, "state_dict", None)
     if method is None:
         return {}
@@ -25,12 +56,6 @@ def own_state(part: Any) -> dict[str, Any]:
         raise ValueError(f"{type(part).__name__}.state_dict() must return a dict, got {state!r}.")
     _check(state, f"{type(part).__name__}.state_dict()")
     return state
-
-
-def load_own_state(part: Any, state: dict[str, Any]) -> None:
-    """Go on from `own_state`; nothing to do for a part that had none."""
-    if state:
-        part.load_state_dict(state)
 
 
 def _check(value: Any, where: str) -> None:

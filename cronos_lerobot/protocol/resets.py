@@ -14,7 +14,6 @@ from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import LoopState
-from cronos_lerobot.protocol.own_state import load_own_state, own_state
 from cronos_lerobot.protocol.task_values import RunContext, TaskValues
 
 
@@ -255,26 +254,14 @@ class Resets:
 
     def bind(self, run: RunContext) -> None:
         """Tell every strategy what the run is made of; a ValueError refuses the run."""
-        for strategy in self._all():
+        for strategy in self.all:
             strategy.bind(run)
 
-    def state_dict(self) -> dict[str, Any]:
-        """What the strategies keep of their own, {} where none keeps anything.
-
-        Raises:
-            ValueError: a strategy keeps what a checkpoint cannot hold.
-        """
-        states = [own_state(strategy) for strategy in self._all()]
-        return {"strategies": states} if any(states) else {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from `state_dict` of the same strategies."""
-        for strategy, own in zip(self._all(), state["strategies"], strict=True):
-            load_own_state(strategy, own)
-
-    def _all(self) -> list[ResetStrategy]:
-        first = [self.initial, self.divergence, self.end_effector, self.heuristic]
-        return [*first, *self.extra, self.scene, self.takeover]
+    @property
+    def all(self) -> tuple[ResetStrategy, ...]:
+        """Every one of them."""
+        first = (self.initial, self.divergence, self.end_effector, self.heuristic)
+        return (*first, *self.extra, self.scene, self.takeover)
 
 
 ResetFactory = Callable[[np.random.Generator, ProtocolConfig], ResetStrategy]

@@ -10,7 +10,6 @@ import numpy as np
 
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.loop_state import LoopState
-from cronos_lerobot.protocol.own_state import load_own_state, own_state
 from cronos_lerobot.protocol.task_values import RunContext, TaskValues
 
 
@@ -168,14 +167,6 @@ class CheckedOrder:
         """Tell the order."""
         bind_task_order(self.order, run)
 
-    def state_dict(self) -> dict[str, Any]:
-        """What the order keeps of its own."""
-        return own_state(self.order)
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Let the order go on from it."""
-        load_own_state(self.order, state)
-
     def draw(self, loop: LoopState) -> np.ndarray:
         """What the order draws."""
         drawn = self.order.draw(loop)
@@ -210,14 +201,6 @@ class LearnedReset:
         """Tell the order of the tasks in between."""
         bind_task_order(self.order, run)
 
-    def state_dict(self) -> dict[str, Any]:
-        """What the order of the tasks in between keeps of its own."""
-        return own_state(self.order)
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Let that order go on from it."""
-        load_own_state(self.order, state)
-
     def draw(self, loop: LoopState) -> np.ndarray:
         """A task for every stream, or the reset task of every stream, in turns."""
         if loop.switches % 2:
@@ -230,6 +213,13 @@ def bind_task_order(order: TaskOrder, run: RunContext) -> None:
     bind = getattr(order, "bind", None)
     if bind is not None:
         bind(run)
+
+
+def find_inner(order: TaskOrder) -> TaskOrder:
+    """The order itself, out of what `make_task_order` has put around it."""
+    while isinstance(order, CheckedOrder | LearnedReset):
+        order = order.order
+    return order
 
 
 def check_task_order(name: str) -> None:

@@ -82,8 +82,8 @@ def identity(outcomes: Outcomes) -> str:
     return f"{what} {sorted((name, str(outcomes.setting.get(name))) for name in WORTH_SAYING)}"
 
 
-def _order(checkpoint: str) -> tuple[bool, str]:
-    return checkpoint == LAST, checkpoint
+def _order(checkpoint: str) -> tuple[bool, int, str]:
+    return checkpoint == LAST, int(checkpoint) if checkpoint.isdigit() else -1, checkpoint
 
 
 def run_and_checkpoint(outcomes: Outcomes) -> tuple[str, str]:

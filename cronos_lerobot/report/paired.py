@@ -7,7 +7,7 @@ The episodes of one configuration go together, too, as they begin in one scene, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import sqrt
 
@@ -15,6 +15,7 @@ import numpy as np
 from lerobot_env_cronos.statistics import Z_95, wilson_interval
 from scipy.stats import t as student_t
 
+from cronos_lerobot.evaluation.outcomes import Episode
 from cronos_lerobot.evaluation.sign_flip import sign_flip_p
 
 ALPHA = 0.05
@@ -35,6 +36,16 @@ class Pairs:
     """(policies of B, episodes) int."""
     configurations: np.ndarray
     """(episodes,) the configuration, a cluster of episodes."""
+    unit: str = "configuration"
+    """What a cluster is, in words."""
+
+    @classmethod
+    def of(cls, a: np.ndarray, b: np.ndarray, episodes: Sequence[Episode]) -> Pairs:
+        """Pairs by configuration; where all episodes are of one, by repetition, with draws of its own each."""
+        configurations = np.array([episode.configuration for episode in episodes])
+        if len(np.unique(configurations)) > 1:
+            return cls(a, b, configurations)
+        return cls(a, b, np.array([episode.seed for episode in episodes]), "repetition of one configuration")
 
     @property
     def differences(self) -> np.ndarray:
@@ -92,17 +103,17 @@ def compare_policies(pairs: Pairs, power: float) -> Difference:
     spread = sqrt(k * cluster_variance(pairs.differences, pairs.clusters)) if k > 1 else 0.0
     is_binary = pairs.is_one_each and max(pairs.a.max(), pairs.b.max()) <= 1
     if is_binary:
-        interval, name = _newcombe(pairs), "Newcombe's paired interval by configuration"
+        interval, name = _newcombe(pairs), f"Newcombe's paired interval by {pairs.unit}"
     else:
         half = float(student_t.ppf(1 - ALPHA / 2, k - 1)) * spread / sqrt(k) if k > 1 else 0.0
         interval = (value - half, value + half) if half else None
-        name = "t-interval over configurations"
+        name = f"t-interval by {pairs.unit}"
     needed = samples_needed(spread, value, power, lambda n: n - 1)
     return Difference(
         value,
         interval,
         sign_flip_p(pairs.whole_differences),
-        f"{name}, exact sign-flip p over {k} configurations",
+        f"{name}, exact sign-flip p over {k} {_plural(pairs.unit)}",
         None if needed is None else max(needed, FEWEST),
         detectable(spread, k, power, k - 1) if k >= FEWEST else None,
     )
@@ -129,7 +140,7 @@ def compare_trainings(pairs: Pairs, power: float) -> Difference | None:
     variance = trainings + more
     spread = sqrt(sum(v * len(side) for v, side in zip(of_side, sides, strict=True)))
     counts = f"{len(pairs.a)} against {len(pairs.b)} trainings"
-    method = f"t-interval and p by training and configuration ({counts}, {k} configurations)"
+    method = f"t-interval and p by training and {pairs.unit} ({counts}, {k} {_plural(pairs.unit)})"
     per_side = len(sides)
     needed = samples_needed(spread, value, power, lambda n: per_side * (n - 1))
     if not variance:
@@ -140,6 +151,10 @@ def compare_trainings(pairs: Pairs, power: float) -> Difference | None:
     p = 2 * float(student_t.sf(abs(value) / sqrt(variance), df))
     found = (float(student_t.ppf(1 - ALPHA / 2, df)) + float(student_t.ppf(power, df))) * sqrt(variance)
     return Difference(value, (value - half, value + half), p, method, needed, found)
+
+
+def _plural(unit: str) -> str:
+    return unit.replace(unit.split()[0], f"{unit.split()[0]}s", 1)
 
 
 def cluster_variance(values: np.ndarray, clusters: np.ndarray) -> float:

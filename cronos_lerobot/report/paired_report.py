@@ -116,7 +116,7 @@ def _suite(side_a: Side, side_b: Side, suite: str, split: str, power: float) -> 
     episodes = paired_episodes((a, b), suite, split)
     numbers = np.array([episode.number for episode in episodes])
     lengths = [np.array([[o.lengths[e] for e in episodes] for o in side]) for side in (a, b)]
-    pairs = Pairs(lengths[0], lengths[1], np.array([episode.configuration for episode in episodes]))
+    pairs = Pairs.of(lengths[0], lengths[1], episodes)
     if suite == "independent":
         labels = next((o.labels[suite] for o in (*a, *b) if suite in o.labels), {})
         parts = {labels.get(int(n), f"task {n}"): _some(pairs, numbers == n) for n in np.unique(numbers)}
@@ -142,12 +142,12 @@ def _suite(side_a: Side, side_b: Side, suite: str, split: str, power: float) -> 
 
 
 def _some(pairs: Pairs, mask: np.ndarray) -> Pairs:
-    return Pairs(pairs.a[:, mask], pairs.b[:, mask], pairs.configurations[mask])
+    return replace(pairs, a=pairs.a[:, mask], b=pairs.b[:, mask], configurations=pairs.configurations[mask])
 
 
 def _beyond(pairs: Pairs, position: int) -> Pairs:
     a, b = ((lengths > position).astype(int) for lengths in (pairs.a, pairs.b))
-    return Pairs(a, b, pairs.configurations)
+    return replace(pairs, a=a, b=b)
 
 
 def _row(what: str, pairs: Pairs, power: float) -> PairedRow:

@@ -52,13 +52,25 @@ def update_curve(group: Group, value: Callable[[Record], float | None]) -> Curve
 
 
 def mean_curve(curves: list[tuple[Any, Any]]) -> Curve:
-    """Mean and standard deviation of (x, y) curves over the range of x that all of them have."""
+    """Mean and standard deviation of (x, y) curves over the range of x that all of them have.
+
+    Where a curve is evaluated more than once at one x, as between two interventions, the mean goes from the first
+    of them straight to the last, as the areas of `performance_gap` have it.
+    """
     xs = [np.asarray(x, float) for x, _ in curves]
     ys = [np.asarray(y, float) for _, y in curves]
     low, high = max(x.min() for x in xs), min(x.max() for x in xs)
-    grid: Any = np.unique(np.concatenate(xs))
-    grid = grid[(grid >= low) & (grid <= high)]
-    values = np.stack([interpolate(x, y, grid) for x, y in zip(xs, ys, strict=True)])
+    places: Any = np.unique(np.concatenate(xs))
+    places = places[(places >= low) & (places <= high)]
+    is_twice = np.isin(places, np.concatenate([x[1:][x[1:] == x[:-1]] for x in xs]))
+    grid = np.repeat(places, 1 + is_twice)
+    is_first = np.append(grid[1:] == grid[:-1], False)
+    values = np.stack(
+        [
+            np.where(is_first, interpolate(x, y, grid, is_first=True), interpolate(x, y, grid))
+            for x, y in zip(xs, ys, strict=True)
+        ]
+    )
     mean = values.mean(0)
     spread = values.std(0, ddof=1) if len(values) > 1 else np.zeros(len(grid))
     return Curve(grid, mean, mean - spread, mean + spread, is_band_over_seeds=len(values) > 1)

@@ -243,10 +243,10 @@ def base_changes(args: argparse.Namespace) -> dict[str, int]:
     return changes
 
 
-def check_budget(chosen: list[tuple[Experiment, tuple[Row, ...]]], options: Options) -> None:
-    """Refuse a reset budget for all rows where checkpoints are evaluated that it may keep a run from.
+def check_checkpoints(chosen: list[tuple[Experiment, tuple[Row, ...]]], options: Options) -> None:
+    """Refuse, where checkpoints are evaluated, flags that may keep a run from having them.
 
-    A row's own is another matter: `Row.has_budget`.
+    A row's own reset budget is another matter: `Row.has_budget`.
 
     Raises:
         ValueError: there is one.
@@ -257,6 +257,9 @@ def check_budget(chosen: list[tuple[Experiment, tuple[Row, ...]]], options: Opti
                 f"--protocol.reset_budget ends runs early, and {experiment.name} evaluates their checkpoints at"
                 " fixed steps; experiments without such evaluations take it, table1 for example"
             )
+        dropping = ("--keep_checkpoints", "--save_checkpoint")
+        if experiment.evaluations and (given := [flag for flag in options.extra if flag.startswith(dropping)]):
+            raise ValueError(f"{given[0]} drops checkpoints, and {experiment.name} evaluates them after the runs")
 
 
 def check_runs(jobs: list[Job], options: Options) -> None:
@@ -365,7 +368,7 @@ def main() -> None:
         chosen = [(EXPERIMENTS[name], find_rows(EXPERIMENTS[name], args.rows)) for name in names]
         bases = dict.fromkeys(row.begins_with(experiment.scene) for experiment, rows in chosen for row in rows)
         options = make_options(args, sys.argv[split + 1 :], bases)
-        check_budget(chosen, options)
+        check_checkpoints(chosen, options)
         slurm = make_slurm_options(args)
     except ValueError as error:
         sys.exit(f"error: {error}")

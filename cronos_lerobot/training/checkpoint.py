@@ -46,7 +46,7 @@ from cronos_lerobot.agents.state import to_arrays, to_tensors
 from cronos_lerobot.agents.weights import load_weights, weights_file
 from cronos_lerobot.processes import Processes
 from cronos_lerobot.protocol.loop_state import LoopState
-from cronos_lerobot.protocol.own_state import load_own_state, own_state
+from cronos_lerobot.protocol.own_state import load_own_states, own_states
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.resume import RUN, check_resumed, describe_run
 from cronos_lerobot.training.seeding import NamedGenerators
@@ -76,16 +76,8 @@ class RunState:
     preprocessor: Any
     postprocessor: Any
     processes: Processes = field(default_factory=Processes)
-    strategies: dict[str, Any] = field(default_factory=dict)
-    """Task order and resets, by name: they may keep something of their own."""
-
-    def strategies_state(self) -> dict[str, Any]:
-        """What each of them keeps.
-
-        Raises:
-            ValueError: one keeps what a checkpoint cannot hold.
-        """
-        return {name: own_state(part) for name, part in self.strategies.items()}
+    strategies: tuple[Any, ...] = ()
+    """Task order and resets: they may keep something of their own."""
 
 
 def save_checkpoint(
@@ -134,7 +126,9 @@ def save_checkpoint(
     _remove_partial(folder)
     if config.keep_checkpoints is not None:
         for old in list_checkpoints(folder)[: -config.keep_checkpoints]:
-            shutil.rmtree(old)
+            # Of a run that goes on from an earlier one, those of its former end are the later ones.
+            if old != final:
+                shutil.rmtree(old)
     return final
 
 
@@ -168,7 +162,9 @@ def load_checkpoint(run: RunState, config: CronosTrainConfig, folder: Path) -> d
 
 def list_checkpoints(folder: Path) -> list[Path]:
     """Return the checkpoints in `folder`, oldest first."""
-    return sorted(p for p in folder.iterdir() if p.is_dir() and not p.is_symlink() and p.name.isdigit())
+    found = (p for p in folder.iterdir() if p.is_dir() and not p.is_symlink() and p.name.isdigit())
+    # By the number: a run that was made longer than a million steps has names of other lengths.
+    return sorted(found, key=lambda p: int(p.name))
 
 
 def _write_model(run: RunState, config: CronosTrainConfig, folder: Path) -> None:
@@ -192,7 +188,7 @@ def _write_training_state(
     save_training_step(run.loop.n, folder, num_processes=run.processes.count)
     np.savez(folder / ENV_STATE, allow_pickle=False, **env_state)
     torch.save(to_tensors(observers), folder / OBSERVERS)
-    torch.save(to_tensors(run.strategies_state()), folder / STRATEGIES)
+    torch.save(to_tensors(own_states(run.strategies)), folder / STRATEGIES)
     state = {"loop": run.loop.state_dict(), "generators": generators}
     (folder / LOOP).write_text(json.dumps(state))
 
@@ -213,8 +209,7 @@ def _load_strategies(run: RunState, path: Path) -> None:
         return
     with _reading(path):
         states = to_arrays(torch.load(path))
-    for name, part in run.strategies.items():
-        load_own_state(part, states[name])
+    load_own_states(run.strategies, states)
 
 
 @contextmanager

@@ -17,10 +17,11 @@ from cronos_lerobot.agents.state import to_comparable
 from cronos_lerobot.evaluation.independent import evaluate_independent
 from cronos_lerobot.processes import Processes, bit_sum
 from cronos_lerobot.protocol.loop_state import Event, SegmentEnd, Step, Update
+from cronos_lerobot.protocol.own_state import own_states
 from cronos_lerobot.protocol.resets import make_resets
 from cronos_lerobot.protocol.rf_mtrl import rf_mtrl
 from cronos_lerobot.protocol.takeovers import AssistedAgent, Takeover, make_expert
-from cronos_lerobot.protocol.task_orders import TaskSet, bind_task_order, make_task_order
+from cronos_lerobot.protocol.task_orders import TaskSet, bind_task_order, find_inner, make_task_order
 from cronos_lerobot.protocol.task_values import RunContext
 from cronos_lerobot.stopwatch import Stopwatch
 from cronos_lerobot.training.checkpoint import RunState, load_checkpoint, save_checkpoint
@@ -95,10 +96,10 @@ class Trainer:
         self._observers: dict[str, Any] = {}
         self.run_state = RunState(
             self.agent, self.loop, self.generators, self.env, preprocessor, postprocessor, self.processes,
-            {"task_order": self._task_order, "resets": self._resets},
+            (find_inner(self._task_order), *self._resets.all),
         )  # fmt: skip
         # What no checkpoint can hold is told now, and not hours later.
-        self.run_state.strategies_state()
+        own_states(self.run_state.strategies)
         self.statistics = RolloutStatistics([t.instruction for t in self.task_set.all], len(self.task_set.tasks))
         self.critic_log = CriticLog(config.protocol)
         self._smoothed = SmoothedSuccess(config.protocol, len(self.task_set.tasks))
@@ -268,7 +269,7 @@ class Trainer:
             {
                 "the loop's state": self.loop.state_dict(),
                 "the random numbers": {name: states[name] for name in sorted(self._drawn_alike)},
-                "the strategies' own state": to_comparable(self.run_state.strategies_state()),
+                "the strategies' own state": to_comparable(own_states(self.run_state.strategies)),
                 "the policy": bit_sum(self.agent.shared_tensors()),
             }
         )

@@ -130,6 +130,10 @@ def test_list_names_every_row(monkeypatch, capsys):
         (["table1", "--", "--steps=3"], "--steps=3 is set by the experiment"),
         (["table1", "--", "--save_freq=3"], "--save_freq=3 is set by the experiment"),
         (["figure5", "--", "--protocol.reset_budget=100"], "figure5 evaluates their checkpoints at fixed steps"),
+        (
+            ["figure4", "--", "--keep_checkpoints=1"],
+            "--keep_checkpoints=1 drops checkpoints, and figure4",
+        ),
         (["table1", "--slurm.time=60"], "--slurm.time needs --launcher=slurm"),
         (["table1", "--launcher=slurm", "--slurm.time=2h"], "--slurm.time must be minutes, H:MM:SS or D-HH:MM:SS"),
         (["table1", "--launcher=slurm", "--slurm.cpus=0"], "--slurm.cpus must be at least 1, got 0"),
@@ -144,7 +148,8 @@ def test_list_names_every_row(monkeypatch, capsys):
 )
 def test_mistakes_are_explained(flags, message, monkeypatch, capsys):
     with pytest.raises(SystemExit) as stopped:
-        call(monkeypatch, *flags)
+        # Were one not refused, its hours of training are not begun.
+        call(monkeypatch, flags[0], "--dry_run", *flags[1:])
     assert stopped.value.code
     assert message in f"{stopped.value} {capsys.readouterr().err}"
 

@@ -8,6 +8,7 @@ from experiment_runs import make_run, read_csv, results
 from forked_commands import run_forked
 from scipy import stats
 
+from cronos_lerobot.experiments.columns import difference_columns
 from cronos_lerobot.experiments.definitions import EXPERIMENTS
 from cronos_lerobot.experiments.differences import compare_rows, gains, to_first
 from cronos_lerobot.experiments.outputs import write_outputs
@@ -125,3 +126,16 @@ def test_runs_without_a_first_evaluation_have_no_gain(options):
     first = next(line for line in lines if '"evaluation"' in line)
     metrics.write_text("".join(line for line in lines if line != first))
     assert gains(results(options, "table1")) == []
+
+
+def test_where_nothing_varies_there_is_no_p_and_no_word(options):
+    for seed in (1, 2):
+        make_run(options, "table1", "t80", seed, (2, 4, 8))
+        make_run(options, "table1", "t1280", seed, (2, 4, 8))
+        make_run(options, "table1", "t1280_eer", seed, (2, 4, 4 + seed))
+    columns = difference_columns(compare_rows(results(options, "table1")))
+    assert columns[""][0] == "T = 1280"
+    assert [columns[name][0] for name in ("difference", "p", "p (Holm)", "verdict")] == ["+0.000", "–", "–", "–"]
+    # Two numbers are left to adjust.
+    p = compare_rows(results(options, "table1"))[1].difference.p
+    assert columns["p (Holm)"][1] == f"{min(1, 2 * p):.2g}"

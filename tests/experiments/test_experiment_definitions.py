@@ -194,6 +194,13 @@ def test_rows_of_one_configuration_begin_with_a_policy_of_that_one_and_repeat_th
     assert f"--policy.path=out/{one}/clone/checkpoints/000320/pretrained_model" in base.command
 
 
+def test_given_numbers_of_episodes_hold_for_rows_with_one_configuration():
+    jobs = jobs_of("figure4", extra=("--eval.n_episodes=16", "--algorithm.target_kl=0.02"))
+    flags = {name: jobs[f"kitchen_2x2_state_paper/{name}_1300k/seed1"].command for name in ("t80", "t80_1config")}
+    assert {"--eval.n_episodes=16", "--eval.repetitions=1", "--algorithm.target_kl=0.02"} <= set(flags["t80"])
+    assert {"--eval.n_episodes=1", "--eval.repetitions=16"} <= set(flags["t80_1config"])
+
+
 def test_runs_are_evaluated_at_the_budgets_of_all_tables_that_share_them():
     at = "--eval_at_interventions=[1000, 1600, 2000, 4000, 6000, 8000]"
     for name in ("table1", "figure4"):

@@ -13,10 +13,11 @@ from forked_commands import run_forked
 from synthetic_runs import INSTRUCTIONS, write_training_run
 
 from cronos_lerobot.experiments import plots, tables
-from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base
-from cronos_lerobot.experiments.jobs import write_record
+from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base, CheckpointEvaluation, Row
+from cronos_lerobot.experiments.jobs import made_by, write_record
 from cronos_lerobot.experiments.outputs import write_outputs
 from cronos_lerobot.experiments.plan import train_job
+from cronos_lerobot.experiments.results import collect
 from cronos_lerobot.experiments.scales import SCALES
 from cronos_lerobot.experiments.specs import base_evaluation_folder, run_specs
 
@@ -234,6 +235,50 @@ def test_held_out_curve_is_cronos_evals(options, tmp_path):
     assert (row["success_train_mean"], row["success_held_out_mean"]) == (0.75, 0.625)
     text = write_outputs(EXPERIMENTS["figure4"], EXPERIMENTS["figure4"].rows, options, tmp_path / "out")
     assert "success, held-out" in text
+
+
+def test_seeds_without_an_evaluation_are_not_counted_as_if_they_had_one(options, tmp_path):
+    first, _ = (make_run(options, "figure4", "t320_eer", seed, (2, 4, 6)) for seed in (1, 2))
+    for checkpoint in (5_120, 10_240):
+        folder = first.evaluation_folder("independent", "held_out", checkpoint)
+        write_results(folder, "independent", "held_out", evaluation(0.5))
+    result = results(options, "figure4")
+    row = by_row(tables.main_rows(result))["t320_eer"]
+    assert (row["seeds"], row["seeds_train"], row["seeds_held_out"]) == (2, 2, 1)
+    text = write_outputs(EXPERIMENTS["figure4"], EXPERIMENTS["figure4"].rows, options, tmp_path / "out")
+    assert "| seeds, held-out |" in text
+    assert "| 1/2 |" in text
+    unfinished = text.split("## Not finished")[1]
+    assert "- base/kitchen_2x2_state_400demos_320steps/independent_held_out: not evaluated" in unfinished
+    assert "t320_eer_10k/seed2/independent_held_out_0010240: not evaluated" in unfinished
+    assert "t320_eer_10k/seed1/independent_held_out" not in unfinished
+    labels = [text.get_text() for text in plots.curves_figure(result).legends[0].get_texts()]
+    assert labels == ["T = 320, EER (2 seeds)", "T = 320, EER (1 seed)"]
+
+
+def test_evaluation_of_a_run_that_its_own_budget_ended_counts(options):
+    budgets = (("--protocol.reset_budget", 1000),)
+    short = Row(320, end_effector_reset=True, budgets=budgets, tag="short")
+    evaluations = (CheckpointEvaluation("independent", ("held_out",)),)
+    experiment = replace(EXPERIMENTS["figure4"], rows=(short,), evaluations=evaluations)
+    (spec,) = [spec for spec in run_specs(experiment, options) if spec.seed == 1]
+    write_training_run(spec.train_folder, seed=1, interval=320, successes=(2, 4, 6), updates=4)
+    job = train_job(spec, None)
+    record = {"command": list(job.command), "status": "done", "seconds": 3.0, "starts": 1}
+    write_record(job, record | {"made_by": made_by(job)})
+    folder = spec.evaluation_folder("independent", "held_out", 10_240)
+    write_results(folder, "independent", "held_out", evaluation(0.5))
+    (row,) = tables.main_rows(collect(experiment, (short,), options))
+    assert (row["success_train_mean"], row["success_held_out_mean"]) == (0.75, 0.5)
+
+
+def test_a_number_of_interventions_that_some_runs_did_not_reach_has_a_reason(options):
+    make_run(options, "figure3", "t80", 1, (2, 4, 6))
+    make_run(options, "figure3", "t80", 2, (2, 4, 6), updates=4)
+    row = results(options, "figure3").rows[0]
+    found = row.success_at(100)
+    assert (found.summary, found.reason) == (None, "1 of 2 runs ended after 64 interventions")
+    assert row.success_at(64).summary.n == 2
 
 
 def test_sequences(options, tmp_path):

@@ -6,7 +6,7 @@ from synthetic_runs import read_csv, write_training_run
 from cronos_lerobot.report.figures import agent_figure
 from cronos_lerobot.report.page import write_report
 from cronos_lerobot.report.runs import find_runs, group_runs
-from cronos_lerobot.report.series import segment_spans
+from cronos_lerobot.report.series import mean_curve, segment_spans
 from cronos_lerobot.report.statistics import Rate
 from cronos_lerobot.scripts.report import make_report
 
@@ -61,3 +61,15 @@ def test_segments_are_one_by_one_and_then_in_spans_that_double():
     assert list(segment_spans({16: Rate(0, 1), 31: Rate(1, 1), 32: Rate(1, 1), 64: Rate(0, 3)})) == [
         (17, 32), (33, 64), (65, 128),
     ]  # fmt: skip
+
+
+def test_mean_curve_goes_straight_up_where_a_run_was_evaluated_twice_at_one_place():
+    """As between two interventions: a base policy's success at 0 must not be lost to later evaluations there."""
+    one = ([0, 0, 64, 64, 128], [0.5, 0.3, 0.5, 0.4, 0.4])
+    other = ([0, 0, 64, 128], [0.7, 0.5, 0.7, 0.6])
+    curve = mean_curve([one, other])
+    assert curve.x.tolist() == [0, 0, 64, 64, 128]
+    assert curve.y.tolist() == pytest.approx([0.6, 0.4, 0.6, 0.55, 0.5])
+    # Of one curve alone it is the curve itself, and none is longer than the shortest.
+    assert mean_curve([one, one]).y.tolist() == pytest.approx(one[1])
+    assert mean_curve([one, ([0, 64], [1.0, 1.0])]).x.tolist() == [0, 0, 64, 64]

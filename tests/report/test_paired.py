@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_1samp, ttest_ind
 
+from cronos_lerobot.evaluation.outcomes import Episode
 from cronos_lerobot.report.paired import (
     Pairs,
     compare_policies,
@@ -161,3 +162,21 @@ def test_how_many_it_takes():
     assert samples_needed(1.0, 0.5, 0.8, lambda n: n - 1) == 34
     assert samples_needed(1.0, 0.0, 0.8, lambda n: n - 1) is None
     assert detectable(1.0, 1, 0.8, 0) is None
+
+
+def test_episodes_of_one_configuration_go_together_by_repetition():
+    """64 times four tasks from one start, each with other draws: of one cluster nothing would be known."""
+    episodes = [Episode("independent", "train", task, 0, seed) for task in range(4) for seed in range(64)]
+    some = np.array([[seed % 4 == 0 for _ in range(4) for seed in range(64)]], int)
+    every = np.ones_like(some)
+    pairs = Pairs.of(some, every, episodes)
+    assert len(pairs.whole_differences) == 64
+    found = compare_policies(pairs, power=0.8)
+    assert found.value == 0.75
+    # 48 of 64 repetitions differ, all one way, and in all four tasks.
+    assert found.p == pytest.approx(2 / 2**48)
+    low, high = found.ci95
+    assert 0.6 < low < 0.75 < high < 0.87
+    assert found.method.endswith("over 64 repetitions of one configuration")
+    many = [episode._replace(configuration=episode.seed % 16) for episode in episodes]
+    assert len(Pairs.of(some, every, many).whole_differences) == 16

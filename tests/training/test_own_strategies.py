@@ -6,7 +6,7 @@ from test_trainer import STEPS_PER_UPDATE, assert_same_run, config, train
 
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.interventions import Intervention
-from cronos_lerobot.protocol.own_state import own_state
+from cronos_lerobot.protocol.own_state import load_own_states, own_states
 from cronos_lerobot.protocol.resets import EXTRA_RESETS, SceneReset, make_resets
 from cronos_lerobot.protocol.task_orders import TASK_ORDERS
 
@@ -105,18 +105,34 @@ def test_what_a_checkpoint_cannot_hold_is_refused_before_the_run_begins(tmp_path
 def test_states_that_are_none(state, message, monkeypatch):
     monkeypatch.setattr(CountingOrder, "state_dict", lambda self: state)
     with pytest.raises(ValueError, match=message):
-        own_state(CountingOrder(None))
+        own_states([CountingOrder(None)])
 
 
 def test_who_tells_a_state_must_take_it_back(monkeypatch):
     monkeypatch.delattr(CountingOrder, "load_state_dict")
     with pytest.raises(ValueError, match=r"CountingOrder has state_dict\(\) and no load_state_dict"):
-        own_state(CountingOrder(None))
+        own_states([CountingOrder(None)])
+
+
+def test_a_run_may_go_on_with_others(tmp_path, caplog):
+    train(own(tmp_path, 2 * STEPS_PER_UPDATE))
+    other = resume(tmp_path)
+    other.protocol.task_order = "heuristic"
+    assert train(other).loop.n == 4 * STEPS_PER_UPDATE
+    assert "has the state of CountingOrder, which this run does not have" in caplog.text
+
+
+def test_two_of_one_class_are_told_apart():
+    first, second = EveryThirdSwitch(None, ProtocolConfig()), EveryThirdSwitch(None, ProtocolConfig())
+    second.asked = {"of": np.ones(4, int), "history": []}
+    states = own_states([first, CountingOrder(None), second])
+    assert list(states) == ["EveryThirdSwitch", "CountingOrder", "EveryThirdSwitch 2"]
+    load_own_states([second, first], states)
+    assert (first.asked["history"], second.asked["history"]) == ([], [1.0])
 
 
 def test_built_in_strategies_keep_nothing():
     protocol = ProtocolConfig(heuristic_reset=True, end_effector_reset=True)
-    assert make_resets(protocol, lambda name: np.random.default_rng(0)).state_dict() == {}
-    assert all(
-        own_state(order(np.random.default_rng(0))) == {} for order in set(TASK_ORDERS.values()) - {CountingOrder}
-    )
+    rng = np.random.default_rng(0)
+    orders = [order(rng) for order in set(TASK_ORDERS.values()) - {CountingOrder}]
+    assert own_states([*make_resets(protocol, lambda name: rng).all, *orders]) == {}

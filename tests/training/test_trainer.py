@@ -15,6 +15,7 @@ from safetensors.torch import load_file
 
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.training.checkpoint import list_checkpoints
 from cronos_lerobot.training.config import CronosTrainConfig, PeriodicEvaluationConfig, RecordConfig
 from cronos_lerobot.training.stopping import StopRequest
 from cronos_lerobot.training.trainer import Trainer
@@ -283,6 +284,24 @@ def test_old_checkpoints_are_dropped(tmp_path):
     names = sorted(p.name for p in (tmp_path / "run/checkpoints").iterdir())
     assert names == ["000096", "000128", "last"]
     assert (tmp_path / "run/checkpoints/last").resolve().name == "000128"
+
+
+def test_checkpoints_are_in_the_order_of_their_steps_whatever_their_digits(tmp_path):
+    """A run that was made longer than a million steps has names of six digits and of seven."""
+    for name in ("614400", "0716800", "512000"):
+        (tmp_path / name).mkdir()
+    assert [path.name for path in list_checkpoints(tmp_path)] == ["512000", "614400", "0716800"]
+
+
+def test_a_run_that_goes_on_from_an_earlier_checkpoint_keeps_what_it_writes(tmp_path):
+    train(config(tmp_path))
+    again = config(tmp_path, keep_checkpoints=1)
+    again.checkpoint_path = tmp_path / "checkpoints/000032"
+    with pytest.raises(KilledError):
+        train(again, env=MortalEnv(STREAMS))
+    # One update, from 8 to 16 steps of each stream, then its end: two later ones are of the run before.
+    assert (tmp_path / "checkpoints/last").resolve().name == "000064"
+    assert (tmp_path / "checkpoints/last/training_state").is_dir()
 
 
 def test_kill_while_saving_leaves_the_last_checkpoint_whole(tmp_path, monkeypatch):
