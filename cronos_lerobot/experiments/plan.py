@@ -31,6 +31,7 @@ from cronos_lerobot.experiments.specs import (
     run_specs,
 )
 
+SPLITS = ("train", "held_out")
 LAST_POLICY = Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR)
 
 
@@ -71,7 +72,9 @@ def base_jobs(base: Base, options: Options) -> list[Job]:
         clone += ["--num_workers=0"]
     name = f"base/{folder.name}"
     demos = Job(f"{name}/demos", tuple(record), folder / "demos", stage=BASE)
-    clone_job = Job(f"{name}/clone", tuple(clone), folder / "clone", needs=(demos.name,), stage=BASE)
+    # Evaluations may have come from another machine, without the clone that they are of.
+    evaluations = tuple(base_evaluation_folder(base, "independent", split, options) for split in SPLITS)
+    clone_job = Job(f"{name}/clone", tuple(clone), folder / "clone", evaluations, needs=(demos.name,), stage=BASE)
     return [replace(job, environment=gymnasium_id(scene), root=options.root) for job in (demos, clone_job)]
 
 

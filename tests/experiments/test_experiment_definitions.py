@@ -265,6 +265,8 @@ def test_evaluations_of_checkpoints():
     } <= set(evals[0].command)
     base = "base/kitchen_2x2_state_400demos_320steps"
     assert figure4[f"{base}/independent_held_out"].needs == (f"{base}/clone",)
+    # It goes with the clone that it is of.
+    assert figure4[f"{base}/independent_held_out"].output in figure4[f"{base}/clone"].made_from_it
     assert f"--policy.path={run}/train/checkpoints/1300480/pretrained_model" in evals[-1].command
     assert evals[0].needs == ("kitchen_2x2_state_paper/t80_1300k/seed2",)
     figure5 = [job for job in jobs_of("figure5", rows=["t80"]).values() if job.command[0] == "cronos-eval"]

@@ -89,11 +89,15 @@ def test_every_flag_is_there():
 
 
 def test_pages_are_drawn_anew_by_the_commands_beside_the_archives():
-    block = DOCS[DOCS.index("  cronos-reproduce table1 --scale=small --report_only") :].split("```")[0]
-    commands = [line.split() for line in block.replace("\\\n", " ").splitlines() if line.strip()]
+    block = DOCS[DOCS.index("  for paper in table1") :].split("```")[0]
+    loop, rest = block.split("  done\n")
+    papers, command = re.fullmatch(r"  for paper in (.*); do\n(.*)\n", loop, re.DOTALL).groups()
+    lines = [command.replace("$paper", name) for name in papers.split()] + rest.replace("\\\n", " ").splitlines()
+    commands = [line.split() for line in lines if line.strip()]
     pages = {page.stem: page for page in (Path(__file__).parents[2] / "docs/results").glob("*_state/*.json")}
     assert [command[1] for command in commands] == [
         "table1",
+        *(f"figure{number}" for number in (2, 3, 4, 5, 11, 12, 13, 14)),
         "few_resets",
         "few_resets_kitchen_3x3",
         "few_resets_playroom_2x2",
