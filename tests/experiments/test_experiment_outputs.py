@@ -13,13 +13,12 @@ from forked_commands import run_forked
 from synthetic_runs import INSTRUCTIONS, write_training_run
 
 from cronos_lerobot.experiments import plots, tables
-from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base, CheckpointEvaluation, Row
-from cronos_lerobot.experiments.jobs import made_by, write_record
+from cronos_lerobot.experiments.definitions import EXPERIMENTS
+from cronos_lerobot.experiments.jobs import write_record
 from cronos_lerobot.experiments.outputs import write_outputs
 from cronos_lerobot.experiments.plan import train_job
-from cronos_lerobot.experiments.results import collect
 from cronos_lerobot.experiments.scales import SCALES
-from cronos_lerobot.experiments.specs import base_evaluation_folder, run_specs
+from cronos_lerobot.experiments.specs import run_specs
 
 
 # 8 streams x 8 updates x 160 steps, as the made-up runs have; evaluated at 0, 5120 and 10240.
@@ -182,19 +181,6 @@ def test_run_of_another_command_is_named_and_left_out(options):
     assert (row["seeds"], row["success_train_mean"]) == (0, None)
 
 
-def test_results_of_version_0_are_named_and_left_out(options):
-    spec = make_run(options, "figure4", "t80", 1, (2, 4, 6))
-    folder = spec.evaluation_folder("independent", "held_out", 10_240)
-    write_results(folder, "independent", "held_out", evaluation(0.5))
-    old = {"format": 1, "benchmark": {"environment": "lerobot_env_cronos/kitchen_2x2-v0"}}
-    (folder / "results.json").write_text(json.dumps(old))
-    result = results(options, "figure4")
-    (text,) = result.changed
-    assert "kitchen_2x2-v0; this is version 1" in text
-    row = by_row(tables.main_rows(result))["t80"]
-    assert (row["success_train_mean"], row["success_held_out_mean"]) == (0.75, None)
-
-
 def test_run_that_its_reset_budget_ended_early_counts_and_is_named(options, tmp_path):
     make_run(options, "table1", "t80", 1, (2, 4, 6), updates=4)
     make_run(options, "table1", "t1280", 1, (2, 4, 6))
@@ -205,73 +191,6 @@ def test_run_that_its_reset_budget_ended_early_counts_and_is_named(options, tmp_
     assert early.strip() == "- kitchen_2x2_state_small/t80_10k/seed1: after 5,120 of 10,240 steps"
 
 
-def evaluation(success, n=8):
-    rate = {"success": success, "n": n, "ci95": [0.0, 1.0]}
-    return rate | {"per_task": dict.fromkeys(INSTRUCTIONS, rate)}
-
-
-HEAD = {"format": 2, "benchmark": {"environment": "lerobot_env_cronos/kitchen_2x2-v1"}}
-
-
-def write_results(folder, suite, split, content):
-    folder.mkdir(parents=True)
-    (folder / "results.json").write_text(json.dumps(HEAD | {suite: {split: content}}))
-
-
-def test_held_out_curve_is_cronos_evals(options, tmp_path):
-    spec = make_run(options, "figure4", "t320_eer", 1, (2, 4, 6))
-    for checkpoint, success in ((5_120, 0.5), (10_240, 0.625)):
-        write_results(
-            spec.evaluation_folder("independent", "held_out", checkpoint),
-            "independent", "held_out", evaluation(success),
-        )  # fmt: skip
-    base = base_evaluation_folder(Base("kitchen_2x2"), "independent", "held_out", options)
-    write_results(base, "independent", "held_out", evaluation(0.125))
-    result = results(options, "figure4")
-    (seed,) = result.rows[1].seeds
-    points = [(p.interaction_steps, p.interventions, p.success) for p in seed.curve("held_out", INSTRUCTIONS[0])]
-    assert points == [(0, 0, 0.125), (5_120, 16, 0.5), (10_240, 32, 0.625)]
-    row = by_row(tables.main_rows(result))["t320_eer"]
-    assert (row["success_train_mean"], row["success_held_out_mean"]) == (0.75, 0.625)
-    text = write_outputs(EXPERIMENTS["figure4"], EXPERIMENTS["figure4"].rows, options, tmp_path / "out")
-    assert "success, held-out" in text
-
-
-def test_seeds_without_an_evaluation_are_not_counted_as_if_they_had_one(options, tmp_path):
-    first, _ = (make_run(options, "figure4", "t320_eer", seed, (2, 4, 6)) for seed in (1, 2))
-    for checkpoint in (5_120, 10_240):
-        folder = first.evaluation_folder("independent", "held_out", checkpoint)
-        write_results(folder, "independent", "held_out", evaluation(0.5))
-    result = results(options, "figure4")
-    row = by_row(tables.main_rows(result))["t320_eer"]
-    assert (row["seeds"], row["seeds_train"], row["seeds_held_out"]) == (2, 2, 1)
-    text = write_outputs(EXPERIMENTS["figure4"], EXPERIMENTS["figure4"].rows, options, tmp_path / "out")
-    assert "| seeds, held-out |" in text
-    assert "| 1/2 |" in text
-    unfinished = text.split("## Not finished")[1]
-    assert "- base/kitchen_2x2_state_400demos_320steps/independent_held_out: not evaluated" in unfinished
-    assert "t320_eer_10k/seed2/independent_held_out_0010240: not evaluated" in unfinished
-    assert "t320_eer_10k/seed1/independent_held_out" not in unfinished
-    labels = [text.get_text() for text in plots.curves_figure(result).legends[0].get_texts()]
-    assert labels == ["T = 320, EER (2 seeds)", "T = 320, EER (1 seed)"]
-
-
-def test_evaluation_of_a_run_that_its_own_budget_ended_counts(options):
-    budgets = (("--protocol.reset_budget", 1000),)
-    short = Row(320, end_effector_reset=True, budgets=budgets, tag="short")
-    evaluations = (CheckpointEvaluation("independent", ("held_out",)),)
-    experiment = replace(EXPERIMENTS["figure4"], rows=(short,), evaluations=evaluations)
-    (spec,) = [spec for spec in run_specs(experiment, options) if spec.seed == 1]
-    write_training_run(spec.train_folder, seed=1, interval=320, successes=(2, 4, 6), updates=4)
-    job = train_job(spec, None)
-    record = {"command": list(job.command), "status": "done", "seconds": 3.0, "starts": 1}
-    write_record(job, record | {"made_by": made_by(job)})
-    folder = spec.evaluation_folder("independent", "held_out", 10_240)
-    write_results(folder, "independent", "held_out", evaluation(0.5))
-    (row,) = tables.main_rows(collect(experiment, (short,), options))
-    assert (row["success_train_mean"], row["success_held_out_mean"]) == (0.75, 0.5)
-
-
 def test_a_number_of_interventions_that_some_runs_did_not_reach_has_a_reason(options):
     make_run(options, "figure3", "t80", 1, (2, 4, 6))
     make_run(options, "figure3", "t80", 2, (2, 4, 6), updates=4)
@@ -279,33 +198,6 @@ def test_a_number_of_interventions_that_some_runs_did_not_reach_has_a_reason(opt
     found = row.success_at(100)
     assert (found.summary, found.reason) == (None, "1 of 2 runs ended after 64 interventions")
     assert row.success_at(64).summary.n == 2
-
-
-def test_sequences(options, tmp_path):
-    apart = {"found_complete": 1, "never_grasped": 2}
-    rates = {1: [0.75, 0.5, 0.25, 0.0], 2: [0.25, 0.5, 0.25, 0.0]}
-    for seed, successes in rates.items():
-        spec = make_run(options, "figure5", "t320_eer", seed, (2, 4, 6))
-        content = {
-            "n": 640,
-            "positions": [{"success": s, "std": 0.1, "n": 640, "ci95": [0, 1]} | apart for s in successes],
-            "seen": {"n": 64, "positions": [{"success": 1.0}] * 4, "average_chain_length": {"mean": 4.0}},
-            "unseen": None,
-            "average_chain_length": {"mean": sum(successes), "std": 0.1, "ci95": [0, 4]},
-        }
-        write_results(spec.evaluation_folder("sequential", "held_out", 10_240), "sequential", "held_out", content)
-    row, seen = tables.sequential_rows(results(options, "figure5"))
-    assert (seen["orderings"], seen["n"], seen["SEQ 0_mean"], seen["chain_length_mean"]) == ("seen", 64, 1.0, 4.0)
-    assert (row["row"], row["split"], row["n"], row["seeds"]) == ("t320_eer", "held_out", 640, 2)
-    assert [row[f"SEQ {i}_mean"] for i in range(4)] == [0.5, 0.5, 0.25, 0.0]
-    assert row["SEQ 0_std"] == pytest.approx(0.5 / 2**0.5)
-    assert row["chain_length_mean"] == 1.25
-    text = write_outputs(EXPERIMENTS["figure5"], EXPERIMENTS["figure5"].rows, options, tmp_path / "out")
-    assert (
-        "| 0.500 ± 0.354 | 0.500 ± 0.000 | 0.250 ± 0.000 | 0.000 ± 0.000 | 1.250 ± 0.354 | 640 | 8 | 16 | 2 |"
-        in text
-    )
-    assert (tmp_path / "out/figure5_sequential.png").exists()
 
 
 def test_files_of_table1(options, tmp_path):
