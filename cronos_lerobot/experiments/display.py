@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console, Group
@@ -13,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from cronos_lerobot.experiments.jobs import Job, changes, missing
-from cronos_lerobot.experiments.runner import BLOCKED, CHANGED, DONE, FAILED
+from cronos_lerobot.experiments.runner import BLOCKED, CHANGED, DONE, FAILED, MISSING
 
 TAIL_LINES = 20
 """Lines of a failed job's log that are shown."""
@@ -39,14 +40,14 @@ def describe(job: Job, what: str) -> str:
             f" another --root, or go back to what made it. What differs:\n    " + "\n    ".join(changes(job))
         )
     if what == BLOCKED:
-        return f"{job.name}: blocked, {missing_inputs(job) or 'it needs a job that is not done'}"
+        return f"{job.name}: blocked, it needs a job that is not done"
+    if what == MISSING:
+        return f"{job.name}: blocked, {describe_missing(missing(job), job)}"
     return f"{job.name}: {what}"
 
 
-def missing_inputs(job: Job) -> str:
-    """What a job reads and does not find, and what to do about it; empty if everything is there."""
-    if not (paths := missing(job)):
-        return ""
+def describe_missing(paths: Sequence[Path], job: Job) -> str:
+    """What a job does not find of what it reads, and what to do about it."""
     return (
         f"{', '.join(map(str, paths))} is not there: {' and '.join(job.needs)} came without checkpoints. Copy them"
         " from where it was made, or delete its folder here to make it again"

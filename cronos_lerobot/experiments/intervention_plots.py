@@ -66,10 +66,11 @@ def interventions_figure(result: ExperimentResult) -> Figure | None:
     if not by_base:
         return None
     most = max(map(len, by_base.values()))
-    figure = _with_list(result, by_base, drawn) if most > MOST_MARKS else _with_steps(result, by_base, drawn)
+    styles = row_styles(result)
+    figure = (_with_list if most > MOST_MARKS else _with_steps)(by_base, styles, drawn)
     panels = figure.axes[::2]
     for ax, (base, rows) in zip(panels, by_base.items(), strict=True):
-        _join_ends(ax, rows, result, row_styles(result))
+        _join_ends(ax, rows, result, styles)
         ax.set_title(f"{base} base policy", fontsize=9, color=INK, loc="left")
         ax.set_ylabel("success, training configurations")
     _logarithmic(panels, [end.interventions for end in drawn.values()])
@@ -78,13 +79,13 @@ def interventions_figure(result: ExperimentResult) -> Figure | None:
     return figure
 
 
-def _with_steps(result: ExperimentResult, by_base: dict[str, list[RowResult]], drawn: dict[str, End]) -> Figure:
-    size = (10, 3.4 * len(by_base) + 0.11 * len(result.rows) + 0.4)
+def _with_steps(by_base: dict[str, list[RowResult]], styles: dict[str, Style], drawn: dict[str, End]) -> Figure:
+    size = (10, 3.4 * len(by_base) + 0.11 * len(styles) + 0.4)
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(len(by_base), 2, squeeze=False, sharey=True, sharex="col")
     for rows, line in zip(by_base.values(), axes, strict=True):
         for ax, axis in zip(line, (INTERVENTIONS, INTERACTION_STEPS), strict=True):
-            _draw_rows(ax, rows, row_styles(result), drawn, axis)
+            _draw_rows(ax, rows, styles, drawn, axis)
     axes[0, 1].set_xlim(left=0, right=1.15 * max(end.steps for end in drawn.values()))
     for ax in axes[:, 1]:
         ax.label_outer()
@@ -92,21 +93,21 @@ def _with_steps(result: ExperimentResult, by_base: dict[str, list[RowResult]], d
     return figure
 
 
-def _with_list(result: ExperimentResult, by_base: dict[str, list[RowResult]], drawn: dict[str, End]) -> Figure:
+def _with_list(by_base: dict[str, list[RowResult]], styles: dict[str, Style], drawn: dict[str, End]) -> Figure:
     heights = [0.21 * len(rows) + 0.7 for rows in by_base.values()]
     figure = Figure(figsize=(11, sum(heights) + 0.5), layout="constrained")
     grid = {"height_ratios": heights, "width_ratios": (5, 4)}
     axes = figure.subplots(len(by_base), 2, squeeze=False, sharex="col", gridspec_kw=grid)
     for rows, (left, right) in zip(by_base.values(), axes, strict=True):
-        _draw_rows(left, rows, row_styles(result), drawn, INTERVENTIONS, with_intervals=False)
+        _draw_rows(left, rows, styles, drawn, INTERVENTIONS, with_intervals=False)
         for place, row in enumerate(rows):
-            style, success = row_styles(result)[row.row.name], drawn[row.row.name].success
+            style, success = styles[row.row.name], drawn[row.row.name].success
             look = {"color": style.color, "marker": style.marker, "ms": 5.5, "lw": 0, "elinewidth": 1.4}
             right.errorbar([success.mean], [place], xerr=_error(success), **look)
         begins = [curve[0].success for row in rows for seed in row.drawn if (curve := seed.curve(SPLIT))]
         right.axvline(float(np.mean(begins)), color=INK, lw=1.0, ls=":", zorder=1)
         style_axes(right, "success at the end; dotted, before training")
-        labels = [f"{row_styles(result)[row.row.name].label} ({_seeds(row)})" for row in rows]
+        labels = [f"{styles[row.row.name].label} ({_seeds(row)})" for row in rows]
         right.set_yticks(range(len(rows)), labels, fontsize=7.5)
         right.set_ylim(len(rows) - 0.4, -0.6)
     for ax in axes[:-1, 1]:

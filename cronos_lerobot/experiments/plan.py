@@ -10,6 +10,7 @@ from pathlib import Path
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from lerobot_env_cronos import gymnasium_id
+from lerobot_env_cronos.benchmark.configurations import SPLITS
 
 from cronos_lerobot.experiments.definitions import (
     CURRICULUM_INTERVAL,
@@ -31,7 +32,6 @@ from cronos_lerobot.experiments.specs import (
     run_specs,
 )
 
-SPLITS = ("train", "held_out")
 LAST_POLICY = Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR)
 
 

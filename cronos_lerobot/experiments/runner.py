@@ -39,6 +39,8 @@ KILL_S = 15.0
 ELSEWHERE = "is being run by another process: waiting for it"
 STOPPING = "was asked to stop; Ctrl-C ends it at once"
 DONE, FAILED, CHANGED, BLOCKED = "done", "failed", "changed", "blocked"
+MISSING = "missing"
+"""Why a job is blocked whose needs are done: what it reads of them is not there."""
 ENDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 """Those that end the runner as Ctrl-C does; the second is a closed terminal's."""
 TIME_LIMIT_SIGNAL = signal.SIGUSR2
@@ -137,8 +139,10 @@ class Runner:
                 continue
             needs = [self.states.get(name) for name in job.needs]
             are_done = all(state == DONE for state in needs)
-            if any(state not in (None, DONE) for state in needs) or (are_done and missing(job)):
+            if any(state not in (None, DONE) for state in needs):
                 self._finish(job, BLOCKED)
+            elif are_done and missing(job):
+                self._finish(job, BLOCKED, MISSING)
             elif are_done and len(self._children) < self.parallel:
                 self._start(job)
 
@@ -196,9 +200,9 @@ class Runner:
         os.close(child.lock)
         self._children.remove(child)
 
-    def _finish(self, job: Job, state: str) -> None:
+    def _finish(self, job: Job, state: str, event: str | None = None) -> None:
         self.states[job.name] = state
-        self.display.event(job, state)
+        self.display.event(job, event or state)
 
     def stop(self) -> None:
         """End the commands that still run: they can be resumed. Ctrl-C ends them at once.

@@ -27,12 +27,10 @@ def load_own_states(parts: Iterable[Any], states: dict[str, dict[str, Any]]) -> 
     """
     named = _named(parts)
     for name, state in states.items():
-        if name in named:
-            named[name].load_state_dict(state)
+        if load := getattr(named.get(name), "load_state_dict", None):
+            load(state)
         else:
-            logging.warning(
-                f"The checkpoint has the state of {name}, which this run does not have: it is dropped."
-            )
+            logging.warning(f"The checkpoint has the state of {name}, which this run does not have: dropped.")
 
 
 def _named(parts: Iterable[Any]) -> dict[str, Any]:

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cronos_lerobot.experiments.definitions import COMMANDS, EXPERIMENTS, Base, Experiment, Row, find_rows
-from cronos_lerobot.experiments.display import missing_inputs
-from cronos_lerobot.experiments.jobs import RUNNING, Job, changes, is_done, other_commits, status
+from cronos_lerobot.experiments.display import describe_missing
+from cronos_lerobot.experiments.jobs import RUNNING, Job, changes, is_done, missing, other_commits, status
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
 from cronos_lerobot.experiments.slurm import SlurmError, SlurmOptions
 from cronos_lerobot.locks import FolderInUseError
@@ -297,9 +297,9 @@ def print_plan(jobs: list[Job]) -> None:
         if status(job) == RUNNING:
             print(f"# {job.name}: is being run by another process")
             continue
-        absent = missing_inputs(job) if all(is_done(needed) for needed in jobs if needed.name in job.needs) else ""
-        if absent:
-            print(f"# {job.name}: blocked, {absent}")
+        absent = missing(job)
+        if absent and all(is_done(needed) for needed in jobs if needed.name in job.needs):
+            print(f"# {job.name}: blocked, {describe_missing(absent, job)}")
             continue
         resumed = job.resume() if job.output.exists() else None
         print(f"# {job.name}{': goes on' if resumed else ''}")

@@ -59,7 +59,7 @@ def test_as_many_at_a_time_as_asked(tmp_path):
 def test_failure_blocks_what_needs_it_and_nothing_else(tmp_path, capsys):
     jobs = [
         python_job(tmp_path, "a", "print('so far so good'); raise SystemExit('the disk is full')"),
-        count_job(tmp_path, "b", needs=("a",)),
+        count_job(tmp_path, "b", needs=("a",), reads=(tmp_path / "a/checkpoint",)),
         count_job(tmp_path, "c", needs=("b",)),
         count_job(tmp_path, "d"),
     ]
@@ -67,6 +67,7 @@ def test_failure_blocks_what_needs_it_and_nothing_else(tmp_path, capsys):
     assert states == {"a": "failed", "b": "blocked", "c": "blocked", "d": "done"}
     out = capsys.readouterr().out
     assert "so far so good\nthe disk is full" in out
+    assert "b: blocked, it needs a job that is not done\n" in out
     assert not (tmp_path / "b").exists()
     assert (read_record(jobs[0])["status"], read_record(jobs[0])["returncode"]) == ("failed", 1)
 
