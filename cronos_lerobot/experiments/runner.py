@@ -15,6 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol
 
+from cronos_lerobot.experiments.arithmetic import portable_arithmetic
 from cronos_lerobot.experiments.jobs import (
     RUNNING,
     STOPPED,
@@ -79,7 +80,7 @@ class Runner:
         jobs: each name once; needs come before those who need them.
         parallel: how many run at once.
         display: shows what happens.
-        environment: variables of the commands, besides those of this process.
+        environment: variables of the commands, besides those of this process and `portable_arithmetic`.
         grace_s: how long a job may take to end after it was asked to [s].
     """
 
@@ -98,7 +99,7 @@ class Runner:
             raise ValueError(f"at least one job must run at a time, got {parallel}")
         self.parallel, self.display, self.grace_s = parallel, display, grace_s
         # Unbuffered, so that a log says in time, and in order, what its command does.
-        self.environment = os.environ | {"PYTHONUNBUFFERED": "1"} | (environment or {})
+        self.environment = portable_arithmetic() | os.environ | {"PYTHONUNBUFFERED": "1"} | (environment or {})
         self.states: dict[str, str] = {}
         self._children: list[_Child] = []
         self._elsewhere: set[str] = set()

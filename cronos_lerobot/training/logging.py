@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from tqdm import tqdm
 
 from cronos_lerobot.evaluation.policy_source import files_fingerprint
@@ -182,7 +183,12 @@ def write_manifest(config: CronosTrainConfig, num_processes: int = 1) -> None:
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "versions": {"python": platform.python_version()} | package_versions(),
         "git_commit": git_commit(),
-        "machine": {"platform": platform.platform(), "cpu_count": os.cpu_count()},
+        "machine": {
+            "platform": platform.platform(),
+            "cpu_count": os.cpu_count(),
+            # What its floating-point sums are made with, and so their last bits.
+            "cpu_capability": torch.backends.cpu.get_cpu_capability(),
+        },
         "num_processes": num_processes,
         "renderer": os.environ.get("MUJOCO_GL"),
         "policy_device": config.policy.device if config.policy else None,
