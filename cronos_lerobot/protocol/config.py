@@ -50,6 +50,16 @@ class CriticConfig:
             raise ValueError(f"protocol.critic.failures must be 1 to {MAX_FAILURES}, got {self.failures}.")
 
 
+CRITIC_READERS = {
+    "certain_value": ("task_order",),
+    "floor": ("task_order",),
+    "sharpness": ("task_order",),
+    "knows_complete": ("task_order", "scene_reset"),
+    "failures": ("scene_reset",),
+}
+"""Who goes by each setting of CriticConfig, if it is `critic`."""
+
+
 @dataclass
 class ProtocolConfig:
     """When a stream switches task, when the policy learns, what help a stream gets. Misfits are a ValueError."""
@@ -174,15 +184,18 @@ class ProtocolConfig:
 
     def _check_who_reads_critic(self) -> None:
         # Strategies and orders of a user's may go by values, too.
-        if self.scene_reset == "critic" or self.task_order not in VALUELESS_ORDERS or self.extra_resets:
+        if self.task_order not in (*VALUELESS_ORDERS, "critic") or self.extra_resets:
             return
         default = CriticConfig()
         for name, value in vars(self.critic).items():
-            if value != getattr(default, name):
+            readers = CRITIC_READERS[name]
+            if value != getattr(default, name) and not any(
+                getattr(self, reader) == "critic" for reader in readers
+            ):
+                wanted = " or ".join(f"protocol.{reader}=critic" for reader in readers)
                 raise ValueError(
-                    f"protocol.critic.{name}={json.dumps(value)} says how values choose, and none do: "
-                    "give protocol.task_order=critic or protocol.scene_reset=critic, or leave it at "
-                    f"{json.dumps(getattr(default, name))}."
+                    f"protocol.critic.{name}={json.dumps(value)} is read by {wanted} alone: give that, or leave it "
+                    f"at {json.dumps(getattr(default, name))}."
                 )
 
     def _check_multiple_of_k(self, name: str, interval: int) -> None:

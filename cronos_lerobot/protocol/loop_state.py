@@ -42,6 +42,8 @@ class LoopState:
     """(N,) index of the current uncut piece of the stream: task switches and divergences both end one."""
     segments_since_reset: np.ndarray = field(init=False)
     """(N,) finished segments since the last scene reset: 0 during the first one after it."""
+    begins_segment: bool = True
+    """Whether the next step is the first of a segment."""
     succeeded: np.ndarray = field(init=False)
     """(N,) whether the current task has been complete at any step of its segment."""
     grasped: np.ndarray = field(init=False)
@@ -130,6 +132,7 @@ class LoopState:
         """Begin a segment of every stream; `task` is (N,) indices into the task set."""
         self.task = np.asarray(task, np.int64)
         self.taken_over = np.zeros(self.num_streams, np.bool_)
+        self.begins_segment = True
         self.switches += 1
         self.interventions[:, Intervention.TASK_SWITCH] += 1
         self.preceded_by = np.maximum(self.preceded_by, Intervention.TASK_SWITCH)
@@ -145,9 +148,10 @@ class LoopState:
         self.succeeded |= info["is_success"]
         self.grasped |= info["is_grasped"]
         self.diverged = info["diverged"].copy()
-        # No task can be done in one step.
-        begins = self.preceded_by != Intervention.NONE
-        self.found_complete = np.where(begins, info["is_success"], self.found_complete)
+        if self.begins_segment:
+            # No task can be done in one step.
+            self.found_complete = info["is_success"].copy()
+        self.begins_segment = False
         self.piece += cut
         self.preceded_by = np.full(self.num_streams, Intervention.NONE, np.int64)
 

@@ -159,7 +159,8 @@ class PeriodicSceneReset(SceneReset):
         segments = interval // self.segment
         phase = streams * segments // loop.num_streams if self.is_staggered else 0 * streams
         is_due = (loop.t // self.segment + phase) % segments == 0
-        return np.flatnonzero(is_due & (loop.preceded_by != Intervention.SCENE_RESET))
+        # Since its last reset it has ended a segment, or it was reset at this very switch.
+        return np.flatnonzero(is_due & (loop.segments_since_reset > 0))
 
 
 class CriticSceneReset(SceneReset):

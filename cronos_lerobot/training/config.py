@@ -76,7 +76,7 @@ class RecordConfig:
         """Tell now what recording would stumble over later.
 
         Raises:
-            ValueError: more streams are to be recorded than there are.
+            ValueError: more streams are to be recorded than there are, or none.
             OSError: the dataset cannot be made: it exists, or its folder cannot be written to; or it is not
                 there to be resumed.
         """
@@ -85,6 +85,10 @@ class RecordConfig:
         for name, number in (("streams", self.num_streams), ("filmed_streams", self.filmed_streams)):
             if isinstance(number, int) and number > num_envs:
                 raise ValueError(f"record.{name} must be at most num_envs={num_envs}, got {number}.")
+        if self.num_streams == 0:
+            raise ValueError(
+                "record.streams=0 records nothing: give a number from 1, or leave record.repo_id out."
+            )
         root = self.root_in(output_dir)
         if resume:
             if not (root / INFO_PATH).is_file():

@@ -36,7 +36,7 @@ def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1)
     options = _env_options(env_config, local_processes)
     env = CronosVectorEnv(num_envs, scene=env_config.scene, reward=config.protocol.reward, **options)
     wanted = {"protocol.num_configurations": ("train", config.protocol.num_configurations)}
-    if config.eval_freq:
+    if config.eval_freq or config.eval_at_interventions:
         wanted["eval.n_episodes"] = (config.eval.split, config.eval.n_episodes)
     for flag, (split, count) in wanted.items():
         available = len(env.benchmark.configurations[split])

@@ -139,8 +139,9 @@ class RunLogger:
     def _open_tensorboard(self, output_dir: Path) -> Any:
         from torch.utils.tensorboard import SummaryWriter
 
-        # Events past the checkpoint that the run resumes from are hidden.
-        return SummaryWriter(str(output_dir / "tensorboard"), purge_step=self.loop.n or None)
+        # Events past the checkpoint that the run resumes from are hidden, those at it are not.
+        purge_step = self.loop.n + 1 if self.loop.n else None
+        return SummaryWriter(str(output_dir / "tensorboard"), purge_step=purge_step)
 
     def _open_wandb(self) -> Any:
         from lerobot.common.wandb_utils import WandBLogger

@@ -156,10 +156,12 @@ class Trainer:
             self.load()
         self._open_observers(self._observers)
         try:
-            # A run that was told to stop has left an evaluation to the one that goes on from it.
-            if self.loop.t == 0 or self._is_evaluation_due():
-                self._evaluate()
-            self._last_interventions = self.loop.b
+            # A run that was told to stop has left an evaluation to the one that goes on from it; one that a budget
+            # ended between two updates has not.
+            if self.loop.t % self.config.protocol.update_interval == 0:
+                if self.loop.t == 0 or self._is_evaluation_due():
+                    self._evaluate()
+                self._last_interventions = self.loop.b
             return self._run(stop or StopRequest())
         finally:
             self.recorder.close()
@@ -205,10 +207,12 @@ class Trainer:
             if ends:
                 return False
         self._say_end()
-        if self._last_evaluation < self.loop.n:
-            self._evaluate()
         if self.config.save_checkpoint and (last_save < self.loop.n or not self._has_checkpoint()):
             self._save(self.env.get_state() if env_state is None else env_state)
+        # After the checkpoint: a run that goes on from it, with more steps or a larger budget, is as one that was
+        # never ended, and has no evaluation here unless it was due.
+        if self._last_evaluation < self.loop.n:
+            self._evaluate()
         if summary := self.critic_log.summary():
             self.logger.log("resets", summary)
         return True

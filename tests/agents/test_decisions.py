@@ -61,13 +61,15 @@ def at(*x):
     return {"agent_pos": np.array(x, np.float32)[:, None]}
 
 
-def play(agent, steps, rewards, cut=(), diverged=()):
+def play(agent, steps, rewards, cut=(), diverged=(), said=None):
     """Stream 0 is at 1, 2, 3 ..., stream 1 at 101, 102 ...; returns the actions' first number, (steps, 2)."""
     actions = []
     for t in range(steps):
         now, after = at(1 + t, 101 + t), at(2 + t, 102 + t)
         sample = agent.act(now, ["a", "b"])
         actions.append(sample.action[:, 0].tolist())
+        if said is not None:
+            said.append((sample.log_prob, sample.value))
         broken = np.array([(t, i) in diverged for i in range(2)])
         ends = broken | np.array([(t, i) in cut for i in range(2)])
         agent.store(now, ["a", "b"], sample, np.array(rewards[t], np.float32), after, ends, broken)
@@ -96,10 +98,15 @@ def test_a_decision_is_played_to_its_end_and_its_rewards_are_discounted_and_summ
 def test_a_divergence_ends_a_decision_and_the_stream_decides_anew():
     agent, policy = make_agent(rows=1)
     rewards = [[0, 1], [0, 2], [0, 64], [1, 64]]
-    actions = play(agent, 4, rewards, diverged={(1, 1)}, cut={(3, 0), (3, 1)})
+    said = []
+    actions = play(agent, 4, rewards, diverged={(1, 1)}, cut={(3, 0), (3, 1)}, said=said)
     # After its step 1 stream 1 is somewhere else: it decides on what is left, at x = 103.
     assert policy.asked == [[1, 101], [103]]
     assert [a[1] for a in actions] == [1010, 1011, 1030, 1031]
+    # What is recorded of its steps: log-probability -2 x and value x / 4 of the decision that they are of.
+    assert [log_prob[1] for log_prob, _ in said] == [-202, -202, -206, -206]
+    assert [value[1] for _, value in said] == [25.25, 25.25, 25.75, 25.75]
+    assert [log_prob[0] for log_prob, _ in said] == [-2] * 4
     buffer = agent.buffer
     assert buffer.rewards.tolist() == [[0.125, 2.0]]
     assert buffer.durations.tolist() == [[4, 2]]
@@ -107,6 +114,8 @@ def test_a_divergence_ends_a_decision_and_the_stream_decides_anew():
     # V(o_4) = 5 / 4 of stream 0; of stream 1 V(o_1) = 102 / 4: there is no o_2, and the rest is not learned from.
     assert buffer.bootstrap_values.tolist() == [[1.25, 25.5]]
     assert buffer.traces.tolist() == [[[1], [101]]]
+    assert buffer.log_probs.sum(-1).tolist() == [[-2, -202]]
+    assert buffer.values.tolist() == [[0.25, 25.25]]
     buffer.compute_advantages(0.5, 0.5)
     assert buffer.advantages[0, 1] == 2 + 25.5 / 4 - 25.25
 

@@ -90,6 +90,22 @@ def test_a_policy_that_looks_back_sees_what_happened_since_the_trace_was_cut():
     assert [a[1] for a in actions[2:5]] == [1012, 1040, 1041]
 
 
+def test_warmed_up_once_is_warm_for_good():
+    """Failed segments that are remembered may push the successes out; with none at all there is no step."""
+    policy = make_pocketvla("categorical")
+    processors = around(policy, *make_pre_post_processors(policy.config))
+    agent = make_imitating(policy, processors, warmup_segments=2, weighting="return")
+    assert learn(agent)["optimizer_steps"] == 1
+    agent.memory.load_state_dict(agent.memory.state_dict()[:1])
+    assert agent.update()["optimizer_steps"] == 1
+    resumed = make_imitating(policy, processors, warmup_segments=2, weighting="return")
+    resumed.load_state_dict(agent.state_dict())
+    assert resumed.update()["optimizer_steps"] == 1
+    (failed,) = resumed.memory.state_dict()
+    resumed.memory.load_state_dict([failed | {"success": False}])
+    assert resumed.update()["optimizer_steps"] == 0
+
+
 def test_a_history_is_a_batch_as_ppo_has_it():
     frames = [
         {

@@ -347,3 +347,25 @@ def test_settings_out_of_range_are_refused():
     policy.config.input_features = {}
     with pytest.raises(ValueError, match=r"observation=state needs a policy that observes observation\.state"):
         make_agent(policy, observation="state")
+
+
+def test_the_policy_stays_in_evaluation_mode_after_an_evaluation():
+    """One puts what it evaluates into the mode that it found, all modules in it."""
+    agent = make_agent()
+    was_training = agent.steered.training
+    agent.steered.eval()
+    agent.steered.train(was_training)
+    assert not any(module.training for module in (agent.policy, *agent.steered.modules()))
+
+
+def test_decisions_since_the_last_update_are_saved():
+    """A budget may end a run between two updates."""
+    whole, broken = make_agent(), make_agent()
+    for agent in (whole, broken):
+        play(agent, [[0, 0]] * 8, cut={(7, 0), (7, 1)})
+    resumed = make_agent()
+    resumed.load_state_dict(broken.state_dict())
+    for agent in (whole, resumed):
+        play(agent, [[0, 0]] * 8, cut={(7, 0), (7, 1)})
+    # Two streams, two decisions in each half.
+    assert [agent.update()["optimizer_steps"] for agent in (whole, resumed)] == [8, 8]

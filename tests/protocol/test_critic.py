@@ -347,10 +347,21 @@ def test_best_value_leaves_out_what_is_complete():
             {"scene_reset": "critic", "reset_budget": 5, "scene_reset_interval": 8},
             "=8 is for periodic .* or give null",
         ),
-        ({"critic": CriticConfig(failures=3)}, "protocol.critic.failures=3 says how values choose, and none do"),
+        (
+            {"critic": CriticConfig(failures=3)},
+            "protocol.critic.failures=3 is read by protocol.scene_reset=critic alone",
+        ),
+        (
+            {"critic": CriticConfig(failures=3), "task_order": "critic"},
+            "read by protocol.scene_reset=critic alone",
+        ),
+        (
+            {"critic": CriticConfig(floor=0.5), "scene_reset": "critic", "reset_budget": 5},
+            "floor=0.5 is read by protocol.task_order=critic alone: give that, or leave it at 0.02",
+        ),
         (
             {"critic": CriticConfig(knows_complete=False)},
-            "knows_complete=false .* give protocol.task_order=critic",
+            "knows_complete=false is read by protocol.task_order=critic or protocol.scene_reset=critic alone",
         ),
     ],
 )
@@ -360,17 +371,18 @@ def test_protocols_that_make_no_sense_are_refused(options, message):
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("name", "value", "options"),
     [
-        {"task_order": "critic"},
-        {"scene_reset": "critic", "reset_budget": 5, "scene_reset_interval": None},
+        ("certain_value", 3, {"task_order": "critic"}),
+        ("failures", 3, {"scene_reset": "critic", "reset_budget": 5, "scene_reset_interval": None}),
+        ("knows_complete", False, {"scene_reset": "critic", "reset_budget": 5, "scene_reset_interval": None}),
         # A user's may go by values, too.
-        {"task_order": "of_a_user"},
-        {"extra_resets": ["of_a_user"]},
+        ("certain_value", 3, {"task_order": "of_a_user"}),
+        ("failures", 3, {"extra_resets": ["of_a_user"]}),
     ],
 )
-def test_critics_settings_are_taken_where_something_may_read_them(options):
-    assert protocol(critic=CriticConfig(certain_value=3), **options).critic.certain_value == 3
+def test_critics_settings_are_taken_where_something_may_read_them(name, value, options):
+    assert getattr(protocol(critic=CriticConfig(**{name: value}), **options).critic, name) == value
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,8 @@ STAGGERED = {"reset_phase": "staggered", "scene_reset_interval": 16}
 
 def critic_protocol(**options):
     """Segments of 4 steps, updates every 8; DummyPolicy's values are some tenths."""
-    critic = CriticConfig(certain_value=0.5, floor=0.05, failures=1)
+    asks = {"failures": 1} if options.get("scene_reset") == "critic" else {}
+    critic = CriticConfig(certain_value=0.5, floor=0.05, **asks)
     defaults = {"task_switch_interval": 4, "update_interval": 8, "task_order": "critic", "critic": critic}
     return ProtocolConfig(**(defaults | options))
 
@@ -183,7 +184,7 @@ def test_asking_for_values_changes_nothing_else(tmp_path):
     assert_same_run(tmp_path / "quiet", tmp_path / "asked")
 
 
-REAL = (*SMALL, *OBSERVATIONS["state"], "--protocol.task_order=critic", "--protocol.critic.failures=1")
+REAL = (*SMALL, *OBSERVATIONS["state"], "--protocol.task_order=critic")
 
 
 def test_the_real_scene_stopped_and_resumed(tmp_path, monkeypatch):
@@ -203,7 +204,7 @@ def test_the_real_scene_stopped_and_resumed(tmp_path, monkeypatch):
 def test_the_real_scene_reset_by_the_critic(tmp_path, monkeypatch):
     cronos_train(
         monkeypatch, *REAL, "--protocol.scene_reset=critic", "--protocol.reset_budget=8",
-        "--protocol.scene_reset_interval=null",
+        "--protocol.scene_reset_interval=null", "--protocol.critic.failures=1",
         "--env.task_observation=one_hot", "--protocol.critic.knows_complete=false",
         f"--output_dir={tmp_path / 'run'}",
     )  # fmt: skip

@@ -53,9 +53,12 @@ class ClonedPolicy(DummyPolicy):
 
     def __init__(self, seed=0):
         super().__init__(ClonedConfig(), seed)
+        self.register_buffer("running_mean", torch.zeros(3))
 
     def forward(self, batch):
         assert self.training
+        # As batch normalization does, of the process's own batch.
+        self.running_mean += 0.1 * (self._inputs(batch).mean(0) - self.running_mean)
         inputs = torch.nn.functional.dropout(self._inputs(batch), 0.2)
         bins = torch.distributions.Categorical(logits=self.actor(inputs).reshape(-1, 7, 3))
         return -bins.log_prob(batch["action"][:, 0] + 1).mean(), {}
@@ -172,7 +175,7 @@ def test_an_average_costs_only_what_is_trained(tmp_path):
     trainer = Trainer(
         settings(tmp_path, algorithm=algorithm), DummyEnv(4), DummyEnv, policy, *identity_processors()
     )
-    assert set(trainer.agent.state_dict()["learner"]) == {"actor.weight", "actor.bias"}
+    assert set(trainer.agent.state_dict()["learner"]) == {"actor.weight", "actor.bias", "running_mean"}
 
 
 class TiedPolicy(ClonedPolicy):
@@ -209,13 +212,15 @@ def in_processes(processes, cfg, env_class=DummyEnv):
     trainer = train(cfg, env_class, processes)
     if trainer is None:
         return None
-    return trainer.policy.actor.weight.tolist(), len(trainer.agent.memory)
+    weights = [tensor.tolist() for tensor in (trainer.policy.actor.weight, trainer.policy.running_mean)]
+    return weights, len(trainer.agent.memory)
 
 
 def test_two_processes_learn_together_and_resume(tmp_path):
     """Each from its own streams' successes, with the mean of their gradients."""
     first, second = together(in_processes, settings(tmp_path / "unbroken"))
     assert first[0] == second[0]
+    assert np.any(first[0][1])
     last = [line for line in metrics(tmp_path / "unbroken") if line["kind"] == "update"][-1]
     assert last["agent"]["optimizer_steps"] == 5
     assert last["agent"]["segments"] <= first[1] + second[1]

@@ -132,6 +132,7 @@ def cronos_train(monkeypatch, *arguments):
         (["--record.streams=3"], "record.streams must be at most num_envs=2, got 3"),
         (["--record.filmed_streams=3"], "record.filmed_streams must be at most num_envs=2, got 3"),
         (["--record.streams=some"], "record.streams must be a number or 'all', got 'some'"),
+        (["--record.streams=0", "--record.filmed_streams=1"], "record.streams=0 records nothing"),
         (["--record.flush_interval_s=0"], "record.flush_interval_s must be > 0, got 0"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",

@@ -11,6 +11,7 @@ import torch
 from dummies import DummyPolicyConfig
 from lerobot.configs.parser import PluginLoadError
 from lerobot_env_cronos import CronosEnvConfig
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_trainer import STEPS_PER_UPDATE, assert_same_run, config, make_trainer, metrics, train
 
 from cronos_lerobot.agents.ppo.config import PPOConfig
@@ -196,3 +197,30 @@ def test_a_shorter_metrics_file_is_not_filled_up(tmp_path):
     assert path.read_text() == '{"kind": "update"}\n'
     MetricsFile(path, 19).close()
     assert path.stat().st_size == 19
+
+
+def test_the_evaluation_that_ends_a_run_is_not_there_once_it_goes_on(tmp_path):
+    """Nor does it keep a due one away, or count as that of so many interventions."""
+    evaluated = {"eval_freq": 48, "eval_at_interventions": [4]}
+    train(config(tmp_path / "whole", **budget(None) | evaluated))
+    train(config(tmp_path / "stopped", **budget(4) | evaluated))
+    assert [line["interaction_steps"] for line in evaluations(tmp_path / "stopped")] == [0, 48]
+    # With nothing left to do it is made again.
+    train(resumed(tmp_path / "stopped", **budget(4) | evaluated), policy_seed=8)
+    assert [line["interaction_steps"] for line in evaluations(tmp_path / "stopped")] == [0, 48]
+    train(resumed(tmp_path / "stopped", **budget(None) | evaluated), policy_seed=8)
+    assert_same_run(tmp_path / "whole", tmp_path / "stopped")
+    found = [(line["interaction_steps"], line["at_interventions"]) for line in evaluations(tmp_path / "stopped")]
+    assert found == [(0, []), (64, [4]), (96, []), (128, [])]
+
+
+def evaluations(folder):
+    return [line for line in metrics(folder) if line["kind"] == "evaluation"]
+
+
+def test_tensorboard_has_every_point_once_after_a_resume(tmp_path):
+    train(config(tmp_path / "run", steps=2 * STEPS_PER_UPDATE, tensorboard=True, eval_freq=0))
+    train(resumed(tmp_path / "run", steps=4 * STEPS_PER_UPDATE, tensorboard=True, eval_freq=0))
+    events = EventAccumulator(str(tmp_path / "run/tensorboard")).Reload()
+    (tag,) = (tag for tag in events.Tags()["scalars"] if tag.endswith("steps_per_s"))
+    assert [event.step for event in events.Scalars(tag)] == [n * STEPS_PER_UPDATE for n in (1, 2, 3, 4)]

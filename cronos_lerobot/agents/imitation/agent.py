@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -68,6 +69,7 @@ class ImitationAgent(LearningAgent):
         drop_last = getattr(policy_config, "drop_n_last_frames", 0) or 0
         self.memory = SegmentMemory(int(self.config.memory_gib * 2**30), drop_last)
         self._weights: np.ndarray | None = None
+        self._is_warm = False
         self._demos = None
         if self.config.demos_share:
             self._demos = Demonstrations(self.config.demos, policy_config)
@@ -113,17 +115,25 @@ class ImitationAgent(LearningAgent):
         found = self._processes.concatenate(np.array([[successes, memory.num_frames, len(memory)]]))
         metrics = {"segments": float(found[:, 0].sum()), "frames": float(found[:, 1].sum())}
         metrics |= self._weigh()
+        # Failed segments that are remembered may push successes out again.
+        self._is_warm |= bool(found[:, 0].sum() >= self.config.warmup_segments)
         # All processes take a step, or none.
-        has_batch = self._demos is not None or found[:, 2].all()
-        if found[:, 0].sum() < self.config.warmup_segments or not has_batch:
+        has_batch = self._demos is not None or (found[:, 2].all() and found[:, 0].any())
+        if not self._is_warm or not has_batch:
             return metrics | {"optimizer_steps": 0.0}
         with self._stopwatch("update"):
             self._learner.train()
             steps = [self._step() for _ in range(self.config.steps_per_update)]
             self._learner.eval()
+            # Running means, as those of batch normalization, are each process's own of its own batches.
+            self._processes.copy_from_main([*self._learner.buffers(), *self.policy.buffers()])
         means = self._processes.concatenate(np.array([steps])).mean(axis=(0, 1))
         metrics |= {"loss": float(means[0]), "grad_norm": float(means[1])}
         return metrics | {"optimizer_steps": float(len(steps))}
+
+    def shared_tensors(self) -> Iterable[Tensor]:
+        """What is trained, and the policy's buffers, which training may move."""
+        return [*super().shared_tensors(), *self.policy.buffers()]
 
     def state_dict(self) -> dict[str, Any]:
         """The segments that each process remembers, and what an average is of; see `LearningAgent`."""
@@ -132,11 +142,13 @@ class ImitationAgent(LearningAgent):
             params = self.policy.named_parameters(remove_duplicate=False)
             frozen = {name for name, param in params if not param.requires_grad}
             learner = {name: value for name, value in self._learner.state_dict().items() if name not in frozen}
-        return {"memory": to_tensors(self._processes.gather(self.memory.state_dict())), "learner": learner}
+        memory = to_tensors(self._processes.gather(self.memory.state_dict()))
+        return {"memory": memory, "learner": learner, "is_warm": self._is_warm}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on with the segments of this process, or with its share if there are more or fewer processes now."""
         processes = self._processes
+        self._is_warm = state.get("is_warm", False)
         self.memory.load_state_dict(own_share(to_arrays(state["memory"]), processes.rank, processes.count))
         if self.config.ema_decay:
             self._learner.load_state_dict(self.policy.state_dict() | state.get("learner", {}))

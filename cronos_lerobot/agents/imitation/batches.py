@@ -163,7 +163,7 @@ def draw_batch(
 ) -> Batch | None:
     """Return `size` frames of a memory and, by a share, of demonstrations; None if there is nothing to draw.
 
-    As long as nothing is remembered, all of them are of the demonstrations.
+    As long as no success is remembered, all of them are of the demonstrations.
 
     Args:
         memory: own segments.
@@ -174,7 +174,8 @@ def draw_batch(
         config: of the policy.
         weights: see `SegmentMemory.draw`.
     """
-    num_demos = 0 if demos is None else round(demos_share * size) if len(memory) else size
+    has_success = any(segment.success for segment in memory.segments)
+    num_demos = 0 if demos is None else round(demos_share * size) if has_success else size
     parts = []
     if demos is not None and num_demos:
         parts.append(demos.batch(num_demos, rng))

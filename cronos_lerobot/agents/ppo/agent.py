@@ -70,9 +70,7 @@ class PPOAgent(LearningAgent):
             elif self.clock.fresh.any():
                 self._decide_anew(self._seen, tau)
             assert self._decision is not None
-            action = self.clock.action()
-            log_prob = self._decision.log_prob
-            return ActionSample(action, log_prob.reshape(len(tau), -1).sum(1), self._decision.value)
+            return ActionSample(self.clock.action(), self._log_prob, self._value)
 
     def store(
         self,
@@ -188,12 +186,16 @@ class PPOAgent(LearningAgent):
         # The environment may write the next observation where this one lies.
         self._encoded = {name: col.copy() for name, col in encoded.items()} if self.num_steps > 1 else encoded
         self._decision = decision
+        self._log_prob, self._value = decision.log_prob.reshape(len(decision.value), -1).sum(1), decision.value
         self.clock.begin(decision.actions)
 
     def _decide_anew(self, columns: Columns, tau: list[str]) -> None:
         """Streams whose decision ended too early decide on what they do until the others decide."""
         who = np.flatnonzero(self.clock.fresh)
         _, decision = self._decide({name: col[who] for name, col in columns.items()}, [tau[i] for i in who])
+        # What is learned from keeps the numbers of the decision that was cut.
+        self._log_prob, self._value = self._log_prob.copy(), self._value.copy()
+        self._log_prob[who], self._value[who] = decision.log_prob.reshape(len(who), -1).sum(1), decision.value
         self.clock.begin_anew(decision.actions)
 
     @torch.inference_mode()

@@ -59,7 +59,8 @@ class SteeringAgent(LearningAgent):
             noise_repeat=self.config.noise_repeat,
             hidden_width=self.config.hidden_width,
         )
-        self.steered = SteeredPolicy(steerable, shape)
+        # An evaluation leaves it in the mode that it found, and with it the policy.
+        self.steered = SteeredPolicy(steerable, shape).eval()
         device = self._processors.device
         self.sac = SAC(
             self.config, self.steered.actor, self.steered.whitening, shape.features, self.steered.dims, device,
@@ -95,7 +96,7 @@ class SteeringAgent(LearningAgent):
             elif self.clock.fresh.any():
                 who = np.flatnonzero(self.clock.fresh)
                 columns = {name: col[who] for name, col in self._seen.items()}
-                self.clock.begin_anew(self._decide(columns, [tau[i] for i in who])[0])
+                self._decide_anew(columns, [tau[i] for i in who], who)
             return ActionSample(self.clock.action(), self._log_prob, self._value)
 
     def store(
@@ -173,11 +174,17 @@ class SteeringAgent(LearningAgent):
     def state_dict(self) -> dict[str, Any]:
         """Actor, critics and the memory; see `LearningAgent`."""
         memory = map_leaves(self.memory.state_dict(), np.ndarray, self._processes.collect)
-        return {"num_steps": self.num_steps, "sac": self.sac.state_dict(), "memory": to_tensors(memory)}
+        return {
+            "num_steps": self.num_steps,
+            "new": self._new * self._processes.count,
+            "sac": self.sac.state_dict(),
+            "memory": to_tensors(memory),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from `state_dict`, with this process's share of the memory."""
         self.num_steps = state["num_steps"]
+        self._new = state.get("new", 0) // self._processes.count
         self.sac.load_state_dict(state["sac"])
         memory = to_arrays(state["memory"])
         share = len(memory.get("reward", ())) // self._processes.count
@@ -187,12 +194,25 @@ class SteeringAgent(LearningAgent):
     def _begin(self, columns: Columns, tau: list[str]) -> None:
         """All streams decide; where a decision went on until here, this is what follows it."""
         actions, features, choice, log_prob = self._decide(columns, tau)
-        self._log_prob = log_prob.cpu().numpy()
-        self._value = self.sac.value(features, choice).cpu().numpy() if self.num_steps else 0.0 * self._log_prob
+        self._log_prob, self._value = log_prob.cpu().numpy(), self._worth(features, choice)
         self._features, self._choice = features.cpu().numpy(), choice.cpu().numpy()
         if self._waiting:
             self._remember(self._features)
         self.clock.begin(actions, self._features.shape[1:])
+
+    def _decide_anew(self, columns: Columns, tau: list[str], who: np.ndarray) -> None:
+        """Streams `who`, whose decision ended too early, decide on what they do until the others decide."""
+        actions, features, choice, log_prob = self._decide(columns, tau)
+        # Copies: steps that are being recorded hold the former ones.
+        self._log_prob, self._value = self._log_prob.copy(), self._value.copy()
+        self._log_prob[who], self._value[who] = log_prob.cpu().numpy(), self._worth(features, choice)
+        self.clock.begin_anew(actions)
+
+    def _worth(self, features: Tensor, choice: Tensor) -> np.ndarray:
+        """The critics' word on choices, 0 until they have learned."""
+        if not self.num_steps:
+            return np.zeros(len(features), np.float32)
+        return self.sac.value(features, choice).cpu().numpy()
 
     def _decide(self, columns: Columns, tau: list[str]) -> tuple[np.ndarray, Tensor, Tensor, Tensor]:
         """Actions (k, n, A) in physical units; of the decision features, choice and its log-density."""
