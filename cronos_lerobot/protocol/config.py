@@ -194,8 +194,8 @@ class ProtocolConfig:
             ):
                 wanted = " or ".join(f"protocol.{reader}=critic" for reader in readers)
                 raise ValueError(
-                    f"protocol.critic.{name}={json.dumps(value)} is read by {wanted} alone: give that, or leave it "
-                    f"at {json.dumps(getattr(default, name))}."
+                    f"protocol.critic.{name}={json.dumps(value)} is read by {wanted} alone: give that, or leave "
+                    f"it at {json.dumps(getattr(default, name))}."
                 )
 
     def _check_multiple_of_k(self, name: str, interval: int) -> None:

@@ -261,21 +261,21 @@ def test_unknown_task_order_lists_the_known_ones():
 
 def test_a_divergence_in_a_segment_is_not_its_first_step():
     """What is complete after one was not found so, unless the segment's own first step found it."""
-    broken = np.array([False, True])
-    loop, cut = LoopState(2, 1), np.zeros(2, bool)
+    loop, never = LoopState(2, 1), np.zeros(2, bool)
 
-    def step(*complete, diverged=np.zeros(2, bool)):
-        loop.count_step({"is_success": np.array(complete), "is_grasped": cut, "diverged": diverged}, cut)
+    def step(*complete, diverged=(False, False)):
+        info = {"is_success": np.array(complete), "is_grasped": never, "diverged": np.array(diverged)}
+        loop.count_step(info, never)
 
     loop.switch_task(np.zeros(2, np.int64))
-    step(True, False, diverged=broken)
+    step(True, False, diverged=(False, True))
     loop.count_intervention(np.array([0, 1]), Intervention.DIVERGENCE)
     step(False, True)
     end = loop.end_segment()
     assert end.success.tolist() == [True, True]
     assert end.found_complete.tolist() == [True, False]
     # One in a segment's last step is followed by the next one's first.
-    step(False, False, diverged=broken)
+    step(False, False, diverged=(False, True))
     loop.count_intervention(np.array([1]), Intervention.DIVERGENCE)
     loop.switch_task(np.zeros(2, np.int64))
     step(False, True)
