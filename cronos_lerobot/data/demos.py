@@ -131,15 +131,17 @@ class DemoCollector:
         self._started = 0
         self._seed = (seed, writer.num_episodes)
         everything = env.scene.tasks + (env.scene.reset_tasks if config.reset_tasks else ())
-        self._kept = dict.fromkeys(tasks or everything, 0)
-        self._tried = dict.fromkeys(self._kept, 0)
+        self._kept = {task: writer.episodes_before[task.instruction] for task in tasks or everything}
+        self._already = sum(self._kept.values())
+        # A dataset that is gone on with goes on with the next configuration, as far as the attempts succeeded.
+        self._tried = dict(self._kept)
         self._episodes: list[_Episode | None] = [None] * env.num_envs
         self._noise = ActionNoise(config.noise, env.num_envs)
         self._misses = GraspMisses(config.misses, env)
         self._failures_in_a_row = 0
 
     def collect(self, num_episodes: int, on_episode: Callable[[int], object] = lambda frames: None) -> None:
-        """Write `num_episodes` more episodes, the same number of each task as far as that divides.
+        """Write `num_episodes` more episodes: in the end each task has the same number, as far as that divides.
 
         Args:
             num_episodes: how many.
@@ -264,7 +266,7 @@ class DemoCollector:
             if episode is not None:
                 under_way[episode.task] += 1
         for stream, episode in enumerate(self._episodes):
-            if episode is None and sum(under_way.values()) < num_episodes:
+            if episode is None and sum(under_way.values()) < self._already + num_episodes:
                 task = min(under_way, key=lambda task: under_way[task])
                 under_way[task] += 1
                 self._episodes[stream] = self._new_episode(stream, task)

@@ -47,12 +47,15 @@ def to_replay_buffer(
         `is_intervention` of the takeovers' transitions, as LeRobot's actor marks them.
 
     Raises:
-        ValueError: there is no such column.
+        ValueError: there is no such column, or the buffer is to take successors from its next row
+            (`optimize_memory`).
     """
     from lerobot.rl import ReplayBuffer
 
     if unknown := [key for key in state_keys if key not in streams.meta.features]:
         raise ValueError(f"{streams.repo_id} has no columns {unknown}; it has {list(streams.meta.features)}")
+    if options.get("optimize_memory"):
+        raise ValueError("optimize_memory=True takes the next row for a successor, and rows at cuts are left out")
     capacity = options.pop("capacity", streams.meta.total_frames)
     buffer = ReplayBuffer(capacity, device=device, state_keys=state_keys, **options)
     for transition in _transitions(streams, state_keys):

@@ -171,16 +171,17 @@ class StreamDataset:
         return [segment for segment in self.segments if segment.stream == stream]
 
     def switches(self, stream: int | None = None) -> Iterator[Switch]:
-        """The places between two segments, of one stream or of all."""
+        """The places between two segments that followed one another, of one stream or of all."""
         for before, after in pairwise(self.segments if stream is None else self.segments_of(stream)):
-            if before.stream == after.stream:
+            if before.stream == after.stream and after.step == before.step + before.length:
                 yield Switch(before, after)
 
     def reset_free_episodes(self, stream: int | None = None) -> Iterator[list[Segment]]:
-        """What lies between two scene resets: the segments of a stream from one to the next."""
+        """What there is between two scene resets: the segments of a stream from one to the next."""
         episode: list[Segment] = []
         for segment in self.segments if stream is None else self.segments_of(stream):
-            if episode and (segment.position == 0 or segment.stream != episode[0].stream):
+            # What was filtered out may have been the first after a reset.
+            if episode and _reset(segment) != _reset(episode[-1]):
                 yield episode
                 episode = []
             episode.append(segment)
@@ -290,6 +291,11 @@ def to_array(column: pa.ChunkedArray) -> np.ndarray:
         values = column.combine_chunks()
         return np.asarray(values.flatten()).reshape(len(values), -1)
     return column.to_numpy()
+
+
+def _reset(segment: Segment) -> tuple[int, int]:
+    """The stream, and the number of its first segment since the last scene reset."""
+    return segment.stream, segment.index - segment.position
 
 
 def _segment(row: dict[str, Any]) -> Segment:

@@ -8,9 +8,11 @@ import queue
 import shutil
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any, Self
 
@@ -263,6 +265,9 @@ class SegmentWriter:
         self._canvas: dict[str, np.ndarray] = {}
         self._oldest = 0.0
         self._on_disk = meta.info.total_episodes, meta.info.total_frames
+        tasks = [] if meta.episodes is None else meta.episodes["tasks"]
+        self.episodes_before: Counter[str] = Counter(chain.from_iterable(tasks))
+        """Episodes of each task that were there when writing began."""
         self._next_shard = next_shard_index(meta)
         self._failure: BaseException | None = None
         self._pending = 0

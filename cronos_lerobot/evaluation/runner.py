@@ -90,6 +90,11 @@ class Evaluation:
             self._close()
         results = self.results()
         write_json(self.store.folder / self.file, results)
+        if left_out := set(self.store.names()) - {part.name for part in self.parts}:
+            logging.warning(
+                "%s has what the flags name, and not %s, which the folder has too.",
+                self.file, ", ".join(sorted(left_out)),
+            )  # fmt: skip
         if self.config.eval.videos:
             results["videos"] = film_best_and_worst(
                 self.store,

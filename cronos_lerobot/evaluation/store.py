@@ -72,6 +72,10 @@ class ResultStore:
         # Written last: a part is finished when it is there.
         write_json(self._path(name), content)
 
+    def names(self) -> list[str]:
+        """The finished parts."""
+        return sorted(path.stem for path in self._path("").parent.glob("*.json"))
+
     def has_trajectories(self, name: str) -> bool:
         """Whether a part was written with trajectories."""
         with np.load(self._path(name).with_suffix(".npz")) as arrays:

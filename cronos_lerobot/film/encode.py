@@ -16,11 +16,13 @@ GIF_QUALITIES = ((2, 128), (2, 64), (3, 64), (4, 48), (6, 32), (8, 32), (12, 24)
 
 
 def write_mp4(path: Path, frames: list[np.ndarray], fps: int) -> None:
-    """Encode frames (H, W, 3) uint8 as h264 that every browser plays."""
+    """Encode frames (H, W, 3) uint8 as h264 that every browser plays; a kill leaves no half of it at `path`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     encoder = RGBEncoderConfig(vcodec="h264", preset="medium", g=10 * fps, crf=28)
-    with VideoFile(path, fps, *frames[0].shape[:2], encoder) as video:
+    partial = path.with_name(f".{path.name}")
+    with VideoFile(partial, fps, *frames[0].shape[:2], encoder) as video:
         video.append(np.stack(frames))
+    partial.replace(path)
 
 
 def write_gif(path: Path, frames: list[np.ndarray], max_bytes: int = MAX_GIF_BYTES) -> int:

@@ -29,7 +29,8 @@ from cronos_lerobot.hub.runs import (
 from cronos_lerobot.report import figures
 from cronos_lerobot.report.runs import TrainingRun, group_runs
 
-REPLACES = ["curves/*"]
+REPLACES = ["curves/*", "*.safetensors", "*.json", "*.model", "*.txt"]
+"""Also what a policy of another kind has left: an actor that steers or adapters would be loaded with this one."""
 FIGURES = {
     "evaluation": ("Periodic evaluation, with 95 % intervals", figures.evaluation_figure),
     "training": ("Success of the training streams' segments", figures.training_figure),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from cronos_lerobot.experiments.arithmetic import portable_arithmetic
 from cronos_lerobot.training.stopping import SAME_S
 
 ECHO_S = 1.0
@@ -107,7 +109,8 @@ def run_command(command: list[str]) -> None:
 
 def _run(command: list[str]) -> int:
     """Run a command, which Ctrl-C reaches as it does us, to its end; a second one kills it. Its exit status."""
-    with subprocess.Popen(command) as process:
+    # README says what comes out: on any processor with AVX2 the same.
+    with subprocess.Popen(command, env=portable_arithmetic() | os.environ) as process:
         try:
             return process.wait()
         except KeyboardInterrupt:

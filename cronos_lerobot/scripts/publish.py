@@ -23,7 +23,6 @@ HF_ENDPOINT chooses the Hub and HF_TOKEN the account (or `hf auth login`). After
 goes on with what is missing. `cronos-publish policy --help` has the flags of a command, docs/hub.md the rest.
 """
 
-import sys
 import tempfile
 from collections.abc import Callable
 from functools import partial
@@ -59,8 +58,9 @@ def publish_stream(config: StreamConfig) -> None:
     config.validate()
     from cronos_lerobot.hub.streams import REPLACES, read_codebase_version, write_stream_repository
 
-    version = read_codebase_version(config)
-    _publish(config, write_stream_repository, replaces=REPLACES, tag=version)
+    # LeRobot reads a dataset at its version's tag unless it is told a revision: that is not for a branch.
+    tag = read_codebase_version(config) if config.branch is None else None
+    _publish(config, write_stream_repository, replaces=REPLACES, tag=tag)
 
 
 def publish_policy(config: PolicyConfig) -> None:
@@ -108,9 +108,8 @@ COMMANDS: dict[str, tuple[type[PublishConfig], Callable[[Any], None]]] = {
 
 def main() -> None:
     """Entry point of `cronos-publish`."""
-    if sys.argv[1:2] in (["benchmark"], ["results"]):
-        # They may bring scenes with them.
-        register_third_party_plugins()
+    # They may bring scenes with them.
+    register_third_party_plugins()
     run_subcommand(__doc__ or "", COMMANDS, (ValueError, OSError, ImportError, PublishError))
 
 

@@ -32,7 +32,9 @@ from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.report.stream_video import PolicySpectator, load_spectator
 from cronos_lerobot.scripts.errors import error_line, parse_command_line, stop
 
-MAY_DIFFER = ("resume", "num_envs", "env.num_threads", "dataset.repo_id", "dataset.num_episodes")
+MAY_DIFFER = (
+    "resume", "num_envs", "env.num_threads", "dataset.repo_id", "dataset.num_episodes", "dataset.overwrite",
+)  # fmt: skip
 """Flags that need not be those of the dataset that is resumed."""
 EVALUATION_ONLY = {"suite": "independent", "split": "train", "advance": "window", "end_effector_reset": False}
 """Flags of the environment that say how to evaluate, with their defaults."""

@@ -40,6 +40,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot.utils.constants import HF_LEROBOT_HOME
+from lerobot.utils.import_utils import register_third_party_plugins
 from rich.console import Console
 
 from cronos_lerobot.data.file_check import check_dataset
@@ -205,6 +206,8 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], None]]] = {
 
 def main() -> None:
     """Entry point of `cronos-streams`."""
+    # Streams may be of a scene that one of them brings.
+    register_third_party_plugins()
     run_subcommand(__doc__ or "", COMMANDS)
 
 

@@ -7,10 +7,12 @@ from collected_demos import Spy, collect, command, episodes_of, home_position
 from forked_commands import run_forked
 from lerobot.datasets import LeRobotDataset
 from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.expert.reach import find_reach
 
-from cronos_lerobot.data.demos import DemoConfig, StartConfig
+from cronos_lerobot.data.demos import DemoCollector, DemoConfig, StartConfig
 from cronos_lerobot.data.perturbations import ActionNoise, MissConfig, NoiseConfig, drop_against_another
+from cronos_lerobot.data.writer import SegmentWriter
 from cronos_lerobot.scripts.record_demos import RecordDemosConfig, record_demos
 
 NUM_ENVS = 4
@@ -32,6 +34,15 @@ def test_successful_episodes_of_every_task_in_balance(env, tmp_path):
         assert episode["next.done"].tolist() == [False] * (len(episode["index"]) - 1) + [True]
         assert not episode["next.truncated"].any()
         assert episode["next.reward"].sum() == pytest.approx(1.0)  # "difference": the level reached
+
+
+def test_a_dataset_that_is_gone_on_with_goes_on_with_the_next_configurations(env, tmp_path):
+    collect(env, tmp_path / "d", DemoConfig(), 6)
+    with SegmentWriter.resume("me/demos", tmp_path / "d") as writer:
+        DemoCollector(env, ScriptedExpert(env), writer, DemoConfig()).collect(6)
+    episodes = LeRobotDataset("me/demos", root=tmp_path / "d").meta.episodes
+    begun = [(tasks[0], number) for tasks, number in zip(episodes["tasks"], episodes["cronos.configuration"])]
+    assert sorted(begun) == sorted((task.instruction, number) for task in env.scene.tasks for number in range(3))
 
 
 def test_starts_at_home_in_training_configurations(env, tmp_path):
@@ -291,6 +302,9 @@ def test_the_command_records_resumes_and_overwrites(tmp_path, caplog):
     assert dataset.meta.fps == 5
     record_demos(command(root, 1, overwrite=True))
     assert LeRobotDataset("me/demos", root=root).num_episodes == 1
+    # What was made in the place of another may be gone on with all the same.
+    record_demos(command(root, 2, resume=True))
+    assert LeRobotDataset("me/demos", root=root).num_episodes == 2
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious" / "thesis.tex").write_text("...")
     with pytest.raises(FileExistsError, match="is not a LeRobotDataset"):

@@ -12,6 +12,7 @@ from synthetic_segments import FPS, features, segment
 from synthetic_streams import PICTURES, STEPS, STREAMS, TASKS, UPDATE, K, record
 
 from cronos_lerobot.data.stream_check import StreamError
+from cronos_lerobot.data.stream_filter import SegmentFilter, filter_streams
 from cronos_lerobot.data.stream_statistics import make_tables, statistics
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.data.writer import SegmentWriter
@@ -83,6 +84,16 @@ def test_episodes_between_scene_resets(streams):
     episodes = list(streams.reset_free_episodes())
     assert [(e[0].stream, e[0].step, len(e)) for e in episodes] == [(i, t, 4) for i in range(3) for t in (0, 16)]
     assert list(streams.reset_free_episodes(1)) == episodes[2:4]
+
+
+def test_what_was_filtered_out_ends_an_episode_and_joins_nothing(streams, tmp_path):
+    """Stream 1 succeeds in its odd segments; the first ones after a scene reset are 0 and 4."""
+    wanted = SegmentFilter(success=True, streams=[1])
+    filter_streams(streams, wanted, "me/some", tmp_path / "d")
+    some = StreamDataset("me/some", tmp_path / "d")
+    episodes = [[segment.index for segment in episode] for episode in some.reset_free_episodes()]
+    assert episodes == [[1, 3], [5, 7]]
+    assert list(some.switches()) == []
 
 
 def test_statistics(streams):

@@ -5,6 +5,14 @@ import re
 
 import pytest
 import yaml
+from huggingface_hub.utils import filter_repo_objects
+from lerobot_env_cronos import CronosEnvConfig
+from lerobot_policy_pocketvla import PocketVLAConfig
+
+from cronos_lerobot.hub.policy import REPLACES
+from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.factory import make_env
 
 BENCHMARK = ("benchmark", "--repo_id=me/bench", "--scene=playroom_2x2", "--seed=5", "--num_configurations=2",
              "--num_orderings=2", "--chain_length=2")  # fmt: skip
@@ -47,6 +55,14 @@ def test_a_training_that_asks_for_more_configurations_than_there_are_is_told(ben
     assert outcome.code == 1
     assert "--eval.n_episodes=64, but" in outcome.output
     assert "has 2 train configurations: give --eval.n_episodes=2 or fewer" in outcome.output
+    # Also where only numbers of interventions are to be evaluated at.
+    config = CronosTrainConfig(
+        policy=PocketVLAConfig(device="cpu", push_to_hub=False), env=CronosEnvConfig(benchmark=str(bench)),
+        output_dir=tmp_path / "other", protocol=ProtocolConfig(num_configurations=2), eval_freq=0,
+        eval_at_interventions=[2],
+    )  # fmt: skip
+    with pytest.raises(ValueError, match=r"--eval\.n_episodes=64, but .* has 2 train configurations"):
+        make_env(config, 2)
 
 
 @pytest.fixture(scope="module")
@@ -147,6 +163,16 @@ print(streams.dataset[15]["observation.images.front"].shape)
     card = repository.find("main").files["README.md"].content.decode()
     assert "1 of 2 parallel streams" in card
     assert "4 segments, 16 frames at 5 Hz" in card
+    # A branch is for those who name it: the tag, which LeRobot reads at, stays.
+    commands.run(*publish, "--branch=trial")
+    assert set(repository.branches) == {"main", "trial"}
+    assert repository.tags == {"v3.0": repository.branches["main"]}
+
+
+def test_a_policy_that_is_pushed_again_leaves_nothing_that_would_be_loaded_with_it():
+    there = ["steering.safetensors", "adapter_model.safetensors", "adapter_config.json", "tokenizer.model",
+             "curves/old.png", ".eval_results/me_bench.yaml", "README.md", ".gitattributes"]  # fmt: skip
+    assert list(filter_repo_objects(there, allow_patterns=REPLACES)) == there[:5]
 
 
 def test_a_policy_is_loaded_back_with_its_card(hub, run, policy, commands, tmp_path):

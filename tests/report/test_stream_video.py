@@ -186,7 +186,11 @@ def test_overlay_shows_outcomes():
 
 def test_mp4_plays_every_frame(film, tmp_path):
     frames, _ = film
+    with pytest.raises(ValueError, match="frames must be uint8"):
+        write_mp4(tmp_path / "a/stream.mp4", [frame.astype(float) for frame in frames], fps=20)
+    assert not (tmp_path / "a/stream.mp4").exists()
     write_mp4(tmp_path / "a/stream.mp4", frames, fps=20)
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["stream.mp4"]
     with av.open(str(tmp_path / "a/stream.mp4")) as container:
         decoded = list(container.decode(video=0))
         assert container.streams.video[0].average_rate == 20

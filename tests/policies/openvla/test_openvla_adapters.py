@@ -122,3 +122,12 @@ def test_adapters_of_another_network_are_refused(published, published_adapter, t
     save_file(renamed, folder / ADAPTER_WEIGHTS, metadata={"format": "pt"})
     with pytest.raises(ValueError, match="llm"):
         make_policy(published, adapter=str(folder))
+
+
+def test_adapters_that_the_config_cannot_describe_are_merged_or_refused(published, published_adapter, tmp_path):
+    folder = shutil.copytree(published_adapter, tmp_path / "other")
+    fields = json.loads((folder / ADAPTER_CONFIG).read_text()) | {"use_rslora": True}
+    (folder / ADAPTER_CONFIG).write_text(json.dumps(fields))
+    with pytest.raises(ValueError, match=r"is no plain LoRA \(use_rslora\).*--policy\.merge_adapter=true"):
+        make_policy(published, adapter=str(folder))
+    make_policy(published, adapter=str(folder), merge_adapter=True)

@@ -19,10 +19,23 @@ def test_states_are_standardised_and_constant_ones_do_not_explode():
     batch = make_batch(2) | {"observation.state": torch.full((2, 13), 6.0)}
     batch["observation.state"][:, 0] = 2.0 + 1e-4
     state = preprocessor(batch)["observation.state"]
-    torch.testing.assert_close(state[:, 1:], torch.ones(2, 12))
-    # 0.1 mm from a constant is a tenth of the smallest deviation, not ten thousand.
+    torch.testing.assert_close(state[:, 1:], torch.full((2, 12), 4 / 4.001))
+    # 0.1 mm from a constant is a tenth of what is added to its deviation, not ten thousand.
     torch.testing.assert_close(state[:, 0], torch.full((2,), 0.1), atol=1e-3, rtol=0)
     assert STATS["observation.state"]["std"][0] == 0.0
+
+
+def test_a_constant_does_not_explode_either_where_lerobot_train_puts_in_other_statistics(tmp_path):
+    """As it does with those of its dataset when it goes on from a policy."""
+    for processor in make_pre_post_processors(make_config(), dataset_stats=STATS):
+        processor.save_pretrained(tmp_path)
+    other = STATS | {"observation.state": {"mean": np.full(13, 3.0), "std": np.full(13, 1e-6)}}
+    preprocessor, _ = make_pre_post_processors(
+        make_config(), pretrained_path=str(tmp_path),
+        preprocessor_overrides={"normalizer_processor": {"stats": other}},
+    )  # fmt: skip
+    state = preprocessor(make_batch(1) | {"observation.state": torch.full((1, 13), 3.0005)})["observation.state"]
+    torch.testing.assert_close(state, torch.full((1, 13), 0.5), atol=1e-3, rtol=0)
 
 
 def test_bridge_bounds_map_to_the_ends_of_the_range_and_back():

@@ -30,6 +30,8 @@ PARTS = {"vision": "vision_backbone", "projector": "projector", "language": "lan
 """What LoRA may be asked to adapt."""
 BASE_LAYER = ".base_layer."
 """In the name of an adapted layer's own weights, which PEFT saves too where that is the output layer."""
+VARIANTS = ("use_rslora", "use_dora", "rank_pattern", "alpha_pattern")
+"""Settings of LoRA that a policy's config has no place for."""
 
 
 def linear_names(network: nn.Module, parts: Sequence[str]) -> list[str]:
@@ -59,12 +61,18 @@ def load_adapter(network: OpenVLANetwork, name: str, *, merge: bool) -> LoraConf
         merge: add it to the weights instead of keeping it apart and trainable.
 
     Raises:
-        ValueError: it is no LoRA adapter, its tensors are not this network's, or it was made on other weights.
+        ValueError: it is no LoRA adapter, or one of `VARIANTS` that is not to be merged, its tensors are not this
+            network's, or it was made on other weights.
     """
     folder = fetch(name)
     config = PeftConfig.from_pretrained(str(folder))
     if not isinstance(config, LoraConfig):
         raise ValueError(f"{name} is an adapter of type {config.peft_type}; only LoRA can be loaded.")
+    if not merge and (variants := [field for field in VARIANTS if getattr(config, field)]):
+        raise ValueError(
+            f"{name} is no plain LoRA ({', '.join(variants)}), and would be loaded as such once it is saved with "
+            "the policy: add it to the weights, --policy.merge_adapter=true"
+        )
     state = {_network_name(key): value for key, value in load_file(folder / ADAPTER_WEIGHTS).items()}
     _check_base(network, {key: state.pop(key) for key in list(state) if BASE_LAYER in key}, name)
     modules = dict(network.named_modules())
