@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +34,7 @@ from cronos_lerobot.experiments.results import (
 )
 from cronos_lerobot.experiments.specs import Options, base_policy
 from cronos_lerobot.report.paired import ALPHA
+from cronos_lerobot.report.png import to_png
 from cronos_lerobot.report.tables import write_csv
 from cronos_lerobot.training.logging import METRICS
 
@@ -71,9 +71,8 @@ def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options,
     drawn = []
     for file, figure in drawings.items():
         if figure is not None:
-            buffer = BytesIO()
-            figure.savefig(buffer, format="png", dpi=DPI_BY_TASK if experiment.by_task else DPI)
-            (folder / f"{file}.png").write_bytes(buffer.getvalue())
+            png = to_png(figure, DPI_BY_TASK if experiment.by_task else DPI)
+            (folder / f"{file}.png").write_bytes(png)
             drawn.append(f"{file}.png")
     summary = _settings(result) | {"rows": data[name], "claims": tables.claim_rows(result)}
     orders = paper_orders(result)

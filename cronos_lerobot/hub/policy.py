@@ -27,6 +27,7 @@ from cronos_lerobot.hub.runs import (
     train_config_path,
 )
 from cronos_lerobot.report import figures
+from cronos_lerobot.report.png import to_png
 from cronos_lerobot.report.runs import TrainingRun, group_runs
 
 REPLACES = ["curves/*", "*.safetensors", "*.json", "*.model", "*.txt"]
@@ -99,7 +100,7 @@ def _draw_curves(run: TrainingRun, folder: Path) -> list[tuple[str, str]]:
             continue
         path = folder / "curves" / f"{name}.png"
         path.parent.mkdir(exist_ok=True)
-        figure.savefig(path, dpi=DPI)
+        path.write_bytes(to_png(figure, DPI))
         drawn.append((caption, f"curves/{name}.png"))
     return drawn
 

@@ -6,7 +6,6 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from matplotlib.figure import Figure
 
 from cronos_lerobot.report import clips, figures, suite_views, tables
 from cronos_lerobot.report.comparisons import Comparison, compare_evaluations, compare_training
+from cronos_lerobot.report.png import to_png
 from cronos_lerobot.report.runs import EvaluationRun, Group, TrainingRun, group_runs
 from cronos_lerobot.report.suites import SuiteRun
 
@@ -144,10 +144,9 @@ def _draw_suites(suites: list[SuiteRun], output: Path) -> list[str]:
 
 def _write_png(figure: Figure, path: Path) -> str:
     """Write a figure; returns it as a data URL."""
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
-    path.write_bytes(buffer.getvalue())
-    return clips.data_url(buffer.getvalue(), "image/png")
+    png = to_png(figure, DPI)
+    path.write_bytes(png)
+    return clips.data_url(png, "image/png")
 
 
 def _clip_rows(report: Report, output: Path) -> list[list[dict[str, Any]]]:

@@ -27,6 +27,7 @@ from cronos_lerobot.experiments.jobs import Job
 from cronos_lerobot.experiments.plan import LAST_POLICY, resume_command
 from cronos_lerobot.experiments.progress import train_progress
 from cronos_lerobot.experiments.runner import DONE, Runner
+from cronos_lerobot.report.png import to_png
 from cronos_lerobot.report.runs import TrainingRun, read_training_run
 from cronos_lerobot.studies.every_policy_report import (
     Cost,
@@ -266,7 +267,7 @@ def main() -> None:
     if ends:
         args.output_dir.mkdir(parents=True, exist_ok=True)
         write_gains(ends, args.output_dir / "gains.csv")
-        draw_gains(ends).savefig(args.output_dir / "gains.png", dpi=150)
+        (args.output_dir / "gains.png").write_bytes(to_png(draw_gains(ends), 150))
     print(make_table(ends), make_cost_table(find_costs(begun)), sep="\n\n")
     if not done:
         sys.exit(1)

@@ -27,6 +27,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cronos_lerobot.report.figures import COLORS, INK, style_axes
+from cronos_lerobot.report.png import to_png
 from cronos_lerobot.report.runs import TrainingRun, read_training_run
 from cronos_lerobot.report.statistics import Rate, SeedRate, newcombe_interval, sum_rates
 from cronos_lerobot.report.tables import Row, write_csv
@@ -295,7 +296,7 @@ def main() -> None:
     except (OSError, ValueError) as error:
         sys.exit(str(error))
     args.output.mkdir(parents=True, exist_ok=True)
-    draw_streams(streams, runs).savefig(args.output / "streams.png", dpi=150)
+    (args.output / "streams.png").write_bytes(to_png(draw_streams(streams, runs), 150))
     write_csv(args.output / "streams.csv", table_rows(streams))
     tables = "\n\n".join(make(streams) for make in (make_table, make_parts, make_differences))
     (args.output / "streams.md").write_text(tables + "\n")
