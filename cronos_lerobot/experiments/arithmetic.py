@@ -7,9 +7,6 @@ every x86-64 processor of the last ten years has.
 
 from __future__ import annotations
 
-import numpy as np
-import torch
-
 AVX2 = {
     "ATEN_CPU_CAPABILITY": "avx2",
     "MKL_CBWR": "AVX2",
@@ -24,6 +21,10 @@ def portable_arithmetic() -> dict[str, str]:
 
     They have to be set before the command starts. One that a user has set himself should win over them.
     """
+    # They take seconds, and commands that only explain themselves do without.
+    import numpy as np
+    import torch
+
     if torch.backends.cpu.get_cpu_capability() not in ("AVX2", "AVX512"):
         return {}
     found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any
 
@@ -13,6 +13,7 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from cronos_lerobot.agents.registry import check_agent
+from cronos_lerobot.experiments.flags import read_flags
 from cronos_lerobot.experiments.jobs import Job
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.resume import allow_single_file
@@ -43,27 +44,13 @@ def check_commands(jobs: Iterable[Job], policy_type: str | None = BASE_POLICY) -
         if job.command[0] != "cronos-train":
             continue
         try:
-            given = dict(_pairs(job.command[1:]))
+            given = dict(read_flags(job.command[1:]))
             key = tuple(sorted((name, value) for name, value in given.items() if name not in WHICH_RUN))
             if key not in seen:
                 seen.add(key)
                 _check(given, policy_type)
         except (ValueError, OSError, ParsingError) as error:
             raise ValueError(f"{job.name} would not begin: {_reason(error)}") from error
-
-
-def _pairs(arguments: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Name and value of `--name=value` and `--name value`."""
-    rest = list(arguments)
-    while rest:
-        flag, is_joined, value = rest.pop(0).partition("=")
-        if not flag.startswith("--"):
-            raise ValueError(f"flags begin with --, got {flag!r}")
-        if not is_joined:
-            if not rest or rest[0].startswith("--"):
-                raise ValueError(f"{flag} needs a value")
-            value = rest.pop(0)
-        yield flag.removeprefix("--"), value
 
 
 def _check(given: dict[str, str], policy_type: str | None) -> None:

@@ -51,6 +51,10 @@ class Row:
     base: str = NARROW
     """Which base policy it begins with, by its demonstrations; see `scales.BASE_KINDS`."""
 
+    def __post_init__(self) -> None:
+        if wrong := [flag for flag in self.flags if not flag.startswith("--") or "=" not in flag]:
+            raise ValueError(f"flags of a row are --name=value, one word each, got {wrong[0]!r}.")
+
     @property
     def name(self) -> str:
         """How `--rows` and the run's folder call it, such as `t1280_eer_cl_hsr`."""

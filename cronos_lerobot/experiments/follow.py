@@ -28,6 +28,8 @@ class Follower:
     def __init__(self, jobs: Sequence[Job], submitted: dict[str, str], cluster: Cluster, display: Display) -> None:
         self.jobs, self.submitted, self.cluster, self.display = list(jobs), submitted, cluster, display
         self.states: dict[str, str] = {}
+        # Done once, and in the queue again: what they were made of is made anew.
+        self._again = {job.name for job in self.jobs if job.name in submitted and is_done(job)}
         self._missed_since: dict[str, float] = {}
         self._seen: dict[str, tuple[str | None, int]] = {}
 
@@ -40,7 +42,7 @@ class Follower:
         for job in self.jobs:
             if changes(job):
                 self._finish(job, CHANGED)
-            elif is_done(job):
+            elif is_done(job) and job.name not in self._again:
                 self.states[job.name] = DONE
             elif job.name in self.submitted:
                 self.display.event(job, f"is in the queue, {self.submitted[job.name]}")
@@ -62,11 +64,13 @@ class Follower:
         for job in self.jobs:
             if job.name in self.states:
                 continue
-            if is_done(job):
+            queued = queue.get(self.submitted.get(job.name, ""))
+            if not is_done(job):
+                self._again.discard(job.name)
+            elif not (queued and job.name in self._again):
                 self._finish(job, DONE)
                 continue
             record = read_record(job)
-            queued = queue.get(self.submitted.get(job.name, ""))
             if queued:
                 self._missed_since.pop(job.name, None)
                 # Where an element was killed and requeued, the note says `running` until the next start.

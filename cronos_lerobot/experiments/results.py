@@ -165,7 +165,8 @@ class RowResult:
     def success_at(self, interventions: int, split: str = "train") -> AtBudget:
         """Success after so many interventions.
 
-        Measured by the evaluation at the first policy update that came to so many, else interpolated.
+        Measured by the evaluation at the first policy update that came to so many, or the last of those where the
+        number happened to be just that; else interpolated.
         """
         finished = [
             (curve, seed.run.last["interventions"]) for seed in self.finished if (curve := seed.curve(split))
@@ -177,7 +178,8 @@ class RowResult:
         values: list[float] = []
         gaps: list[tuple[int, int]] = []
         for curve, _ in finished:
-            measured = [p for p in curve if interventions in (p.interventions, *p.at_interventions)]
+            measured = [p for p in curve if interventions in p.at_interventions]
+            measured = measured or [p for p in curve if p.interventions == interventions]
             if measured:
                 values.append(measured[-1].success)
                 continue

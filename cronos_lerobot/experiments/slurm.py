@@ -254,6 +254,20 @@ class Cluster:
             known, queue = read_submitted(self.folder), squeue()
             queued = {name: number for name, number in known.items() if number in queue}
             waiting = [job for job in jobs if job.name not in queued and not changes(job) and not is_done(job)]
+            # What is begun anew takes with it what was made of it: that is made again, too.
+            gone = [
+                folder
+                for job in waiting
+                if not job.output.exists() or job.resume() is None
+                for folder in job.made_from_it
+            ]
+            names = {job.name for job in waiting}
+            waiting = [
+                job
+                for job in jobs
+                if job.name in names
+                or (job.name not in queued and any(job.output.is_relative_to(folder) for folder in gone))
+            ]
             bases, runs, evaluations = plan_arrays(jobs, waiting)
             made = {job.name: job for job in jobs}
             submitted: dict[str, str] = {}

@@ -44,15 +44,16 @@ def compare_training(groups: list[Group]) -> list[Comparison]:
 
 
 def _different_starts(runs: list[TrainingRun]) -> list[TrainingRun]:
-    """Runs whose first evaluations are not of one and the same policy.
+    """The first of the runs, if all began with the same policy; else all of them.
 
     Seeds that begin with a saved policy measure it with the same episodes and random numbers: one evaluation, and
-    not one for each. Those that begin from scratch have a policy each.
+    not one for each. Those that begin from scratch, or with the clones of several machines, are compared each with
+    its own.
     """
-    by_policy = {
-        (run.config.get("policy") or {}).get("pretrained_path") or str(run.folder): run for run in runs[::-1]
+    policies = {
+        run.base or (run.config.get("policy") or {}).get("pretrained_path") or str(run.folder) for run in runs
     }
-    return list(by_policy.values())[::-1]
+    return runs[:1] if len(policies) == 1 else runs
 
 
 def compare_evaluations(before: list[EvaluationRun], after: list[EvaluationRun]) -> list[Comparison]:

@@ -12,7 +12,9 @@ from cronos_lerobot.evaluation.store import IDENTITY as IDENTITY_FILE
 from cronos_lerobot.evaluation.store import read_results
 
 SUITES = ("independent", "sequential")
-DECISIVE = ("policy", "scene", "obs_type", "temperature", "seed", "advance", "end_effector_reset")
+DECISIVE = (
+    "policy", "policy_fingerprint", "scene", "obs_type", "temperature", "seed", "advance", "end_effector_reset",
+)  # fmt: skip
 """Fields of results.json in which two evaluations of one policy must agree to be shown as one."""
 IDENTITY = {"benchmark": "the package's", "n_episodes": None, "orderings": None, "renderer": "classic"}
 """Fields of its `identity` in which they must agree too, with what it means that one is missing."""
@@ -77,6 +79,7 @@ def read_suite_runs(files: Iterable[Path]) -> list[SuiteRun]:
 def _settings(results: dict[str, Any]) -> dict[str, Any]:
     identity = results.get("identity", {})
     own = {name: identity.get(name, default) for name, default in IDENTITY.items()}
+    own["repetitions"] = results.get("repetitions", 1)
     return {name: results.get(name) for name in DECISIVE} | own
 
 

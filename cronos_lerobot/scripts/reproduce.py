@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from cronos_lerobot.experiments.definitions import COMMANDS, EXPERIMENTS, Base, Experiment, Row, find_rows
 from cronos_lerobot.experiments.display import describe_missing
+from cronos_lerobot.experiments.flags import join_flags
 from cronos_lerobot.experiments.jobs import RUNNING, Job, changes, is_done, missing, other_commits, status
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
 from cronos_lerobot.experiments.slurm import SlurmError, SlurmOptions
@@ -44,6 +45,8 @@ RESERVED = (
     "--protocol.update_interval",
     "--policy.path",
     "--env.scene",
+    "--eval.split",
+    "--eval.temperature",
     "--resume",
     "--config_path",
 )
@@ -187,7 +190,10 @@ def make_options(args: argparse.Namespace, extra: list[str], bases: Iterable[Bas
     Raises:
         ValueError: a flag makes no sense.
     """
+    extra = join_flags(extra)
     taken = [flag for flag in extra if flag.split("=")[0] in RESERVED]
+    if taken and taken[0].startswith("--eval.temperature="):
+        raise ValueError(f"{taken[0]} after -- is of the runs alone: give --temperature, before it, for all")
     if taken:
         raise ValueError(f"{taken[0]} is set by the experiment; it cannot be given after --")
     if not args.temperature >= 0:

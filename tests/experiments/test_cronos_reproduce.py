@@ -129,6 +129,11 @@ def test_list_names_every_row(monkeypatch, capsys):
         (["table1", "--base.checkpoint=400"], "base.checkpoint must be one of [80, 160, 240, 320], got 400"),
         (["table1", "--", "--steps=3"], "--steps=3 is set by the experiment"),
         (["table1", "--", "--save_freq=3"], "--save_freq=3 is set by the experiment"),
+        (["table1", "--", "--algorithm.target_kl"], "--algorithm.target_kl needs a value"),
+        (["table1", "--", "target_kl"], "flags begin with --, got 'target_kl'"),
+        (["table1", "--", "--save_freq", "3"], "--save_freq=3 is set by the experiment"),
+        (["table1", "--", "--eval.split=held_out"], "--eval.split=held_out is set by the experiment"),
+        (["figure4", "--", "--eval.temperature=1"], "--eval.temperature=1 after -- is of the runs alone: give"),
         (["figure5", "--", "--protocol.reset_budget=100"], "figure5 evaluates their checkpoints at fixed steps"),
         (
             ["figure4", "--", "--keep_checkpoints=1"],
@@ -170,6 +175,19 @@ def test_own_recipe_of_the_base_policy():
     assert (recipe.demos, recipe.clone_steps, recipe.checkpoint, recipe.save_freq) == (400, 320, 160, 80)
 
 
+def test_flags_after_two_dashes_may_be_written_with_a_space(monkeypatch, capsys, tmp_path):
+    flags = ["figure4", f"--root={tmp_path}", "--seeds=1", "--dry_run", "--rows", "t80_1config", "--"]
+    printed = []
+    for given in (["--env.renderer", "filament", "--eval.n_episodes", "16"],
+                  ["--env.renderer=filament", "--eval.n_episodes=16"]):  # fmt: skip
+        call(monkeypatch, *flags, *given)
+        printed.append(capsys.readouterr().out)
+    assert printed[0] == printed[1]
+    assert "--eval.repetitions=16" in printed[0]
+    with pytest.raises(ValueError, match=r"flags of a row are --name=value, one word each, got '--a'"):
+        definitions.Row(80, flags=("--a", "1"), tag="a")
+
+
 def test_a_clean_base_policy_has_a_recipe_and_a_folder_of_its_own(tmp_path):
     args = script.make_parser().parse_args(["table1", "--base.clean=true", f"--root={tmp_path}"])
     options = script.make_options(args, [], [Base("kitchen_2x2")])
@@ -195,8 +213,6 @@ WOULD_NOT_BEGIN = {
     "--protocol.takeover_price=3": "protocol.takeover_price=3 is for takeovers",
     "--protocol.extra_resets=[stock]": "protocol.extra_resets has ['stock']",
     "--algorithm.type=nobody": "got 'nobody'",
-    "--algorithm.target_kl": "--algorithm.target_kl needs a value",
-    "target_kl": "flags begin with --, got 'target_kl'",
 }
 
 

@@ -2,14 +2,15 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import pytest
 from tiny_jobs import Tape
 
 from cronos_lerobot.experiments import follow, status
 from cronos_lerobot.experiments.follow import Follower
-from cronos_lerobot.experiments.jobs import Job, write_record
-from cronos_lerobot.experiments.slurm import SlurmError, slurm_folder
+from cronos_lerobot.experiments.jobs import EVALUATION, Job, write_record
+from cronos_lerobot.experiments.slurm import Cluster, SlurmError, SlurmOptions, slurm_folder
 from cronos_lerobot.scripts import reproduce
 
 
@@ -129,3 +130,43 @@ def test_without_an_answer_of_the_queue_the_notes_tell(tmp_path, monkeypatch, ca
 
     monkeypatch.setattr(status, "squeue", silent)
     assert [line.split()[1] for line in print_status(tmp_path, monkeypatch, capsys)[1:]] == ["done", "stopped"]
+
+
+def test_what_was_done_and_is_made_again_is_done_when_it_has_left_the_queue(job, monkeypatch, clock):
+    note(job, "done")
+    queue = {"7_0": ("PENDING", "Dependency")}
+    follower = make_follower(job, monkeypatch, queue)
+    assert (follower.look(), follower.states) == ([], {})
+    # What it was made of is begun anew, and it is gone until it is made again.
+    job.output.rmdir()
+    assert (follower.look(), follower.states) == ([], {})
+    queue["7_0"] = ("RUNNING", "None")
+    job.output.mkdir()
+    follower.look()
+    assert follower.states == {"a": "done"}
+
+
+def test_what_was_made_of_a_run_that_is_begun_anew_is_submitted_with_it(tmp_path, job, monkeypatch):
+    """Its evaluations are removed with it, and those of others stay as they are."""
+    run = Job("run", ("python",), tmp_path / "run/train", made_from_it=(tmp_path / "run/eval",))
+    evaluation, other = (
+        Job(name, ("python",), tmp_path / name / "eval/last", needs=(name,), stage=EVALUATION)
+        for name in ("run", "other")
+    )
+    evaluation = replace(evaluation, name="run/eval")
+    for made in (evaluation, other):
+        made.output.mkdir(parents=True)
+        note(made, "done")
+    cluster = Cluster.__new__(Cluster)
+    cluster.folder, cluster.options = tmp_path / "slurm", SlurmOptions()
+    monkeypatch.setattr("cronos_lerobot.experiments.slurm.squeue", dict)
+    taken = []
+
+    def submit_array(self, name, tasks, parameters):
+        taken.append([[made.name for made in task.jobs] for task in tasks])
+        return [f"{len(taken)}_{i}" for i in range(len(tasks))]
+
+    monkeypatch.setattr(Cluster, "_submit_array", submit_array)
+    jobs = [run, evaluation, replace(other, needs=())]
+    assert cluster.submit(jobs, threads=1, parallel=None) == {"run": "2_0", "run/eval": "3_0"}
+    assert taken == [[], [["run"]], [["run/eval"]]]

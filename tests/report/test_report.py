@@ -90,12 +90,13 @@ def test_what_cannot_be_read_is_left_out_and_said(tmp_path, monkeypatch, capsys)
         find_runs([tmp_path / "crashed"])
 
 
-def write_seeds(folder, policy=None):
+def write_seeds(folder, policy=None, fingerprints=(None, None)):
     """Two seeds that go from 2 of 8 successes in each task to 5 and 7."""
-    for seed, last in ((1, 5), (2, 7)):
+    for seed, last, fingerprint in ((1, 5, fingerprints[0]), (2, 7, fingerprints[1])):
         manifest = write_training_run(folder / str(seed), seed=seed, successes=(2, 4, last)) / "manifest.json"
         content = json.loads(manifest.read_text())
         content["starts"][0]["config"]["policy"] = {"pretrained_path": policy}
+        content["starts"][0]["policy_fingerprint"] = fingerprint
         manifest.write_text(json.dumps(content))
     (comparison,) = compare_training(group_runs(find_runs([folder]).training))
     return comparison.overall
@@ -110,6 +111,11 @@ def test_one_base_evaluation_counts_once_however_many_seeds_begin_with_it(tmp_pa
     # Wilson's interval of 8 in 32 is [.1325, .4211]; in quadrature as Newcombe has it.
     low, high = 0.5 - (after**2 + 0.1711**2) ** 0.5, 0.5 + (after**2 + 0.1175**2) ** 0.5
     assert gain.interval == (pytest.approx(low, abs=1e-3), pytest.approx(high, abs=1e-3))
+
+
+def test_clones_of_two_machines_count_each_whatever_their_path(tmp_path):
+    assert write_seeds(tmp_path / "one", "base/clone", ("a", "a")).before.n == 32
+    assert write_seeds(tmp_path / "two", "base/clone", ("a", "b")).before.n == 64
 
 
 def test_seeds_from_scratch_have_a_start_each_and_their_gains_an_interval(tmp_path):
@@ -333,6 +339,19 @@ def test_resumed_run_stays_in_its_group(tmp_path):
         content["starts"] += [resumed] if name == "b" else []
         manifest.write_text(json.dumps(content))
     assert len(group_runs(find_runs([tmp_path]).training)) == 1
+
+
+def test_seeds_below_other_roots_are_of_one_experiment(tmp_path):
+    """As `cronos-reproduce` has it: a root may be moved. Another base policy is another experiment."""
+    for seed, path in enumerate(
+        ("outputs/reproduce/base/a/clone", "/home/me/runs/base/a/clone", "x/base/b/clone")
+    ):
+        manifest = write_training_run(tmp_path / str(seed), seed=seed) / "manifest.json"
+        content = json.loads(manifest.read_text())
+        content["starts"][0]["config"]["policy"] = {"pretrained_path": path}
+        manifest.write_text(json.dumps(content))
+    groups = group_runs(find_runs([tmp_path]).training)
+    assert sorted(sorted(run.seed for run in group.runs) for group in groups) == [[0, 1], [2]]
 
 
 def test_of_two_runs_of_one_seed_the_longer_counts(tmp_path):

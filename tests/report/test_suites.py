@@ -32,6 +32,16 @@ def chains(successes):
     return {"n": 640, "positions": [rate(s, 640) for s in successes], "average_chain_length": length}
 
 
+def test_two_policies_of_one_path_stay_apart(tmp_path):
+    """The last checkpoint of a run that went on."""
+    for name, fingerprint, success in (("a", "f1", 0.5), ("b", "f2", 0.75)):
+        content = {"independent": {"train": rate(success) | {"per_task": {}}}}
+        write_results(tmp_path / name, "run/checkpoints/last", content, policy_fingerprint=fingerprint)
+    first, second = find_runs([tmp_path]).suites
+    assert [run.splits("independent")["train"]["success"] for run in (first, second)] == [0.5, 0.75]
+    assert "policy_fingerprint=f1" in first.name
+
+
 def test_results_of_cronos_eval(tmp_path):
     """Both suites, in a folder each, of one policy; another temperature is another evaluation."""
     policy = "outputs/train/eer/checkpoints/0010240/pretrained_model"
