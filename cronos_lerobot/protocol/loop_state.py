@@ -73,6 +73,8 @@ class LoopState:
     """(N,) the agent's value of the current task when it was given, where the task order asked for it; else 0."""
     reset_value: np.ndarray = field(init=False)
     """(N,) its best value over the tasks when the stream's last scene reset was asked for, if by value; else 0."""
+    scene_resets_before: np.ndarray = field(init=False)
+    """(N,) scene resets that had been counted when the last segment ended."""
     asked_resets: np.ndarray = field(init=False)
     """(N,) scene resets that were asked for by value, of all that are counted in `interventions`."""
     takeover_cost: np.ndarray = field(init=False)
@@ -97,6 +99,7 @@ class LoopState:
         self.interventions = np.zeros((n, len(Intervention)), np.int64)
         self.task_value = np.zeros(n)
         self.reset_value = np.zeros(n)
+        self.scene_resets_before = np.zeros(n, np.int64)
         self.asked_resets = np.zeros(n, np.int64)
         self.takeover_cost = np.zeros(n, np.int64)
 
@@ -191,6 +194,7 @@ class LoopState:
         self.succeeded = np.zeros(self.num_streams, np.bool_)
         self.grasped = np.zeros(self.num_streams, np.bool_)
         self.segments_since_reset += 1
+        self.scene_resets_before = self.interventions[:, Intervention.SCENE_RESET].copy()
         return end
 
     def state_dict(self) -> dict[str, Any]:

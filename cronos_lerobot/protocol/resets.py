@@ -159,8 +159,9 @@ class PeriodicSceneReset(SceneReset):
         segments = interval // self.segment
         phase = streams * segments // loop.num_streams if self.is_staggered else 0 * streams
         is_due = (loop.t // self.segment + phase) % segments == 0
-        # Since its last reset it has ended a segment, or it was reset at this very switch.
-        return np.flatnonzero(is_due & (loop.segments_since_reset > 0))
+        # Not `preceded_by`: it says divergence of a stream that was put back and then reset.
+        was_reset = loop.interventions[:, Intervention.SCENE_RESET] > loop.scene_resets_before
+        return np.flatnonzero(is_due & ~was_reset)
 
 
 class CriticSceneReset(SceneReset):

@@ -244,7 +244,6 @@ def test_the_method_spends_what_its_budgets_allow():
         counts.append(0)
         while loop.n < 1_300_480:
             loop.t += 80
-            loop.end_segment()
             counts[-1] += len(reset.due(None, loop))
     assert counts == [1008, 254, 64, 0]
     assert counts[0] <= BUDGET

@@ -178,11 +178,11 @@ def test_papers_row_with_hsr_counts_scene_resets_like_the_curriculum():
     assert loop.b == 64 * (31 + 8) == 2496
 
 
-def test_a_stream_that_an_extra_strategy_has_reset_is_not_reset_again():
-    """At T = 8; stream 1 diverges in the last step before it, and is put back there."""
+def test_a_scene_reset_of_an_extra_strategy_takes_the_place_of_the_periodic_one_and_a_divergence_does_not():
+    """At T = 8; stream 1 diverges in the last step before it, and is put back there, which counts by itself."""
 
-    @register_reset("after_divergence")
-    class Everyone(ResetStrategy):
+    @register_reset("second")
+    class Second(ResetStrategy):
         kind = Intervention.SCENE_RESET
 
         def __init__(self, rng, protocol):
@@ -194,13 +194,14 @@ def test_a_stream_that_an_extra_strategy_has_reset_is_not_reset_again():
         def apply(self, env, ids):
             env.scene_reset(ids, np.zeros(len(ids), int))
 
-    config = protocol(extra_resets=["after_divergence"], scene_reset_interval=8, end_effector_reset=False)
     try:
-        _, _, loop, _ = run(config, 24, env=DummyEnv(2, diverge_at={(7, 1)}))
+        for extra in ([], ["second"]):
+            config = protocol(extra_resets=extra, scene_reset_interval=8, end_effector_reset=False)
+            _, _, loop, _ = run(config, 24, env=DummyEnv(2, diverge_at={(7, 1)}))
+            assert loop.interventions[:, Intervention.DIVERGENCE].tolist() == [0, 1]
+            assert loop.interventions[:, Intervention.SCENE_RESET].tolist() == [1, 1]
     finally:
-        del EXTRA_RESETS["after_divergence"]
-    assert loop.interventions[:, Intervention.DIVERGENCE].tolist() == [0, 1]
-    assert loop.interventions[:, Intervention.SCENE_RESET].tolist() == [1, 1]
+        del EXTRA_RESETS["second"]
 
 
 def test_own_strategy_and_own_order_by_name():
