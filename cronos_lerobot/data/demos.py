@@ -132,7 +132,6 @@ class DemoCollector:
         self._seed = (seed, writer.num_episodes)
         everything = env.scene.tasks + (env.scene.reset_tasks if config.reset_tasks else ())
         self._kept = {task: writer.episodes_before[task.instruction] for task in tasks or everything}
-        self._already = sum(self._kept.values())
         # A dataset that is gone on with goes on with the next configuration, as far as the attempts succeeded.
         self._tried = dict(self._kept)
         self._episodes: list[_Episode | None] = [None] * env.num_envs
@@ -151,7 +150,8 @@ class DemoCollector:
             ExpertError: the expert failed 200 times in a row.
         """
         self._on_episode = on_episode
-        self._start_idle_streams(num_episodes)
+        total = sum(self._kept.values()) + num_episodes
+        self._start_idle_streams(total)
         observation = self.env.observe()
         while any(episode is not None for episode in self._episodes):
             labels = np.clip(self.expert.act(), ACTION_LOW, ACTION_HIGH).astype(np.float32)
@@ -161,7 +161,7 @@ class DemoCollector:
             columns |= {REWARD: reward, SUCCESS: info["is_success"]}
             for stream in range(self.env.num_envs):
                 self._after_step(stream, columns, info)
-            self._start_idle_streams(num_episodes)
+            self._start_idle_streams(total)
 
     def _is_policys(self, episode: _Episode) -> bool:
         """Whether what is done before is done by the policy."""
@@ -259,14 +259,14 @@ class DemoCollector:
         if self._failures_in_a_row >= MAX_FAILURES_IN_A_ROW:
             raise ExpertError(f"{what} {MAX_FAILURES_IN_A_ROW} times in a row, last {last}")
 
-    def _start_idle_streams(self, num_episodes: int) -> None:
+    def _start_idle_streams(self, total: int) -> None:
         """Give every idle stream an episode of the task that has the fewest, until enough are under way."""
         under_way = dict(self._kept)
         for episode in self._episodes:
             if episode is not None:
                 under_way[episode.task] += 1
         for stream, episode in enumerate(self._episodes):
-            if episode is None and sum(under_way.values()) < self._already + num_episodes:
+            if episode is None and sum(under_way.values()) < total:
                 task = min(under_way, key=lambda task: under_way[task])
                 under_way[task] += 1
                 self._episodes[stream] = self._new_episode(stream, task)

@@ -2,7 +2,7 @@
 
 PyTorch, MKL, oneDNN, NumPy and OpenBLAS choose the instructions that a processor has; with others sums come out
 with other last bits, and a clone or a run becomes another one. All of them can be told to stay with AVX2, which
-every x86-64 processor of the last ten years has.
+nearly every x86-64 processor has.
 """
 
 from __future__ import annotations

@@ -148,6 +148,11 @@ def is_done(job: Job) -> bool:
     return read_record(job).get("status") == "done" and not changes(job) and job.output.exists()
 
 
+def continuation(job: Job) -> list[str] | None:
+    """The command that goes on with the output; None where it begins anew, and what was made of it goes."""
+    return job.resume() if job.output.exists() and read_record(job) else None
+
+
 def missing(job: Job) -> list[Path]:
     """What a job whose needs are done reads and does not find, such as a checkpoint that was not carried along."""
     return [path for path in job.reads if not path.exists()]

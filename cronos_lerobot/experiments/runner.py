@@ -21,6 +21,7 @@ from cronos_lerobot.experiments.jobs import (
     STOPPED,
     Job,
     changes,
+    continuation,
     is_done,
     lock,
     made_by,
@@ -160,7 +161,7 @@ class Runner:
             os.close(claim)
             return
         record: dict[str, Any] = read_record(job)
-        resumed = job.resume() if record and job.output.exists() else None
+        resumed = continuation(job)
         if resumed is None:
             job.remove_output()
             gone = [name for name, state in self.states.items() if state == DONE and not is_done(self.jobs[name])]

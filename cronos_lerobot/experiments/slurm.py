@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cronos_lerobot.experiments.display import LineDisplay
-from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job, changes, is_done, read_record
+from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job, changes, continuation, is_done, read_record
 from cronos_lerobot.experiments.runner import DONE, FAILED, Runner
 from cronos_lerobot.locks import FolderLock
 
@@ -183,6 +183,14 @@ class Task:
         return DelayedSubmission(Task(self.jobs, self.needs, self.threads, self.limit_s, self.grace_s))
 
 
+def _to_be_made(jobs: Sequence[Job]) -> list[Job]:
+    """Those that are not done, or will not be: what is begun anew takes with it what was made of it."""
+    unfinished = [job for job in jobs if not changes(job) and not is_done(job)]
+    gone = [folder for job in unfinished if continuation(job) is None for folder in job.made_from_it]
+    lost = [job for job in jobs if is_done(job) and any(job.output.is_relative_to(folder) for folder in gone)]
+    return [*unfinished, *lost]
+
+
 def plan_arrays(jobs: Sequence[Job], waiting: Iterable[Job]) -> tuple[Elements, Elements, Elements]:
     """Return what each element of the three arrays runs.
 
@@ -253,21 +261,7 @@ class Cluster:
         with FolderLock(self.folder):
             known, queue = read_submitted(self.folder), squeue()
             queued = {name: number for name, number in known.items() if number in queue}
-            waiting = [job for job in jobs if job.name not in queued and not changes(job) and not is_done(job)]
-            # What is begun anew takes with it what was made of it: that is made again, too.
-            gone = [
-                folder
-                for job in waiting
-                if not job.output.exists() or job.resume() is None
-                for folder in job.made_from_it
-            ]
-            names = {job.name for job in waiting}
-            waiting = [
-                job
-                for job in jobs
-                if job.name in names
-                or (job.name not in queued and any(job.output.is_relative_to(folder) for folder in gone))
-            ]
+            waiting = _to_be_made([job for job in jobs if job.name not in queued])
             bases, runs, evaluations = plan_arrays(jobs, waiting)
             made = {job.name: job for job in jobs}
             submitted: dict[str, str] = {}

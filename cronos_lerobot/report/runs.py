@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -247,13 +248,13 @@ def read_evaluation_runs(folder: Path, scene: str = "kitchen_2x2") -> list[Evalu
 
 
 def _below_root(config: dict[str, Any]) -> dict[str, Any]:
-    """A config with the path of `cronos-reproduce`'s base policy as seen from its root, which may be moved."""
+    """A config with the path of `cronos-reproduce`'s base policy as seen from its root, which may be moved.
+
+    That is base/<recipe>/clone; what else is called base in two folders may be two policies.
+    """
     policy = config.get("policy") or {}
-    parts = Path(policy.get("pretrained_path") or "").parts
-    if "base" not in parts[:-1]:
-        return config
-    below = parts[len(parts) - 1 - parts[::-1].index("base") :]
-    return config | {"policy": policy | {"pretrained_path": str(Path(*below))}}
+    found = re.search(r"(?:^|/)(base/[^/]+/clone(?:/.*)?)$", policy.get("pretrained_path") or "")
+    return config | {"policy": policy | {"pretrained_path": found[1]}} if found else config
 
 
 def group_runs(runs: list[TrainingRun]) -> list[Group]:
@@ -264,8 +265,9 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
     groups: dict[str, Group] = {}
     flat = {}
     for run in runs:
-        experiment = {key: value for key, value in run.config.items() if key not in NOT_THE_EXPERIMENT}
-        key = json.dumps(_below_root(experiment), sort_keys=True) if experiment else str(run.folder)
+        config = {key: value for key, value in run.config.items() if key not in NOT_THE_EXPERIMENT}
+        experiment = _below_root(config)
+        key = json.dumps(experiment, sort_keys=True) if experiment else str(run.folder)
         group = groups.setdefault(key, Group(run.name))
         # A longer run of the same seed begins with the shorter one: counted twice it would narrow the spread.
         same = next((other for other in group.runs if run.seed is not None and other.seed == run.seed), None)
@@ -273,7 +275,7 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
             group.runs.append(run)
         elif run.last["interaction_steps"] > same.last["interaction_steps"]:
             group.runs[group.runs.index(same)] = run
-        flat[key] = _flatten(_below_root(experiment))
+        flat[key] = _flatten(experiment)
     names = sorted({name for config in flat.values() for name in config})
     differing = [name for name in names if len({config.get(name) for config in flat.values()}) > 1]
     others = [name for name in differing if name not in DESCRIBED]

@@ -109,7 +109,7 @@ def run_command(command: list[str]) -> None:
 
 def _run(command: list[str]) -> int:
     """Run a command, which Ctrl-C reaches as it does us, to its end; a second one kills it. Its exit status."""
-    # README says what comes out: on any processor with AVX2 the same.
+    # As `cronos-reproduce` runs them: README says what comes out.
     with subprocess.Popen(command, env=portable_arithmetic() | os.environ) as process:
         try:
             return process.wait()

@@ -18,7 +18,16 @@ from typing import TYPE_CHECKING
 from cronos_lerobot.experiments.definitions import COMMANDS, EXPERIMENTS, Base, Experiment, Row, find_rows
 from cronos_lerobot.experiments.display import describe_missing
 from cronos_lerobot.experiments.flags import join_flags
-from cronos_lerobot.experiments.jobs import RUNNING, Job, changes, is_done, missing, other_commits, status
+from cronos_lerobot.experiments.jobs import (
+    RUNNING,
+    Job,
+    changes,
+    continuation,
+    is_done,
+    missing,
+    other_commits,
+    status,
+)
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
 from cronos_lerobot.experiments.slurm import SlurmError, SlurmOptions
 from cronos_lerobot.locks import FolderInUseError
@@ -307,7 +316,7 @@ def print_plan(jobs: list[Job]) -> None:
         if absent and all(is_done(needed) for needed in jobs if needed.name in job.needs):
             print(f"# {job.name}: blocked, {describe_missing(absent, job)}")
             continue
-        resumed = job.resume() if job.output.exists() else None
+        resumed = continuation(job)
         print(f"# {job.name}{': goes on' if resumed else ''}")
         print(command_line(resumed or list(job.command)), end="\n\n")
 

@@ -342,16 +342,22 @@ def test_resumed_run_stays_in_its_group(tmp_path):
 
 
 def test_seeds_below_other_roots_are_of_one_experiment(tmp_path):
-    """As `cronos-reproduce` has it: a root may be moved. Another base policy is another experiment."""
-    for seed, path in enumerate(
-        ("outputs/reproduce/base/a/clone", "/home/me/runs/base/a/clone", "x/base/b/clone")
-    ):
+    """As `cronos-reproduce` has it: a root may be moved. Another base policy is another experiment, and the demo's
+    in two folders may be two."""
+    paths = (
+        "a/base/x/clone/last",
+        "/home/me/base/x/clone/last",
+        "a/base/y/clone/last",
+        "a/base/last",
+        "b/base/last",
+    )
+    for seed, path in enumerate(paths):
         manifest = write_training_run(tmp_path / str(seed), seed=seed) / "manifest.json"
         content = json.loads(manifest.read_text())
         content["starts"][0]["config"]["policy"] = {"pretrained_path": path}
         manifest.write_text(json.dumps(content))
     groups = group_runs(find_runs([tmp_path]).training)
-    assert sorted(sorted(run.seed for run in group.runs) for group in groups) == [[0, 1], [2]]
+    assert sorted(sorted(run.seed for run in group.runs) for group in groups) == [[0, 1], [2], [3], [4]]
 
 
 def test_of_two_runs_of_one_seed_the_longer_counts(tmp_path):

@@ -126,7 +126,8 @@ class ImitationAgent(LearningAgent):
             steps = [self._step() for _ in range(self.config.steps_per_update)]
             self._learner.eval()
             # Running means, as those of batch normalization, are each process's own of its own batches.
-            self._processes.copy_from_main([*self._learner.buffers(), *self.policy.buffers()])
+            for module in dict.fromkeys((self._learner, self.policy)):
+                self._processes.copy_from_main(module.buffers())
         means = self._processes.concatenate(np.array([steps])).mean(axis=(0, 1))
         metrics |= {"loss": float(means[0]), "grad_norm": float(means[1])}
         return metrics | {"optimizer_steps": float(len(steps))}

@@ -174,9 +174,10 @@ def draw_batch(
         config: of the policy.
         weights: see `SegmentMemory.draw`.
     """
-    has_success = any(segment.success for segment in memory.segments)
-    num_demos = 0 if demos is None else round(demos_share * size) if has_success else size
-    parts = []
+    num_demos, parts = 0, []
+    if demos is not None:
+        has_success = any(segment.success for segment in memory.segments)
+        num_demos = round(demos_share * size) if has_success else size
     if demos is not None and num_demos:
         parts.append(demos.batch(num_demos, rng))
     if num_demos < size and len(memory):

@@ -69,7 +69,6 @@ class PPOAgent(LearningAgent):
                 self._begin(*self._decide(self._seen, tau))
             elif self.clock.fresh.any():
                 self._decide_anew(self._seen, tau)
-            assert self._decision is not None
             return ActionSample(self.clock.action(), self._log_prob, self._value)
 
     def store(
