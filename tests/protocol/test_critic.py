@@ -335,64 +335,6 @@ def test_best_value_leaves_out_what_is_complete():
         assert asked.best(loop).tolist() == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"reset_phase": "scattered"}, "reset_phase must be one of"),
-        ({"scene_reset": "never"}, "scene_reset must be one of"),
-        ({"scene_reset": "critic"}, "give protocol.reset_budget"),
-        ({"scene_reset": "critic", "reset_budget": 5, "reset_phase": "staggered"}, "leave them out"),
-        ({"scene_reset": "critic", "reset_budget": 5, "curriculum": [(8, 4)]}, "leave them out"),
-        (
-            {"scene_reset": "critic", "reset_budget": 5, "scene_reset_interval": 8},
-            "=8 is for periodic .* or give null",
-        ),
-        (
-            {"critic": CriticConfig(failures=3)},
-            "protocol.critic.failures=3 is read by protocol.scene_reset=critic alone",
-        ),
-        (
-            {"critic": CriticConfig(failures=3), "task_order": "critic"},
-            "read by protocol.scene_reset=critic alone",
-        ),
-        (
-            {"critic": CriticConfig(floor=0.5), "scene_reset": "critic", "reset_budget": 5},
-            "floor=0.5 is read by protocol.task_order=critic alone: give that, or leave it at 0.02",
-        ),
-        (
-            {"critic": CriticConfig(knows_complete=False)},
-            "knows_complete=false is read by protocol.task_order=critic or protocol.scene_reset=critic alone",
-        ),
-    ],
-)
-def test_protocols_that_make_no_sense_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        protocol(**options)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "options"),
-    [
-        ("certain_value", 3, {"task_order": "critic"}),
-        ("failures", 3, {"scene_reset": "critic", "reset_budget": 5, "scene_reset_interval": None}),
-        ("knows_complete", False, {"scene_reset": "critic", "reset_budget": 5, "scene_reset_interval": None}),
-        # A user's may go by values, too.
-        ("certain_value", 3, {"task_order": "of_a_user"}),
-        ("failures", 3, {"extra_resets": ["of_a_user"]}),
-    ],
-)
-def test_critics_settings_are_taken_where_something_may_read_them(name, value, options):
-    assert getattr(protocol(critic=CriticConfig(**{name: value}), **options).critic, name) == value
-
-
-@pytest.mark.parametrize(
-    "options", [{"certain_value": 0}, {"floor": 0}, {"sharpness": -1}, {"failures": 0}, {"failures": 17}]
-)
-def test_critics_settings_out_of_range_are_named(options):
-    with pytest.raises(ValueError, match=f"protocol.critic.{next(iter(options))} must be"):
-        CriticConfig(**options)
-
-
 def test_the_papers_budget_is_spent_in_the_whole_run():
     """1.3 M steps, all streams failing: one less than B at the last switch, or what 2 failures each allow."""
     config = ProtocolConfig(scene_reset="critic", reset_budget=1016)
