@@ -100,7 +100,7 @@ class Runner:
             raise ValueError(f"at least one job must run at a time, got {parallel}")
         self.parallel, self.display, self.grace_s = parallel, display, grace_s
         # Unbuffered, so that a log says in time, and in order, what its command does.
-        self.environment = portable_arithmetic() | os.environ | {"PYTHONUNBUFFERED": "1"} | (environment or {})
+        self.environment = os.environ | {"PYTHONUNBUFFERED": "1"} | (environment or {})
         self.states: dict[str, str] = {}
         self._children: list[_Child] = []
         self._elsewhere: set[str] = set()
@@ -181,7 +181,7 @@ class Runner:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env=self.environment,
+                env=portable_arithmetic(command[0]) | self.environment,
                 start_new_session=True,
                 pass_fds=(claim,),
             )

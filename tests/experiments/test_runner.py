@@ -12,10 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 from tiny_jobs import Tape, count_job, python_job, run
 
-from cronos_lerobot.experiments.arithmetic import AVX2
 from cronos_lerobot.experiments.display import LineDisplay
 from cronos_lerobot.experiments.jobs import (
     Job,
@@ -56,21 +54,6 @@ def test_as_many_at_a_time_as_asked(tmp_path):
     jobs = [python_job(tmp_path, name, "time.sleep(0.3)") for name in "abcde"]
     assert run(jobs[:2], parallel=1)[1].most == 1
     assert run(jobs[2:], parallel=3)[1].most == 3
-
-
-def test_commands_are_held_to_avx2_unless_a_user_says_otherwise(tmp_path, monkeypatch):
-    capability = torch.backends.cpu.get_cpu_capability()
-    for name in AVX2:
-        monkeypatch.delenv(name, raising=False)
-    code = "import os, torch; (out / 'found').write_text(torch.backends.cpu.get_cpu_capability() + ' '"
-    code += " + os.environ.get('MKL_CBWR', 'unset'))"
-    run([python_job(tmp_path, "a", code)])
-    held = capability in ("AVX2", "AVX512")
-    assert (tmp_path / "a/found").read_text() == ("AVX2 AVX2" if held else f"{capability} unset")
-    monkeypatch.setenv("MKL_CBWR", "COMPATIBLE")
-    monkeypatch.setenv("ATEN_CPU_CAPABILITY", "default")
-    run([python_job(tmp_path, "b", code)])
-    assert (tmp_path / "b/found").read_text() == ("DEFAULT COMPATIBLE" if held else f"{capability} COMPATIBLE")
 
 
 def test_failure_blocks_what_needs_it_and_nothing_else(tmp_path, capsys):

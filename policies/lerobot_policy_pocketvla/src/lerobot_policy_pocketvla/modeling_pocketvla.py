@@ -129,7 +129,10 @@ class PocketVLAPolicy(PreTrainedPolicy):
     # LeRobot's policy interface.
 
     def get_optim_params(self) -> list[dict[str, Any]]:  # ty: ignore[incompatible-method-override]
-        """Parameter groups for behaviour cloning: the actor's, weight decay on its matrices only."""
+        """Parameter groups for behaviour cloning: the actor's, weight decay on its matrices only.
+
+        The fused step: the other one takes MKL's root, whose last bits depend on the processor.
+        """
         matrices, others, sigmas = [], [], []
         for name, parameter in [*self.actor.named_parameters(), *self.head.named_parameters()]:
             if name == "raw_sigma":
@@ -141,7 +144,7 @@ class PocketVLAPolicy(PreTrainedPolicy):
         groups = [{"params": matrices}, {"params": others, "weight_decay": 0.0}]
         if sigmas:
             groups.append({"params": sigmas, "weight_decay": 0.0, "lr": self.config.optimizer_sigma_lr})
-        return groups
+        return [group | {"fused": True} for group in groups]
 
     # What an actor-critic trainer needs (structurally; nothing is imported from it).
 
