@@ -1,0 +1,39 @@
+"""Commands know the scenes that installed plugins bring."""
+
+import os
+import sys
+
+import pytest
+from forked_commands import run_forked
+
+PLUGIN = """
+from lerobot_env_cronos import Body, Scene, register_scene
+
+coaster = Body("blue coaster", (0.09, 0.09, 0.005), 900, "disc", (0.1, 0.3, 0.8))
+register_scene(Scene("study_1x1", ("ketchup bottle",), ("blue coaster",)), bodies=[coaster])
+"""
+CODE = """
+import sys
+from cronos_lerobot.scripts.{module} import main
+from lerobot_env_cronos import SCENES
+
+sys.argv = ["{module}", "--help"]
+try:
+    main()
+except SystemExit:
+    pass
+print("scenes:", *SCENES)
+"""
+
+
+@pytest.mark.parametrize("module", ["streams", "publish"])
+def test_a_command_imports_installed_plugins_before_it_looks_for_a_scene(tmp_path, module):
+    package = tmp_path / "lerobot_env_study"
+    package.mkdir()
+    (package / "__init__.py").write_text(PLUGIN)
+    installed = tmp_path / "lerobot_env_study-1.0.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: lerobot_env_study\nVersion: 1.0\n")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    done = run_forked([sys.executable, "-c", CODE.format(module=module)], env=environment, check=True)
+    assert "study_1x1" in done.stdout.rpartition("scenes:")[2].split()
