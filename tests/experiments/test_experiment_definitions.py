@@ -235,7 +235,7 @@ def test_pixels():
     jobs = jobs_of("figure7", rows=["t320_eer"], scale="small", obs_type=PIXELS)
     demos, clone, *trains = jobs.values()
     assert {
-        "--dataset.num_episodes=1800",
+        "--dataset.num_episodes=7200",
         "--dataset.video=false",
         "--env.privileged_state=true",
         "--env.scene=kitchen_3x3",
