@@ -103,14 +103,14 @@ def run_command(command: list[str]) -> None:
     print(f"    $ {command_line(command)}\n", flush=True)
     # The script of the environment that this Python runs in, whatever PATH says.
     program = Path(sys.executable) if command[0] == "python" else Path(sys.executable).with_name(command[0])
-    # As `cronos-reproduce` runs them: README says what comes out.
-    environment = portable_arithmetic(command[0]) | os.environ
-    if _run([str(program), *command[1:]], environment) != 0:
+    if _run([str(program), *command[1:]]) != 0:
         raise StepFailedError(f"the command failed:\n    {command_line(command)}")
 
 
-def _run(command: list[str], environment: dict[str, str]) -> int:
+def _run(command: list[str]) -> int:
     """Run a command, which Ctrl-C reaches as it does us, to its end; a second one kills it. Its exit status."""
+    # As `cronos-reproduce` runs them: README says what comes out.
+    environment = portable_arithmetic(Path(command[0]).name) | os.environ
     with subprocess.Popen(command, env=environment) as process:
         try:
             return process.wait()

@@ -31,6 +31,19 @@ def test_commands_are_held_to_avx2_unless_a_user_says_otherwise(tmp_path, monkey
 
 
 @pytest.mark.skipif(not HELD, reason="this processor has no AVX2")
+def test_the_command_that_clones_takes_the_path_of_all_makers(tmp_path, monkeypatch):
+    monkeypatch.setattr("cronos_lerobot.experiments.runner.POLL_S", 0.02)
+    monkeypatch.delenv("MKL_CBWR", raising=False)
+    code = "import os; (out / 'found').write_text(os.environ['MKL_CBWR'])"
+    for cloning, path in ((CLONING, "AVX2"), ("python", "COMPATIBLE")):
+        monkeypatch.setattr("cronos_lerobot.experiments.arithmetic.CLONING", cloning)
+        portable_arithmetic.cache_clear()
+        run([python_job(tmp_path, cloning, code)])
+        assert (tmp_path / cloning / "found").read_text() == path
+    portable_arithmetic.cache_clear()
+
+
+@pytest.mark.skipif(not HELD, reason="this processor has no AVX2")
 def test_a_clone_is_the_same_on_every_processor():
     """The hash is that of a Zen 3 EPYC, natively, and of an Intel Haswell, as QEMU emulates it."""
     environment = os.environ | portable_arithmetic(CLONING)
