@@ -3,12 +3,10 @@
 PyTorch, MKL, oneDNN, NumPy and OpenBLAS choose the instructions that a processor has; with others sums come out
 with other last bits, and a clone or a run becomes another one. All of them can be told to stay with AVX2, which
 nearly every x86-64 processor has. MKL goes by the maker of the processor as well, but for one path, without AVX:
-half as fast, so that only clones take it, which every run of an experiment begins with.
+the slower one, so that only clones take it, which every run of an experiment begins with.
 """
 
 from __future__ import annotations
-
-from functools import cache
 
 AVX2 = {
     "ATEN_CPU_CAPABILITY": "avx2",
@@ -23,7 +21,6 @@ CLONING = "lerobot-train"
 """The command that clones."""
 
 
-@cache
 def portable_arithmetic(command: str) -> dict[str, str]:
     """Return the variables that hold a command to AVX2; none where the processor does not have it.
 

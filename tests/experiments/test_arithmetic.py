@@ -16,8 +16,12 @@ HELD = CAPABILITY in ("AVX2", "AVX512")
 CLONE = Path(__file__).parents[1] / "policies" / "pocketvla" / "cloned_anywhere.py"
 
 
-def test_commands_are_held_to_avx2_unless_a_user_says_otherwise(tmp_path, monkeypatch):
+@pytest.fixture(autouse=True)
+def fast(monkeypatch):
     monkeypatch.setattr("cronos_lerobot.experiments.runner.POLL_S", 0.02)
+
+
+def test_commands_are_held_to_avx2_unless_a_user_says_otherwise(tmp_path, monkeypatch):
     for name in AVX2:
         monkeypatch.delenv(name, raising=False)
     code = "import os, torch; (out / 'found').write_text(torch.backends.cpu.get_cpu_capability() + ' '"
@@ -32,15 +36,12 @@ def test_commands_are_held_to_avx2_unless_a_user_says_otherwise(tmp_path, monkey
 
 @pytest.mark.skipif(not HELD, reason="this processor has no AVX2")
 def test_the_command_that_clones_takes_the_path_of_all_makers(tmp_path, monkeypatch):
-    monkeypatch.setattr("cronos_lerobot.experiments.runner.POLL_S", 0.02)
     monkeypatch.delenv("MKL_CBWR", raising=False)
     code = "import os; (out / 'found').write_text(os.environ['MKL_CBWR'])"
     for cloning, path in ((CLONING, "AVX2"), ("python", "COMPATIBLE")):
         monkeypatch.setattr("cronos_lerobot.experiments.arithmetic.CLONING", cloning)
-        portable_arithmetic.cache_clear()
         run([python_job(tmp_path, cloning, code)])
         assert (tmp_path / cloning / "found").read_text() == path
-    portable_arithmetic.cache_clear()
 
 
 @pytest.mark.skipif(not HELD, reason="this processor has no AVX2")

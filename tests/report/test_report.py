@@ -344,14 +344,8 @@ def test_resumed_run_stays_in_its_group(tmp_path):
 def test_seeds_below_other_roots_are_of_one_experiment(tmp_path):
     """As `cronos-reproduce` has it: a root may be moved. Another base policy is another experiment, and the demo's
     in two folders may be two."""
-    paths = (
-        "a/base/x/clone/last",
-        "/home/me/base/x/clone/last",
-        "a/base/y/clone/last",
-        "a/base/last",
-        "b/base/last",
-    )
-    for seed, path in enumerate(paths):
+    clones = ("a/base/x/clone/last", "/home/me/base/x/clone/last", "a/base/y/clone/last")
+    for seed, path in enumerate((*clones, "a/base/last", "b/base/last")):
         manifest = write_training_run(tmp_path / str(seed), seed=seed) / "manifest.json"
         content = json.loads(manifest.read_text())
         content["starts"][0]["config"]["policy"] = {"pretrained_path": path}
