@@ -16,18 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cronos_lerobot.experiments.definitions import COMMANDS, EXPERIMENTS, Base, Experiment, Row, find_rows
-from cronos_lerobot.experiments.display import describe_missing
 from cronos_lerobot.experiments.flags import join_flags
-from cronos_lerobot.experiments.jobs import (
-    RUNNING,
-    Job,
-    changes,
-    continuation,
-    is_done,
-    missing,
-    other_commits,
-    status,
-)
+from cronos_lerobot.experiments.jobs import Job, is_done
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
 from cronos_lerobot.experiments.slurm import SlurmError, SlurmOptions
 from cronos_lerobot.locks import FolderInUseError
@@ -38,7 +28,7 @@ from cronos_lerobot.scripts.launchers import (
     run_here,
     run_on_slurm,
 )
-from cronos_lerobot.scripts.pipeline import command_line
+from cronos_lerobot.scripts.listing import print_list, print_plan
 
 if TYPE_CHECKING:
     from cronos_lerobot.experiments.specs import Options
@@ -285,40 +275,6 @@ def check_runs(jobs: list[Job], options: Options) -> None:
     with error_line():
         waiting = [job for job in jobs if not is_done(job)]
         check_commands(waiting, None if options.policy_path else BASE_POLICY)
-
-
-def print_list() -> None:
-    """Print the experiments and their rows."""
-    for experiment in EXPERIMENTS.values():
-        print(f"{experiment.name}: {experiment.title}{f' ({experiment.source})' if experiment.source else ''}")
-        print(f"    {experiment.scene}, {experiment.steps:,} steps at --scale=paper")
-        width = max(24, *(len(row.name) for row in experiment.rows))
-        for row in experiment.rows:
-            print(f"    {row.name:<{width}} {row.label}")
-
-
-def print_plan(jobs: list[Job]) -> None:
-    """Print every command, those that are done as comments."""
-    for job in jobs:
-        if is_done(job):
-            commits = "".join(f", made at commit {commit}" for commit in other_commits(job))
-            print(f"# {job.name}: done ({job.output}){commits}")
-            continue
-        if found := changes(job):
-            print(
-                f"# {job.name}: NOT REUSED, made by another command or version ({job.output}): {'; '.join(found)}"
-            )
-            continue
-        if status(job) == RUNNING:
-            print(f"# {job.name}: is being run by another process")
-            continue
-        absent = missing(job)
-        if absent and all(is_done(needed) for needed in jobs if needed.name in job.needs):
-            print(f"# {job.name}: blocked, {describe_missing(absent, job)}")
-            continue
-        resumed = continuation(job)
-        print(f"# {job.name}{': goes on' if resumed else ''}")
-        print(command_line(resumed or list(job.command)), end="\n\n")
 
 
 def run_jobs(jobs: list[Job], args: argparse.Namespace, slurm: SlurmOptions | None) -> dict[str, str]:
