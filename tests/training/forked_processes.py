@@ -1,18 +1,31 @@
-"""Processes that train together without starting Python again, and streams that are the same in any process."""
+"""Processes that train together without importing LeRobot again, and streams that are the same in any process."""
 
+import faulthandler
 import multiprocessing
 import os
+import queue
 import socket
-import threading
+import tempfile
 import traceback
+from pathlib import Path
 
+import cloudpickle
 import numpy as np
+import pytest
 import torch
 from dummies import DummyEnv, DummyPolicy
 from test_trainer import KilledError
-from tqdm import tqdm
 
 from cronos_lerobot.processes import join_processes
+
+SERVER = multiprocessing.get_context("forkserver")
+"""Forks a process that has imported LeRobot and done nothing else: no child inherits the threads and locks of the
+tests before, with which it may wait for ever, nor does any import LeRobot anew."""
+SERVER.set_forkserver_preload(
+    ["lerobot.datasets", "lerobot_policy_pocketvla", "cronos_lerobot.training.factory", "pytest"]
+)
+
+PATIENCE_S = 120
 
 DIVERGE_AT = {(5, 1), (21, 2)}
 """Stream 1 is the first process's of two, stream 2 the second's."""
@@ -23,40 +36,47 @@ def together(function, *args, count=2):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    # Forked, so that nobody imports LeRobot again.
-    context = multiprocessing.get_context("fork")
-    results = context.Queue()
-    children = [
-        context.Process(target=_child, args=(rank, count, port, results, function, args)) for rank in range(count)
-    ]
-    for child in children:
-        child.start()
-    try:
-        answers = dict(results.get(timeout=120) for _ in children)
+    results = SERVER.Queue()
+    work = cloudpickle.dumps((function, args))
+    with tempfile.TemporaryDirectory() as stacks:
+        children = [
+            SERVER.Process(target=_child, args=(rank, count, port, results, work, f"{stacks}/{rank}"))
+            for rank in range(count)
+        ]
         for child in children:
-            child.join(timeout=60)
-    finally:
-        for child in children:
-            child.kill()
+            child.start()
+        try:
+            answers = dict(results.get(timeout=PATIENCE_S) for _ in children)
+            for child in children:
+                child.join(timeout=60)
+        except queue.Empty:
+            pytest.fail(
+                "\n".join([f"no answer in {PATIENCE_S} s", *[p.read_text() for p in Path(stacks).iterdir()]])
+            )
+        finally:
+            for child in children:
+                child.kill()
     for rank, (_, error) in sorted(answers.items()):
         assert error is None, f"process {rank}:\n{error}"
     return [answers[rank][0] for rank in range(count)]
 
 
-def _child(rank, count, port, results, function, args):
+def _child(rank, count, port, results, work, stacks):
     torch.set_num_threads(1)
-    # The parent's lock is shared: a child that is killed while it draws a bar would keep it for ever.
-    tqdm.set_lock(threading.RLock())
     os.environ |= {
         "RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count),
         "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "OMP_NUM_THREADS": "1",
     }  # fmt: skip
-    try:
-        joined = join_processes("cpu")
-        answer = function(joined, *args), None
-        joined.leave()
-    except BaseException:
-        answer = None, traceback.format_exc()
+    with open(stacks, "w") as file:
+        faulthandler.dump_traceback_later(PATIENCE_S - 10, file=file)
+        try:
+            function, args = cloudpickle.loads(work)
+            joined = join_processes("cpu")
+            answer = function(joined, *args), None
+            joined.leave()
+        except BaseException:
+            answer = None, traceback.format_exc()
+        faulthandler.cancel_dump_traceback_later()
     results.put((rank, answer))
 
 

@@ -23,9 +23,6 @@ from cronos_lerobot.protocol.resets import CriticSceneReset
 from cronos_lerobot.training.critic_log import CriticLog
 from cronos_lerobot.training.seeding import NamedGenerators
 
-# Whatever threads there are wait for work when the test forks.
-pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
-
 EVERYTHING = {"scene_reset": "critic", "reset_budget": 12, "scene_reset_interval": None}
 STAGGERED = {"reset_phase": "staggered", "scene_reset_interval": 16}
 

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -19,7 +20,6 @@ from lerobot_env_cronos import CronosEnvConfig
 from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
 from test_trainer import STEPS_PER_UPDATE, STREAMS, KilledError, assert_same_run, config, metrics, weights
 
-from cronos_lerobot import processes as processes_module
 from cronos_lerobot.agents.base import Decision
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.ppo.ppo import PPO
@@ -35,9 +35,6 @@ from cronos_lerobot.training.factory import make_env
 from cronos_lerobot.training.sharding import ShardedEnv
 from cronos_lerobot.training.stopping import StopRequest
 from cronos_lerobot.training.trainer import Trainer
-
-# Whatever threads there are wait for work when the test forks.
-pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
 
 
 def train(processes, cfg, policy_class=ScriptedPolicy, dies_at=None):
@@ -227,10 +224,10 @@ def test_gradients_are_those_of_one_process_on_all_transitions(options):
         assert {k: result[k] for k in names} == pytest.approx({k: expected_metrics[k] for k in names}, rel=1e-4)
 
 
-def test_mean_of_gradients_by_hand(monkeypatch):
+def test_mean_of_gradients_by_hand():
     """In buckets of two numbers; the last parameter is used by the second process only, the one before by none."""
-    monkeypatch.setattr(processes_module, "BUCKET_BYTES", 8)
 
+    @patch("cronos_lerobot.processes.BUCKET_BYTES", 8)
     def average(processes):
         rank = processes.rank
         parameters = [torch.zeros(2), torch.zeros(1), torch.zeros(3).bfloat16(), torch.zeros(1), torch.zeros(1)]
@@ -266,6 +263,7 @@ def test_a_task_order_that_decides_by_itself_is_stopped(tmp_path, monkeypatch):
         def draw(self, loop):
             return self.rng.integers(loop.num_tasks, size=loop.num_streams)
 
+    @patch.dict("cronos_lerobot.protocol.task_orders.TASK_ORDERS", alone=Alone)
     def train_alone(processes, cfg):
         with pytest.raises(RuntimeError, match="no longer agree on: the loop's state\\. Task orders and"):
             train(processes, cfg)

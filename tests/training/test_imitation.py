@@ -32,8 +32,6 @@ from cronos_lerobot.processes import Processes
 from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig, record_demos
 from cronos_lerobot.training.trainer import Trainer
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
-
 
 @PreTrainedConfig.register_subclass("dummy_cloned")
 @dataclass

@@ -1,5 +1,7 @@
 """Whole runs of PPO that keep their successes: resumed, on two processes, and on the real scene."""
 
+from unittest.mock import patch
+
 import pytest
 import torch
 from dummies import DummyEnv
@@ -15,8 +17,6 @@ from tiny_checkpoints import STATE
 
 from cronos_lerobot.agents.ppo.config import PPOConfig, SelfImitationConfig
 from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig, record_demos
-
-pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
 
 
 class EvenPolicy(ClonedPolicy):
@@ -69,6 +69,7 @@ def test_a_resumed_run_equals_the_unbroken_one(tmp_path, monkeypatch):
     assert not torch.equal(weights(without)["actor.weight"], weights(unbroken)["actor.weight"])
 
 
+@patch("test_imitation.ClonedPolicy", EvenPolicy)
 def in_processes(processes, cfg, env_class=DummyEnv):
     trainer = train_imitation(cfg, env_class, processes)
     if trainer is None:
@@ -76,8 +77,7 @@ def in_processes(processes, cfg, env_class=DummyEnv):
     return trainer.policy.actor.weight.tolist(), len(trainer.agent.ppo.self_imitation.memory)
 
 
-def test_two_processes_clone_their_own_and_resume(tmp_path, monkeypatch):
-    monkeypatch.setattr("test_imitation.ClonedPolicy", EvenPolicy)
+def test_two_processes_clone_their_own_and_resume(tmp_path):
     first, second = together(in_processes, settings(tmp_path / "unbroken"))
     assert first[0] == second[0]
     assert first[1] + second[1] >= 3

@@ -24,8 +24,6 @@ from cronos_lerobot.processes import Processes
 from cronos_lerobot.scripts.train import push_to_hub
 from cronos_lerobot.training.trainer import Trainer
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
-
 
 @PreTrainedConfig.register_subclass("dummy_noise")
 @dataclass

@@ -31,8 +31,6 @@ from cronos_lerobot.report.tables import intervention_rows
 from cronos_lerobot.training.config import RecordConfig
 from cronos_lerobot.training.trainer import Trainer
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
-
 
 def assisted(folder, **options):
     """A run of 32 steps of each stream; whoever fails is taken over the next time."""
