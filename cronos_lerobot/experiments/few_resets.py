@@ -97,10 +97,11 @@ LEARNED = replace(METHOD, learned_reset=True)
 TAUGHT = plugged("takeover", "memory")
 """An expert's segments are cloned only where successes are kept."""
 TUNED = Row(80, tag="decay", flags=PLUGS["decay"].flags)
-"""What settles the policy of few resets may settle that of T = 80."""
+BEST_TUNED = replace(BEST, tag="decay", flags=PLUGS["decay"].flags)
+"""What settles the policy of few resets may settle those of T = 80 and of the paper's aids."""
 ASKED = plugged("asked", "decay")
 PAIRS = (TAUGHT, plugged("critic", "staggered"), plugged("staggered", "decay"), ASKED)
-SCREENED = (*AIDS, *(plugged(name) for name in PLUGS), *PAIRS, METHOD, TUNED)
+SCREENED = (*AIDS, *(plugged(name) for name in PLUGS), *PAIRS, METHOD, TUNED, BEST_TUNED)
 
 METHOD_BY_BUDGET = (
     METHOD,
@@ -142,7 +143,7 @@ for _experiment in (
         "few_resets_best",
         "Learning with few resets, evaluated in full",
         (
-            *map(wide, (EPISODIC, TUNED, PLAIN, BEST, METHOD, ASKED)),
+            *map(wide, (EPISODIC, TUNED, PLAIN, BEST, BEST_TUNED, METHOD, ASKED)),
             *map(with_resets, (TUNED, BEST, METHOD, LEARNED)),
         ),
         splits=BOTH,
@@ -153,7 +154,11 @@ for _experiment in (
     Experiment(
         "few_resets_budgets",
         "Success against the budget of interventions",
-        (*map(wide, (EPISODIC, TUNED, BEST)), with_resets(TUNED), *chain.from_iterable(_BY_BUDGET.values())),
+        (
+            *map(wide, (EPISODIC, TUNED, BEST, BEST_TUNED)),
+            with_resets(TUNED),
+            *chain.from_iterable(_BY_BUDGET.values()),
+        ),
         budgets=(64, 254, 1000),
         by_base=True,
         joined=tuple((label, _names(rows)) for label, rows in _BY_BUDGET.items()),
