@@ -61,10 +61,11 @@ def test_each_plug_stands_alone_and_together_on_both_bases():
     assert len(set(names)) == len(names)
     narrow = [name for name in names if "wide" not in name]
     assert narrow[:5] == ["t80", "t1280_eer", "t1280_eer_cl", "t1280_eer_cl_lsr", "t1280_eer_cl_hsr"]
-    assert [name.split("_")[-1] for name in narrow[5:-6]] == list(PLUGS)
-    assert narrow[-6:] == [
+    assert [name.split("_")[-1] for name in narrow[5:-7]] == list(PLUGS)
+    assert narrow[-7:] == [
         "tnone_eer_takeover_memory", "t1280_eer_critic_staggered", "t1280_eer_staggered_decay",
         "tnone_eer_asked_decay", "t4400_eer_staggered_early_decay", "t80_decay",
+        "t1280_eer_cl_hsr_decay",
     ]  # fmt: skip
     wides = [f"{name}_wide_resets" if "lsr" in name else f"{name}_wide" for name in narrow]
     assert names == narrow + wides
