@@ -33,6 +33,15 @@ from cronos_lerobot.protocol.resets import check_extra_resets
 from cronos_lerobot.protocol.task_orders import check_task_order
 from cronos_lerobot.training.resume import check_resumed, check_types, import_plugins
 
+EVALUATION_ONLY = {
+    "task": "a run trains every task of the scene",
+    "suite": "the periodic evaluation is of single tasks",
+    "split": "training is on train, --eval.split chooses for the periodic evaluation",
+    "advance": "--protocol.task_switch_interval says when a stream goes on to its next task",
+    "end_effector_reset": "of training it is --protocol.end_effector_reset",
+}
+"""Flags of the environment that only lerobot-eval reads, each with what holds in place of it."""
+
 
 @dataclass
 class RecordConfig:
@@ -230,6 +239,8 @@ class CronosTrainConfig:
             raise ValueError("Choose an environment: --env.type=cronos --env.scene=kitchen_2x2.")
         if not is_of_this_package(self.env):
             raise ValueError(f"--env.type must be cronos to train in, got {self.env.type!r}.")
+        if not self.resume:
+            self._check_env(self.env)
         check_agent(self.algorithm.type)
         self._pin_benchmark(self.env)
         if not self.resume and (path := parser.get_path_arg("policy")):
@@ -246,6 +257,13 @@ class CronosTrainConfig:
         if self.checkpoint_path is not None:
             check_resumed(self, self.checkpoint_path)
         self.record.check(Path(self.output_dir), self.num_envs, resume=self.resume)
+
+    @staticmethod
+    def _check_env(env: CronosEnvConfig) -> None:
+        """Refuse what training would not follow."""
+        for name, why in EVALUATION_ONLY.items():
+            if (value := getattr(env, name)) != getattr(CronosEnvConfig, name):
+                raise ValueError(f"--env.{name}={value} is of lerobot-eval: {why}.")
 
     @staticmethod
     def _pin_benchmark(env: CronosEnvConfig) -> None:

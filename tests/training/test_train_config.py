@@ -71,6 +71,17 @@ def test_steps_are_rounded_up_to_whole_updates():
         (["--log_freq=-1"], "log_freq must be >= 1, got -1"),
         (["--steps=80"], "Choose an environment"),
         (["--env.type=pusht"], "--env.type must be cronos to train in, got 'pusht'"),
+        (["--env.type=cronos", "--env.split=held_out"], "--env.split=held_out is of lerobot-eval: .*--eval.split"),
+        (["--env.type=cronos", "--env.suite=sequential"], "--env.suite=sequential is of lerobot-eval"),
+        (["--env.type=cronos", "--env.advance=on_success"], "--env.advance=on_success is .*task_switch_interval"),
+        (
+            ["--env.type=cronos", "--env.end_effector_reset=true"],
+            "--env.end_effector_reset=True is .*--protocol.end_effector_reset",
+        ),
+        (
+            ["--env.type=cronos", "--env.task=put the ketchup bottle on the cloth"],
+            "--env.task=put the ketchup bottle on the cloth is of lerobot-eval: a run trains every task",
+        ),
         (["--resume=true"], "Resuming needs --config_path="),
         (["--resume=true", "--config_path=/nowhere/train_config.json"], "--config_path=/nowhere/.*: no such file"),
         (["--env.type=cronos", "--policy.path=/nowhere"], "--policy.path=/nowhere: no such folder"),
