@@ -6,7 +6,8 @@ import datetime as dt
 import json
 import sys
 import tempfile
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -81,15 +82,24 @@ class RecordConfig:
         """The folder of the dataset of a run in `output_dir`."""
         return Path(self.root or output_dir / "streams")
 
-    def check(self, output_dir: Path, num_envs: int, *, resume: bool) -> None:
+    @staticmethod
+    def film_suffix(render_size: Sequence[int]) -> str:
+        """What the filmed streams' repo_id and root end with; `render_size` is (height, width) [px]."""
+        height, width = render_size
+        return f"_{width}x{height}"
+
+    def check(self, output_dir: Path, num_envs: int, render_size: Sequence[int], *, resume: bool) -> None:
         """Tell now what recording would stumble over later.
 
         Raises:
-            ValueError: more streams are to be recorded than there are, or none.
-            OSError: the dataset cannot be made: it exists, or its folder cannot be written to; or it is not
+            ValueError: more streams are to be recorded than there are, or none; or how is said, but not what.
+            OSError: a dataset cannot be made: it exists, or its folder cannot be written to; or it is not
                 there to be resumed.
         """
         if self.repo_id is None:
+            # A resumed run keeps to what it began with, which once may have been this.
+            if not resume:
+                self._check_nothing_is_asked()
             return
         for name, number in (("streams", self.num_streams), ("filmed_streams", self.filmed_streams)):
             if isinstance(number, int) and number > num_envs:
@@ -103,13 +113,22 @@ class RecordConfig:
             if not (root / INFO_PATH).is_file():
                 raise FileNotFoundError(f"no recording to resume in {root}.")
             return
-        if root.exists():
-            raise FileExistsError(f"{root} exists; choose another --record.root.")
+        film = root.with_name(root.name + self.film_suffix(render_size))
+        for folder in (root, film) if self.filmed_streams else (root,):
+            if folder.exists():
+                raise FileExistsError(f"{folder} exists; choose another --record.root.")
         parent = next(folder for folder in root.absolute().parents if folder.exists())
         try:
             tempfile.TemporaryDirectory(dir=parent).cleanup()
         except OSError as error:
             raise OSError(f"cannot record to {root}: {error}") from error
+
+    def _check_nothing_is_asked(self) -> None:
+        for field_ in fields(self):
+            if (value := getattr(self, field_.name)) != field_.default:
+                raise ValueError(
+                    f"--record.{field_.name}={value} records nothing without --record.repo_id=<user>/<name>."
+                )
 
 
 @dataclass
@@ -256,7 +275,7 @@ class CronosTrainConfig:
             raise FileExistsError(f"{self.output_dir} exists; choose another --output_dir or --resume=true.")
         if self.checkpoint_path is not None:
             check_resumed(self, self.checkpoint_path)
-        self.record.check(Path(self.output_dir), self.num_envs, resume=self.resume)
+        self.record.check(Path(self.output_dir), self.num_envs, self.env.render_size, resume=self.resume)
 
     @staticmethod
     def _check_env(env: CronosEnvConfig) -> None:

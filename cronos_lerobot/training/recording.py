@@ -110,7 +110,7 @@ class StreamObserver:
             camera = parse_camera_names(config.env.camera_name)[0]
             height, width = config.env.render_size
             num_positions = env.positions(np.arange(1)).shape[1]
-            suffix = f"_{width}x{height}"
+            suffix = record.film_suffix(config.env.render_size)
             recorders[FILM] = StreamRecorder.open(
                 env,
                 record.repo_id + suffix,

@@ -5,6 +5,7 @@ import logging
 import resource
 import shutil
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -127,6 +128,10 @@ def cronos_train(monkeypatch, *arguments):
     ("flags", "message"),
     [
         (["--record.root={existing}"], "existing exists; choose another --record.root"),
+        (
+            ["--record.root={new}", "--record.filmed_streams=1", "--env.render_size=[48,64]"],
+            "new_64x48 exists; choose another --record.root",
+        ),
         # Nobody may make a folder there, not even root.
         (["--record.root=/proc/1/streams"], "cannot record to /proc/1/streams"),
         (["--record.streams=3"], "record.streams must be at most num_envs=2, got 3"),
@@ -139,18 +144,35 @@ def cronos_train(monkeypatch, *arguments):
 )
 def test_a_recording_that_cannot_begin_stops_the_run_at_once(tmp_path, monkeypatch, flags, message):
     (tmp_path / "existing").mkdir()
-    flags = [flag.format(existing=tmp_path / "existing") for flag in flags]
+    (tmp_path / "new_64x48").mkdir()
+    flags = [flag.format(existing=tmp_path / "existing", new=tmp_path / "new") for flag in flags]
     with pytest.raises(SystemExit, match=message):
         cronos_train(
             monkeypatch, "--policy.type=pocketvla", "--policy.device=cpu", "--env.type=cronos", "--num_envs=2",
             "--record.repo_id=me/stream", f"--output_dir={tmp_path / 'run'}", *flags,
         )  # fmt: skip
-    assert [path.name for path in tmp_path.iterdir()] == ["existing"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["existing", "new_64x48"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({"streams": "all"}, "--record.streams=all records nothing without --record.repo_id"),
+        ({"filmed_streams": 2}, "--record.filmed_streams=2 records nothing without --record.repo_id"),
+        ({"root": Path("here")}, "--record.root=here records nothing without --record.repo_id"),
+        ({"flush_interval_s": 5.0}, "--record.flush_interval_s=5.0 records nothing without --record.repo_id"),
+    ],
+)
+def test_how_to_record_without_a_dataset_is_refused(tmp_path, flags, message):
+    with pytest.raises(ValueError, match=message):
+        RecordConfig(**flags).check(tmp_path, 4, (480, 640), resume=False)
+    RecordConfig(**flags).check(tmp_path, 4, (480, 640), resume=True)
+    RecordConfig().check(tmp_path, 4, (480, 640), resume=False)
 
 
 def test_resuming_without_the_recording_is_told(tmp_path):
     with pytest.raises(FileNotFoundError, match="no recording to resume in"):
-        RecordConfig("me/stream").check(tmp_path, 4, resume=True)
+        RecordConfig("me/stream").check(tmp_path, 4, (480, 640), resume=True)
 
 
 def test_filmed_streams_are_a_dataset_of_their_own(tmp_path):
