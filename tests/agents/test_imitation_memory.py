@@ -1,5 +1,6 @@
 """What is remembered of streams, and that batches of it are those of a LeRobotDataset of the same frames."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import httpx
@@ -247,6 +248,8 @@ def test_a_dataset_that_is_not_there_is_named(dataset_root, monkeypatch):
         ({"gamma": 1.5}, "algorithm.gamma must be >= 0 and <= 1, got 1.5"),
         ({"demos_share": 1.5}, "algorithm.demos_share must be >= 0 and <= 1, got 1.5"),
         ({"demos_share": 0.5}, "algorithm.demos_share=0.5 needs --algorithm.demos.repo_id"),
+        ({"demos": DemosConfig("me/demos")}, "algorithm.demos.repo_id=me/demos is not learned from with --alg"),
+        ({"demos": DemosConfig(root=Path("d"))}, "algorithm.demos.root=d is not learned from with --algorithm.d"),
     ],
 )
 def test_bad_values_are_named(options, message):

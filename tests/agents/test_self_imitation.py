@@ -242,5 +242,7 @@ def test_a_share_of_demonstrations_needs_them_and_a_weight():
     options.repo_id = "me/demos"
     with pytest.raises(ValueError, match=r"--algorithm\.self_imitation\.coef above 0"):
         PPOConfig(demos_share=0.5, demos=options)
+    with pytest.raises(ValueError, match=r"demos\.repo_id=me/demos is not learned from with .*demos_share=0: "):
+        PPOConfig(demos=options)
     with pytest.raises(ValueError, match=r"algorithm\.demos_share must be >= 0 and <= 1, got 2"):
         PPOConfig(demos_share=2.0)

@@ -18,6 +18,21 @@ class DemosConfig:
     root: Path | None = None
     """Its folder; null takes LeRobot's cache or the Hub."""
 
+    def check(self, share: float) -> None:
+        """Check that `share`, `algorithm.demos_share`, has demonstrations, and they a share.
+
+        Raises:
+            ValueError: as it says.
+        """
+        if share and self.repo_id is None:
+            raise ValueError(f"algorithm.demos_share={share} needs --algorithm.demos.repo_id.")
+        for name in ("repo_id", "root"):
+            if not share and (value := getattr(self, name)) is not None:
+                raise ValueError(
+                    f"algorithm.demos.{name}={value} is not learned from with --algorithm.demos_share=0: give a "
+                    "share above 0, up to 1."
+                )
+
 
 WEIGHTINGS = ("none", "return", "advantage")
 
@@ -79,8 +94,7 @@ class ImitationConfig(RLAlgorithmConfig):
         for name in ("demos_share", "gamma"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"algorithm.{name} must be >= 0 and <= 1, got {getattr(self, name)}.")
-        if self.demos_share and self.demos.repo_id is None:
-            raise ValueError(f"algorithm.demos_share={self.demos_share} needs --algorithm.demos.repo_id.")
+        self.demos.check(self.demos_share)
 
     @classmethod
     def from_policy_config(cls, policy_cfg: Any) -> ImitationConfig:

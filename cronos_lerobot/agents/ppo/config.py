@@ -239,11 +239,8 @@ class PPOConfig(RLAlgorithmConfig):
             )
 
     def _check_demos(self) -> None:
-        if not self.demos_share:
-            return
-        if self.demos.repo_id is None:
-            raise ValueError(f"algorithm.demos_share={self.demos_share} needs --algorithm.demos.repo_id.")
-        if not self.self_imitation.coef:
+        self.demos.check(self.demos_share)
+        if self.demos_share and not self.self_imitation.coef:
             raise ValueError(
                 f"algorithm.demos_share={self.demos_share} is of what PPO clones beside its loss, with a weight "
                 "--algorithm.self_imitation.coef above 0."
