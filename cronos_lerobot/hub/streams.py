@@ -49,12 +49,16 @@ def read_codebase_version(config: StreamConfig) -> str:
 def write_stream_repository(config: StreamConfig, folder: Path) -> str:
     """Write the tree of a dataset's repository into `folder`; returns what it is, in words.
 
-    A dry run copies the files; a push, whose tree is gone afterwards, links them.
+    A dry run copies the files; a push, whose tree is gone afterwards, links them: the config holds the dataset.
 
     Raises:
+        FolderInUseError: it is still being recorded.
         ValueError: --root is missing, the dataset is empty or not ours, or a file of it is damaged.
         FileNotFoundError: there is no dataset, or --run is no run.
     """
+    # Before the lock, which would make the folder around a --root that is not there.
+    read_info(config)
+    config.hold()
     info = read_info(config)
     assert config.root is not None
     origin = check_dataset(config.root)

@@ -1,7 +1,9 @@
 """What is not what a card would say is refused, in one sentence."""
 
+import errno
 import json
 import shutil
+import sys
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -12,10 +14,13 @@ from lerobot_env_cronos.config import CronosEnvConfig
 from safetensors.numpy import save_file
 
 from cronos_lerobot.data.file_check import check_dataset
+from cronos_lerobot.data.writer import SegmentWriter
 from cronos_lerobot.hub.config import PolicyConfig, PublishConfig, StreamConfig
 from cronos_lerobot.hub.policy import write_policy_repository
 from cronos_lerobot.hub.results import check_policy
 from cronos_lerobot.hub.streams import write_stream_repository
+from cronos_lerobot.locks import FolderInUseError, FolderLock
+from cronos_lerobot.scripts.publish import main
 from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig, record_demos
 
 
@@ -42,6 +47,35 @@ def test_what_is_whole_is_published_with_its_origin(demos, tmp_path):
     card = publish(demos, tmp_path)
     assert "in the scene `kitchen_2x2` of CRONOS (`lerobot_env_cronos/kitchen_2x2-v1`)" in card
     assert "`--seed=0`" in card
+
+
+def test_what_is_still_being_recorded_is_not_published_nor_gone_on_with_meanwhile(copy, tmp_path, monkeypatch):
+    writer = SegmentWriter.resume("me/demos", copy)
+    flags = [f"--root={copy}", "--repo_id=me/d", "--dry_run=true", f"--output_dir={tmp_path / 'out'}"]
+    monkeypatch.setattr(sys, "argv", ["cronos-publish", "stream", *flags])
+    with pytest.raises(SystemExit, match=rf"^error: {copy} is still being recorded, publish it afterwards: .*\.$"):
+        main()
+    assert not list((tmp_path / "out").iterdir())
+    writer.finalize()
+    config = StreamConfig(repo_id="me/d", root=copy)
+    (tmp_path / "tree").mkdir()
+    write_stream_repository(config, tmp_path / "tree")
+    # A push still reads what the tree links to.
+    with pytest.raises(FolderInUseError, match="is being written by process"):
+        SegmentWriter.resume("me/demos", copy)
+    del config
+    SegmentWriter.resume("me/demos", copy).finalize()
+
+
+def test_a_dataset_that_may_only_be_read_is_published(copy, tmp_path, monkeypatch):
+    def read_only(self):
+        raise OSError(errno.EROFS, "Read-only file system", str(self.path))
+
+    monkeypatch.setattr(FolderLock, "acquire", read_only)
+    assert "kitchen_2x2" in publish(copy, tmp_path / "out")
+    monkeypatch.setattr("cronos_lerobot.hub.config.READ_ONLY", ())
+    with pytest.raises(OSError, match="Read-only"):
+        publish(copy, tmp_path / "again")
 
 
 def only(root, pattern):
