@@ -115,7 +115,8 @@ class StreamDataset:
             downloading the rest; `dataset` is then out of reach.
 
     Raises:
-        ValueError: the dataset has no recorded streams, or another version of the environment made it.
+        ValueError: the dataset has no recorded streams, or no segment of them yet, or another version of the
+            environment made it.
     """
 
     def __init__(
@@ -135,6 +136,8 @@ class StreamDataset:
         """Where it comes from."""
         if lacking := [name for name in (*STREAM_COLUMNS, TRUNCATED) if name not in self.meta.features]:
             raise ValueError(f"{repo_id} has lost columns of a recorded stream: {lacking}")
+        if not self.meta.total_episodes:
+            raise ValueError(f"{repo_id} in {self.meta.root} has no episode yet")
         # Metadata that came from the Hub lies in LeRobot's cache, without the data.
         is_local = (self.meta.root / "data").is_dir()
         self._files: Any = fsspec.filesystem("file") if is_local else HfFileSystem()

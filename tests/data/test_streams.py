@@ -1,4 +1,5 @@
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,15 +9,17 @@ import pytest
 import synthetic_streams
 from lerobot.datasets import LeRobotDataset, StreamingLeRobotDataset
 from lerobot.datasets.dataset_tools import delete_episodes
-from synthetic_segments import FPS, features, segment
-from synthetic_streams import PICTURES, STEPS, STREAMS, TASKS, UPDATE, K, record
+from synthetic_segments import FPS, features, observation_space, segment
+from synthetic_streams import ORIGIN, PICTURES, STEPS, STREAMS, TASKS, UPDATE, K, record
 
+from cronos_lerobot.data.schema import stream_features
 from cronos_lerobot.data.stream_check import StreamError
 from cronos_lerobot.data.stream_filter import SegmentFilter, filter_streams
 from cronos_lerobot.data.stream_statistics import make_tables, statistics
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.data.writer import SegmentWriter
 from cronos_lerobot.protocol.interventions import Intervention
+from cronos_lerobot.scripts.streams import main
 
 FRONT = "observation.images.front"
 
@@ -241,3 +244,14 @@ def test_other_datasets_are_refused(tmp_path):
         writer.add_segment(segment(5), "task")
     with pytest.raises(ValueError, match="me/demos has no recorded streams: it lacks the columns"):
         StreamDataset("me/demos", tmp_path / "d", streaming=True)
+
+
+@pytest.mark.parametrize("command", ["check", "statistics"])
+def test_a_recording_without_a_segment_is_said_in_one_line(tmp_path, monkeypatch, command):
+    features = stream_features(observation_space(environment_state=None))
+    writer = SegmentWriter("me/stream", tmp_path / "d", features, FPS, origin=ORIGIN)
+    flags = ["--dataset.repo_id=me/stream", f"--dataset.root={tmp_path / 'd'}"]
+    monkeypatch.setattr(sys, "argv", ["cronos-streams", command, *flags])
+    with pytest.raises(SystemExit, match=rf"^error: me/stream in {tmp_path / 'd'} has no episode yet$"):
+        main()
+    writer.finalize()
