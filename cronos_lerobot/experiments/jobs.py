@@ -159,12 +159,29 @@ def missing(job: Job) -> list[Path]:
 
 
 def changes(job: Job) -> list[str]:
-    """Why `output` is not the job's: `changed_flags`, `changed_versions`, or a damaged note; empty if it is."""
+    """Why `output` is not the job's, or may not be: `known_changes`, or it has no note; empty if it is.
+
+    A note is written before its command starts: what lies there without one came from elsewhere.
+    """
+    # In this order: another process may start the job meanwhile.
+    if _is_filled(job.output) and not job.record.is_file():
+        why = f"{job.output} has no note, so nobody knows what made it"
+        return [f"{why}: copy {job.record.name} from where it was made"]
+    return known_changes(job)
+
+
+def known_changes(job: Job) -> list[str]:
+    """How a note tells that `output` is not the job's: `changed_flags`, `changed_versions`, or it is damaged."""
     if not job.output.exists():
         return []
     if damage := _damage(job):
         return [damage]
     return changed_flags(job) + changed_versions(job)
+
+
+def _is_filled(output: Path) -> bool:
+    """Whether there is anything in a folder; a command may find its own made."""
+    return any(output.iterdir()) if output.is_dir() else output.exists()
 
 
 def changed_flags(job: Job) -> list[str]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.experiments.definitions import INTERVENTIONS, CheckpointEvaluation, Experiment, Row
-from cronos_lerobot.experiments.jobs import Job, changes, other_commits, read_record, status
+from cronos_lerobot.experiments.jobs import Job, known_changes, other_commits, read_record, status
 from cronos_lerobot.experiments.plan import base_evaluation_jobs, checkpoint_evaluations, train_job
 from cronos_lerobot.experiments.runner import DONE, FAILED
 from cronos_lerobot.experiments.specs import Options, RunSpec, base_folder, run_specs
@@ -274,7 +274,7 @@ def _read_seed(spec: RunSpec, result: ExperimentResult) -> SeedResult | None:
     job = train_job(spec, None)
     if not _has_record(spec):
         return None
-    if found := changes(job):
+    if found := known_changes(job):
         result.changed.append(f"{spec.name}: {'; '.join(found)}")
         return None
     try:
@@ -300,7 +300,7 @@ def _read_evaluation(
         seed.missing.append(job.name)
         return
     try:
-        if found := changes(job):
+        if found := known_changes(job):
             raise ValueError("; ".join(found))
         splits = read_results(job.output)[evaluation.suite]
     except ValueError as error:

@@ -210,6 +210,26 @@ def test_damaged_note_is_said_and_nothing_is_deleted_for_it(tmp_path, text, caps
     assert (status(job), (tmp_path / "a/n").read_text()) == ("done", "x")
 
 
+def test_what_came_without_its_note_is_said_and_left_alone_with_what_was_made_of_it(tmp_path, capsys):
+    made = count_job(tmp_path, "a", made_from_it=(tmp_path / "b",))
+    jobs = [made, count_job(tmp_path, "b", needs=("a",))]
+    run(jobs)
+    note = made.record.read_text()
+    made.record.unlink()
+    assert Runner(jobs, 1, LineDisplay([])).run() == {"a": "changed", "b": "done"}
+    out = capsys.readouterr().out
+    assert f"{tmp_path}/a has no note, so nobody knows what made it: copy a.job.json from where it was made" in out
+    assert "Delete it, choose another --root" in out
+    assert [(tmp_path / name / "n").read_text() for name in "ab"] == ["x", "x"]
+    # With its note it is what it was.
+    made.record.write_text(note)
+    assert run(jobs)[0] == {"a": "done", "b": "done"}
+    # An empty folder is nothing to lose.
+    (tmp_path / "c").mkdir()
+    assert run([count_job(tmp_path, "c")])[0] == {"c": "done"}
+    assert (tmp_path / "c/n").read_text() == "x"
+
+
 def test_output_of_another_version_is_not_taken_for_done(tmp_path, monkeypatch, capsys):
     job = count_job(tmp_path, "a", environment="lerobot_env_cronos/kitchen_2x2-v1")
     run([job])
