@@ -7,7 +7,7 @@ from typing import Any
 
 from cronos_lerobot.experiments import tables
 from cronos_lerobot.experiments.differences import Gain, RowDifference
-from cronos_lerobot.experiments.orders import Order
+from cronos_lerobot.experiments.orders import NOT_APPLICABLE, Order
 from cronos_lerobot.experiments.results import APART, AtBudget, ExperimentResult
 from cronos_lerobot.protocol.metrics import Summary
 from cronos_lerobot.report.paired import ALPHA, holm
@@ -15,7 +15,6 @@ from cronos_lerobot.report.series import segment_rates, segment_spans
 from cronos_lerobot.report.statistics import Rate
 
 MISSING = "–"
-NOT_APPLICABLE = "not applicable"
 WORDS = {"higher": "above", "lower": "below", "alike": "like"}
 """For what the paper says of a row beside another."""
 
@@ -143,7 +142,7 @@ def order_columns(orders: Sequence[Order]) -> Columns:
         "difference": [f"{one.found.difference.value:+.3f}{one.unit}" if one.found else MISSING for one in orders],
         "95 %": [_signed_interval(one.difference.ci95) if one else MISSING for one in found],
         "of": [_of(one) if one else MISSING for one in found],
-        "holds": [one.holds for one in orders],
+        "holds": [one.holds + (f": {one.reason}" if one.holds == NOT_APPLICABLE else "") for one in orders],
     }
 
 

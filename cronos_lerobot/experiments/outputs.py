@@ -172,7 +172,7 @@ ORDER_NOTES = (
     " chains, how many tasks were done before the first failure. Holds: yes"
     f" or no where p < {ALPHA}, not adjusted; of two rows that are said to do alike, where the whole interval is"
     f" within {MARGIN} of zero, or beyond it; two of these that differ (p < {ALPHA}), by more than that or by"
-    " less, are undecided."
+    " less, are undecided. Not applicable: the base policies of both leave nothing to learn."
 )
 PPO_NOTES = (
     "A scale is that of steps, streams and seeds. The learning algorithm is `ppo`, with this project's settings,"

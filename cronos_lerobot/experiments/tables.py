@@ -223,7 +223,9 @@ def order_rows(orders: Sequence[Order]) -> list[Row]:
             name: getattr(one, name) for name in ("row", "reference", "says", "where", "suite", "split", "unit")
         }
         found = difference_rows([one.found] if one.found else [])
-        rows.append(told | {"holds": one.holds} | (found[0] if found else {}))
+        rows.append(
+            told | {"holds": one.holds, "not_applicable": one.reason or None} | (found[0] if found else {})
+        )
     return rows
 
 

@@ -85,7 +85,10 @@ def _claim(order: dict[str, Any]) -> tuple[str, ...]:
     found = f"{order['difference']:+.3f}{order['unit']}"
     if order["ci95_low"] is not None:
         found += f" [{order['ci95_low']:+.3f}, {order['ci95_high']:+.3f}]"
-    return said, suite, found + ", these policies" * (not order["of_trainings"]), order["holds"]
+    # Files of before there was a reason have none.
+    reason = order.get("not_applicable")
+    holds = order["holds"] + (f": {reason}" if reason else "")
+    return said, suite, found + ", these policies" * (not order["of_trainings"]), holds
 
 
 def main() -> None:

@@ -45,17 +45,18 @@ def bases_of(experiment, rows):
     return {row.begins_with(experiment.scene) for row in rows}
 
 
-def jobs_by_output(root, scale, seeds):
-    chosen = [(one, one.rows) for one in EXPERIMENTS.values()]
-    state = next(name for name, short in OBS_NAMES.items() if short == "state")
+def jobs_by_output(root, scale, seeds, seen="state", names=tuple(EXPERIMENTS)):
+    chosen = [(EXPERIMENTS[name], EXPERIMENTS[name].rows) for name in names]
+    obs_type = next(name for name, short in OBS_NAMES.items() if short == seen)
     bases = {base for one, rows in chosen for base in bases_of(one, rows)}
-    return {job.output: job for job in make_jobs(chosen, make_options(root, scale, state, seeds, bases))}
+    return {job.output: job for job in make_jobs(chosen, make_options(root, scale, obs_type, seeds, bases))}
 
 
 def test_archived_runs_are_done_below_any_root(root, monkeypatch):
     outputs = [note.with_name(note.name.removesuffix(".job.json")) for note in sorted(root.rglob("*.job.json"))]
     seeds = sorted({int(part[4:]) for output in outputs for part in output.parts if part.startswith("seed")})
-    made = {key: job for scale in ("paper", "small") for key, job in jobs_by_output(root, scale, seeds).items()}
+    made = jobs_by_output(root, "paper", seeds) | jobs_by_output(root, "small", seeds)
+    made |= jobs_by_output(root, "small", seeds, "pixels", ["table1"])
     assert len(outputs) > 50
     assert [output for output in outputs if output not in made or not is_done(made[output])] == []
     # The same root by another name.

@@ -78,6 +78,18 @@ def test_an_experiment_says_which_sentences_hold(options, tmp_path):
     assert summary["hours"] == 1.5
 
 
+@pytest.mark.parametrize(("before", "holds"), [((8, 8), "not applicable"), ((8, 6), "not separated")])
+def test_of_rows_whose_bases_leave_nothing_to_learn_nothing_is_said(options, tmp_path, before, holds):
+    """Of eight episodes; one base that may still learn is enough."""
+    for row, start in zip(("t80_1config", "t320_eer_1config"), before, strict=True):
+        make_run(options, "figure4", row, 1, (start, 8, 8))
+    (one, *_) = paper_orders(results(options, "figure4"))
+    assert one.holds == holds
+    page = write_outputs(EXPERIMENTS["figure4"], EXPERIMENTS["figure4"].rows, options, tmp_path / "out")
+    reason = ": the base policy does 1.000 from the start" if holds == "not applicable" else ""
+    assert f"| {holds}{reason} |" in page
+
+
 def evaluate(spec, lengths):
     """What `cronos-eval` would have found at the end of a run of figure 5: held-out chains of one ordering."""
     rates = [{"success": sum(n > i for n in lengths) / len(lengths)} for i in range(4)]

@@ -140,9 +140,10 @@ def test_the_commands_of_the_docs_are_those_of_the_study():
     (shared,) = re.findall(r'^clone="(.*?)"$', block, re.MULTILINE)
     lines = [shlex.split(f"{shared} {line}") for line in re.findall(r"^\$clone (.*)$", block, re.MULTILINE)]
     by_hand = {flag.split("/")[-1]: line for line in lines for flag in line if flag.startswith("--output_dir")}
-    jobs = {job.name: job for job in make_jobs(make_runs(list(KINDS), ["ppo"], [80], [1]), Path("outputs"))}
+    runs = make_runs(list(KINDS), ["ppo"], [80], [1])
+    jobs = {job.name: job for job in make_jobs(runs, Path("outputs/baselines"))}
     for kind in KINDS:
-        expected = flags_of(jobs[f"base {kind}"]) | {"--output_dir": f"outputs/{kind}"}
+        expected = flags_of(jobs[f"base {kind}"]) | {"--output_dir": f"outputs/baselines/{kind}"}
         assert _parsed(by_hand[kind]) == _parsed([f"{name}={value}" for name, value in expected.items()])
     (record,) = [shlex.split(line) for line in block.splitlines() if line.startswith("cronos-record-demos")]
     assert _parsed(record) == _parsed(jobs["demos"].command)
