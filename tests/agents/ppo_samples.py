@@ -12,7 +12,7 @@ from cronos_lerobot.agents.processing import PolicyProcessors
 
 
 def make_ppo(seed=0, policy=None, **options):
-    options = {"minibatch_size": 64, "value_warmup_updates": 0} | options
+    options = {"minibatch_size": 64, "value_warmup_updates": 0, "policy_lr_max": 1e3} | options
     policy = policy or DummyPolicy(seed=seed)
     return PPO(policy, PolicyProcessors(*identity_processors()), PPOConfig(**options), np.random.default_rng(seed))
 

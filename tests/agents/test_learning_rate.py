@@ -6,6 +6,7 @@ from ppo_samples import make_ppo, reward_for_up, rollout
 
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.ppo.learning_rate import adapted_lr, target_kl
+from cronos_lerobot.agents.ppo.state import set_optimizer
 
 
 def test_adaptive_learning_rate():
@@ -98,3 +99,16 @@ def test_a_fixed_lr_survives_an_early_stop():
     ppo = make_ppo(epochs=10, policy_lr=0.5, target_kl=0.01, lr_schedule="fixed")
     assert ppo.update(rollout(ppo, reward_for_up))["policy_epochs"] < 2
     assert ppo.policy_lr == 0.5
+
+
+@pytest.mark.parametrize(
+    ("became", "schedule", "expected"),
+    [(8e-4, "kl_update", 5e-4), (8e-4, "fixed", 8e-4), (2e-6, "kl_step", 1e-5), (3e-4, "kl_step", 3e-4)],
+)
+def test_a_loaded_lr_lies_between_the_ends_that_are_given_now(became, schedule, expected):
+    ppo = make_ppo()
+    ppo.policy_lr = became
+    now = PPOConfig(policy_lr_min=1e-5, policy_lr_max=5e-4, lr_schedule=schedule)
+    set_optimizer(ppo.optimizer, now, {"policy_lr": 5e-5, "value_lr": 1e-3})
+    assert ppo.policy_lr == expected
+    assert [group["lr"] for group in ppo.optimizer.param_groups if group["name"] == "value"] == [1e-3]

@@ -127,6 +127,11 @@ def test_untrainable_policy_is_named():
         ({"value_loss": "l1"}, "huber"),
         ({"target_kl": None}, "needs algorithm.target_kl"),
         ({"policy_lr_min": 1e-2}, "at most policy_lr_max=0.001, got 0.01"),
+        (
+            {"policy_lr": 2e-3},
+            r"policy_lr must be policy_lr_min=1e-06 to policy_lr_max=0.001, got 0.002; or .*lr_schedule=fixed",
+        ),
+        ({"policy_lr": 1e-7, "lr_schedule": "kl_step"}, "policy_lr must be policy_lr_min=1e-06 .* got 1e-07"),
         ({"temperature": 0.0}, "temperature must be > 0, got 0.0"),
         ({"policy_lr": -1.0}, "policy_lr must be >= 0, got -1.0"),
         ({"value_lr": math.nan}, "value_lr must be >= 0, got nan"),

@@ -59,7 +59,9 @@ def settings(folder, minibatch_size, *, resume=None, budget=None, task_order="ra
         task_switch_interval=4, update_interval=8, scene_reset_interval=16, heuristic_reset=True,
         task_order=task_order, reset_budget=budget,
     )  # fmt: skip
-    ppo = {"minibatch_size": minibatch_size, "policy_lr": 1e-2, "kl_base_coef": 0.1} | (algorithm or {})
+    ppo = {"minibatch_size": minibatch_size, "policy_lr": 1e-2, "policy_lr_max": 1.0, "kl_base_coef": 0.1} | (
+        algorithm or {}
+    )
     cfg = config(folder, protocol=protocol, algorithm=PPOConfig(**ppo), **options)
     cfg.checkpoint_path = resume
     return cfg

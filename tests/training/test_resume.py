@@ -67,7 +67,9 @@ def resumed(folder, **options):
 REFUSALS = {
     "--seed=6, but the run that is resumed has 5": {"seed": 6},
     "--record.repo_id=me/stream, but .* has null": {"record": RecordConfig(repo_id="me/stream")},
-    "--algorithm.kl_base_coef=0.0, but .* has 0.1": {"algorithm": PPOConfig(minibatch_size=16, policy_lr=1e-2)},
+    "--algorithm.kl_base_coef=0.0, but .* has 0.1": {
+        "algorithm": PPOConfig(minibatch_size=16, policy_lr=1e-2, policy_lr_max=1.0)
+    },
     "--protocol.learned_reset=true, but .* has false": {
         "protocol": ProtocolConfig(4, 8, 16, task_order="random", learned_reset=True)
     },
@@ -97,7 +99,7 @@ def test_a_run_of_another_version_is_refused(tmp_path):
 
 def test_a_learning_rate_that_is_given_is_the_optimizers(tmp_path):
     """The other one stays what the run has made of it."""
-    algorithm = PPOConfig(minibatch_size=16, policy_lr=1e-2, kl_base_coef=0.1)
+    algorithm = PPOConfig(minibatch_size=16, policy_lr=1e-2, policy_lr_max=1.0, kl_base_coef=0.1)
     train(config(tmp_path / "run", steps=3 * STEPS_PER_UPDATE, eval_freq=0, algorithm=algorithm))
     state = tmp_path / "run/checkpoints/last/training_state"
     for given, expected in (({}, None), ({"policy_lr": 3e-4, "beta1": 0.5}, 3e-4)):

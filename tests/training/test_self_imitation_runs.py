@@ -30,7 +30,7 @@ class EvenPolicy(ClonedPolicy):
 
 def settings(folder, coef=0.5, **options):
     algorithm = PPOConfig(
-        minibatch_size=16, policy_lr=1e-2, value_warmup_updates=1,
+        minibatch_size=16, policy_lr=1e-2, policy_lr_max=1.0, value_warmup_updates=1,
         self_imitation=SelfImitationConfig(coef=coef, batch_size=8, max_age=2, tail_steps=1),
     )  # fmt: skip
     return config(

@@ -97,7 +97,7 @@ def train_with(processes, cfg):
 
 def test_two_processes_take_over_as_one_does(tmp_path):
     """Their shares of takeovers differ, so that one has more to learn from than the other."""
-    options = {"algorithm": PPOConfig(minibatch_size=4, policy_lr=1e-2), "eval_freq": 0}
+    options = {"algorithm": PPOConfig(minibatch_size=4, policy_lr=1e-2, policy_lr_max=1.0), "eval_freq": 0}
     loop, _ = train_with(Processes(), assisted(tmp_path / "one", **options))
     first, second = together(train_with, assisted(tmp_path / "two", **options))
     assert first == second

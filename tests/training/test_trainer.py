@@ -35,7 +35,7 @@ def config(folder, steps=4 * STEPS_PER_UPDATE, **options):
         "protocol": ProtocolConfig(
             task_switch_interval=4, update_interval=8, scene_reset_interval=16, task_order="random"
         ),
-        "algorithm": PPOConfig(minibatch_size=16, policy_lr=1e-2, kl_base_coef=0.1),
+        "algorithm": PPOConfig(minibatch_size=16, policy_lr=1e-2, policy_lr_max=1.0, kl_base_coef=0.1),
         "eval": PeriodicEvaluationConfig(n_episodes=3, batch_size=5),
         "eval_freq": 2 * STEPS_PER_UPDATE,
         "save_freq": STEPS_PER_UPDATE,

@@ -237,6 +237,12 @@ class PPOConfig(RLAlgorithmConfig):
                 f"algorithm.policy_lr_min must be at most policy_lr_max={self.policy_lr_max}, got "
                 f"{self.policy_lr_min}."
             )
+        # Beyond its ends an adaptive rate would leap to them, whichever way it should go.
+        if self.lr_schedule != "fixed" and not self.policy_lr_min <= self.policy_lr <= self.policy_lr_max:
+            raise ValueError(
+                f"algorithm.policy_lr must be policy_lr_min={self.policy_lr_min} to policy_lr_max="
+                f"{self.policy_lr_max}, got {self.policy_lr}; or algorithm.lr_schedule=fixed."
+            )
 
     def _check_demos(self) -> None:
         self.demos.check(self.demos_share)

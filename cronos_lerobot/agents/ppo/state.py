@@ -30,6 +30,8 @@ def join_rollouts(rollout: dict[str, Any], processes: Processes) -> dict[str, An
 def set_optimizer(optimizer: Optimizer, config: PPOConfig, saved: dict[str, float]) -> None:
     """Give a loaded optimizer what `config` changes; other learning rates stay as they have become.
 
+    An adaptive one that is beyond the ends that `config` has now goes on from the nearer one.
+
     Args:
         optimizer: with groups named `policy` and `value`.
         config: to go on with.
@@ -39,5 +41,7 @@ def set_optimizer(optimizer: Optimizer, config: PPOConfig, saved: dict[str, floa
         name = f"{group['name']}_lr"
         if getattr(config, name) != saved[name]:
             group["lr"] = getattr(config, name)
+        if group["name"] == "policy" and config.lr_schedule != "fixed":
+            group["lr"] = min(max(group["lr"], config.policy_lr_min), config.policy_lr_max)
         group["weight_decay"] = config.weight_decay
         group["betas"] = (config.beta1, config.beta2)
