@@ -36,7 +36,13 @@ from lerobot.utils.constants import (
     PRETRAINED_MODEL_DIR,
     TRAINING_STATE_DIR,
 )
-from lerobot.utils.random_utils import deserialize_rng_state, load_rng_state, save_rng_state, serialize_rng_state
+from lerobot.utils.random_utils import (
+    deserialize_rng_state,
+    load_rng_state,
+    save_rng_state,
+    serialize_rng_state,
+    set_seed,
+)
 from lerobot.utils.utils import flatten_dict, unflatten_dict
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
@@ -155,7 +161,7 @@ def load_checkpoint(run: RunState, config: CronosTrainConfig, folder: Path) -> d
         run.env.set_state(dict(arrays))
     run.agent.load_state_dict(_load_agent(state_dir / AGENT))
     _load_strategies(run, state_dir / STRATEGIES)
-    _load_rng_state(state_dir, run.processes.rank)
+    _load_rng_state(state_dir, run.processes.rank, (config.seed, run.processes.rank, run.loop.n))
     with _reading(state_dir / OBSERVERS) as path:
         return to_arrays(torch.load(path))
 
@@ -226,12 +232,16 @@ def _merge(states: list[dict[str, Any]]) -> dict[str, Any]:
     return {kind: {name: s for state in states for name, s in state[kind].items()} for kind in ("numpy", "torch")}
 
 
-def _load_rng_state(folder: Path, rank: int) -> None:
+def _load_rng_state(folder: Path, rank: int, entropy: tuple[int, ...]) -> None:
+    """Go on with the process's own random numbers; one that was not there yet begins with those of `entropy`."""
     path = folder / PROCESS_RNG.format(rank=rank)
-    if path.exists():
+    if rank == 0:
+        load_rng_state(folder)
+    elif path.exists():
         deserialize_rng_state(unflatten_dict(load_file(path)))
     else:
-        load_rng_state(folder)
+        # Those of the first process would be drawn twice.
+        set_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
 
 
 def _warn_of_other_count(folder: Path, processes: Processes) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import random
 import re
 import signal
 import subprocess
@@ -138,6 +139,29 @@ def test_a_run_of_two_processes_goes_on_in_one(tmp_path, caplog):
     expected, weights = train(Processes(), settings(tmp_path / "one", 32))
     assert loop == expected
     assert policy == pytest.approx(weights, rel=1e-3, abs=1e-5)
+
+
+def first_draws(processes, cfg):
+    """What Python's, NumPy's and PyTorch's own generators give after the run's checkpoint was loaded."""
+    mine = processes.share_of(cfg.num_envs)
+    trainer = Trainer(cfg, WanderingEnv(mine.stop - mine.start, mine.start), DummyEnv, ScriptedPolicy(),
+                      *identity_processors(), processes)  # fmt: skip
+    set_seed(cfg.seed)
+    trainer.load()
+    return random.random(), float(np.random.random()), float(torch.rand(1))
+
+
+def test_a_process_that_joins_a_resumed_run_has_random_numbers_of_its_own(tmp_path):
+    """The same ones each time; the first process goes on with the run's."""
+    train(Processes(), settings(tmp_path / "run", 32, steps=2 * STEPS_PER_UPDATE))
+    resumed = settings(tmp_path / "run", 16, resume=(tmp_path / "run/checkpoints/last").resolve())
+    alone = first_draws(Processes(), resumed)
+    first, second = together(first_draws, resumed)
+    assert first == alone
+    assert all(one != other for one, other in zip(first, second, strict=True))
+    assert together(first_draws, resumed) == [first, second]
+    joins = int(np.random.SeedSequence([5, 1, 2 * STEPS_PER_UPDATE]).generate_state(1)[0])
+    assert second[0] == random.Random(joins).random()
 
 
 class SignallingEnv(WanderingEnv):
