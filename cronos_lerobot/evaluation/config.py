@@ -120,6 +120,7 @@ class CronosEvalConfig:
             raise ValueError(f"seed must be at least 0, got {self.seed}")
         self._check_comparison()
         self._check_repetitions()
+        self._check_chains()
         given = {flag.split("=")[0] for flag in parser.get_cli_overrides("env") or []}
         for name, other in (("suite", "eval.suites"), ("split", "eval.splits"), ("task", "eval.orderings")):
             if f"--{name}" in given:
@@ -136,6 +137,9 @@ class CronosEvalConfig:
         most = self._most_configurations()
         if self.eval.n_episodes is not None and self.eval.n_episodes > most:
             raise ValueError(f"eval.n_episodes must be 1 to {most}, got {self.eval.n_episodes}")
+        most = self._most_orderings()
+        if self.eval.orderings is not None and self.eval.orderings > most:
+            raise ValueError(f"eval.orderings must be 1 to {most}, got {self.eval.orderings}")
         if self.output_dir is None:
             name = "expert" if self.policy is None else self.policy.type
             name += "" if self.stop_at_error is None else "_compared"
@@ -161,6 +165,20 @@ class CronosEvalConfig:
             raise ValueError(f"eval.repetitions={repetitions} would all be alike with {why}")
         if repetitions > 1 and self.stop_at_error is not None:
             raise ValueError("--stop_at_error looks at every episode once: leave --eval.repetitions out")
+
+    def _check_chains(self) -> None:
+        """Refuse what says how chains are evaluated where there are none."""
+        if "sequential" in self.suites:
+            return
+        for name, value, default in (
+            ("eval.orderings", self.eval.orderings, None),
+            ("advance", self.advance, CronosEvalConfig.advance),
+            ("end_effector_reset", self.end_effector_reset, CronosEvalConfig.end_effector_reset),
+        ):
+            if value != default:
+                raise ValueError(
+                    f"--{name}={value} is of the sequential suite; --eval.suites={self.eval.suites} leaves it out"
+                )
 
     def _load_policy(self) -> None:
         path = parser.get_path_arg("policy")
@@ -222,9 +240,12 @@ class CronosEvalConfig:
     @property
     def num_orderings(self) -> int:
         """Orderings of the sequential suite."""
-        benchmark = self.benchmark()
-        most = max(len(benchmark.groups("sequential", split)) for split in self.splits)
+        most = self._most_orderings()
         return min(most, self.eval.orderings or (QUICK_ORDERINGS if self.quick else most))
+
+    def _most_orderings(self) -> int:
+        benchmark = self.benchmark()
+        return max(len(benchmark.groups("sequential", split)) for split in self.splits)
 
     def make_parts(self) -> list[Part]:
         """All that is to be run."""

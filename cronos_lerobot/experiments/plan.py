@@ -233,7 +233,9 @@ def eval_command(
         f"--torch_threads={options.threads}",
         f"--output_dir={folder}",
     ]
-    return [*command, "--eval.n_episodes=1", "--eval.orderings=1"] if options.scale.smoke else command
+    if not options.scale.smoke:
+        return command
+    return [*command, "--eval.n_episodes=1", *(["--eval.orderings=1"] if suite == "sequential" else [])]
 
 
 def _eval_job(

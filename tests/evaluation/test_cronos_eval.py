@@ -231,6 +231,16 @@ def test_observations_and_scene_follow_from_the_policy(tmp_path, monkeypatch):
         (("--expert=true", "--eval.suites=independent,chains"), "independent,chains"),
         (("--expert=true", "--eval.splits=test"), "held_out.*'test'"),
         (("--expert=true", "--eval.n_episodes=65"), "1 to 64, got 65"),
+        (("--expert=true", "--eval.orderings=50"), "eval.orderings must be 1 to 10, got 50"),
+        (
+            ("--expert=true", "--eval.suites=independent", "--eval.orderings=3"),
+            "--eval.orderings=3 is of the sequential suite; --eval.suites=independent leaves it out",
+        ),
+        (("--expert=true", "--eval.suites=independent", "--advance=on_success"), "--advance=on_success is of"),
+        (
+            ("--expert=true", "--eval.suites=independent", "--end_effector_reset=true"),
+            "--end_effector_reset=True is of the sequential suite",
+        ),
         (("--expert=true", "--eval.batch_size=0"), "batch_size must be at least 1, got 0"),
         (("--expert=true", "--seed=-1"), "seed must be at least 0"),
         (("--expert=true", "--env.scene=garage"), "garage.*kitchen_2x2"),
