@@ -52,7 +52,7 @@ def make_table(experiments: list[dict[str, Any]]) -> str:
         found = [one for one in experiments if one["experiment"] == name]
         for one in found:
             cells = _experiment(one)
-            for claim in map(_claim, one["orders"]) if one["orders"] else [(MISSING,) * 4]:
+            for claim in _claims(one["orders"]):
                 lines.append(f"| {' | '.join((*cells, *claim))} |")
                 cells = ("",) * len(cells)
         if not found:
@@ -71,10 +71,20 @@ def _experiment(one: dict[str, Any]) -> tuple[str, ...]:
 
 def _not_run(experiment: Experiment) -> tuple[str, ...]:
     """How many sentences of the paper an experiment would tell of."""
-    number = len(paper_results()["orders"].get(experiment.name, ()))
-    said = f"{number} sentence{'s' * (number > 1)}" if number else MISSING
+    said = _sentences(len(paper_results()["orders"].get(experiment.name, ())))
     rows = f"0 of {len(experiment.rows)}"
     return f"{experiment.name}, {experiment.scene}", rows, *(MISSING,) * 3, said, *(MISSING,) * 2, NOT_RUN
+
+
+def _claims(orders: list[dict[str, Any]]) -> list[tuple[str, ...]]:
+    """A line each, or one for all if none of them has its two rows."""
+    if all(order["holds"] == NOT_RUN for order in orders):
+        return [(_sentences(len(orders)), MISSING, MISSING, NOT_RUN if orders else MISSING)]
+    return [_claim(order) for order in orders]
+
+
+def _sentences(number: int) -> str:
+    return f"{number} sentence{'s' * (number > 1)}" if number else MISSING
 
 
 def _claim(order: dict[str, Any]) -> tuple[str, ...]:

@@ -94,10 +94,12 @@ def test_pages_are_drawn_anew_by_the_commands_beside_the_archives():
     papers, command = re.fullmatch(r"  for paper in (.*); do\n(.*)\n", loop, re.DOTALL).groups()
     lines = [command.replace("$paper", name) for name in papers.split()] + rest.replace("\\\n", " ").splitlines()
     commands = [line.split() for line in lines if line.strip()]
-    pages = {page.stem: page for page in (Path(__file__).parents[2] / "docs/results").glob("*_state/*.json")}
+    results = Path(__file__).parents[2] / "docs/results"
     assert [command[1] for command in commands] == [
         "table1",
         *(f"figure{number}" for number in (2, 3, 4, 5, 7, 8, 11, 12, 13, 14)),
+        "table1",
+        "table1",
         "few_resets",
         "few_resets_kitchen_3x3",
         "few_resets_playroom_2x2",
@@ -106,7 +108,10 @@ def test_pages_are_drawn_anew_by_the_commands_beside_the_archives():
     ]
     for command in commands:
         rows = command[command.index("--rows") + 1 :] if "--rows" in command else names(command[1])
-        assert rows == [row["row"] for row in json.loads(pages[command[1]].read_text())["rows"]]
+        scale = next(word.removeprefix("--scale=") for word in command if word.startswith("--scale="))
+        seen = "pixels" if "--obs_type=pixels" in command else "state"
+        page = results / f"{command[1]}_{scale}_{seen}" / f"{command[1]}.json"
+        assert rows == [row["row"] for row in json.loads(page.read_text())["rows"]]
 
 
 def names(experiment):

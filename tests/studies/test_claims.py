@@ -44,3 +44,15 @@ def test_the_table_by_hand(tmp_path):
 def test_the_page_is_what_the_files_say():
     page = (ROOT / CLAIMS.page).read_text()
     assert CLAIMS.rewrite(page, make_table(read_experiments(ROOT / RESULTS))) == page
+
+
+def test_nothing_found_is_one_line_and_what_says_nothing_has_its_reason(tmp_path):
+    missing = {"where": "Section 6.1", "suite": "independent"} | NOT_RUN
+    reason = {"holds": "not applicable", "not_applicable": "the base policy does 0.992 from the start"}
+    for name, orders in (("a", [missing, missing]), ("b", [missing, ORDER | reason])):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "table1.json").write_text(json.dumps(FOUND | {"orders": orders}))
+    lines = [line.split(" | ")[-4:] for line in make_table(read_experiments(tmp_path)).splitlines()[2:5]]
+    assert lines[0] == ["2 sentences", "–", "–", "not run |"]
+    assert lines[1][-1] == "not run |"
+    assert lines[2][-1] == "not applicable: the base policy does 0.992 from the start |"
