@@ -52,6 +52,11 @@ class StartConfig:
             raise ValueError(
                 f"start.num_configurations must be 1 to {NUM_CONFIGURATIONS}, got {self.num_configurations}"
             )
+        if self.layouts != "train" and self.num_configurations != NUM_CONFIGURATIONS:
+            raise ValueError(
+                f"start.num_configurations={self.num_configurations} is of start.layouts=train, got"
+                f" start.layouts={self.layouts}, which draws others without end"
+            )
         if self.earlier_tasks < 1:
             raise ValueError(f"start.earlier_tasks must be at least 1, got {self.earlier_tasks}")
         if self.earlier_tasks > 1 and not self.is_after_another:

@@ -82,6 +82,11 @@ class RecordDemosConfig(DemoConfig):
                     f"--env.{name}={getattr(self.env, name)} is of evaluations; demonstrations begin from training"
                     " configurations or random layouts, one task each"
                 )
+        if self.env.task is not None and self.reset_tasks:
+            raise ValueError(
+                f"--reset_tasks=true demonstrates other tasks than --env.task={self.env.task}, the only one to"
+                " demonstrate: leave one of them out"
+            )
         for name, value, least in (
             ("dataset.num_episodes", self.dataset.num_episodes, 1),
             ("num_envs", self.num_envs, 1),

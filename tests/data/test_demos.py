@@ -278,6 +278,10 @@ def test_one_task_only(env, tmp_path):
         (lambda: StartConfig(arm_pose="up"), "unknown start.arm_pose 'up'; valid: \\['home'"),
         (lambda: StartConfig(layouts="held_out"), "unknown start.layouts 'held_out'"),
         (lambda: StartConfig(leaning_share=1.5), "start.leaning_share must be between 0 and 1, got 1.5"),
+        (
+            lambda: StartConfig(layouts="reach", num_configurations=1),
+            "start.num_configurations=1 is of start.layouts=train, got start.layouts=reach",
+        ),
         (lambda: NoiseConfig(share=2), "noise.share"),
         (lambda: MissConfig(min_offset_m=0.1), "misses.min_offset_m"),
         (lambda: RecordDemosConfig(), "--dataset.repo_id is required"),

@@ -136,6 +136,10 @@ def test_a_filtered_dataset_says_where_its_segments_come_from(tmp_path):
         (["--dataset.num_episodes=-3"], "error: --dataset.num_episodes must be at least 1, got -3"),
         (["--env.scene=garage"], "error: unknown scene 'garage'; "),
         (["--env.split=held_out"], "error: --env.split=held_out is of evaluations; "),
+        (
+            ["--env.task=put the ketchup bottle on the cloth", "--reset_tasks=true"],
+            "error: --reset_tasks=true demonstrates other tasks than --env.task=put the ketchup bottle",
+        ),
         (["--resume=true"], "error: no LeRobotDataset to resume in "),
     ],
 )
