@@ -49,14 +49,12 @@ class Point:
 def summarise_points(points: Sequence[Point]) -> Summary | None:
     """Success over the seeds, a point for each; None of none.
 
-    One alone has the interval of its evaluation. Student's of two or three can be wider than a rate can be: it
-    ends at 0 and 1.
+    One alone has the interval of its evaluation.
     """
     summary = summarise([point.success for point in points])
     if summary is None:
         return None
-    low, high = summary.ci95 or points[0].ci95
-    return replace(summary, ci95=(max(low, 0.0), min(high, 1.0)))
+    return replace(summary, ci95=summary.ci95 or points[0].ci95).within(0.0, 1.0)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ before it ends at the first of them, the part after it begins at the last.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite, nan, sqrt
 from typing import Any
 
@@ -123,6 +123,12 @@ class Summary:
     """95 % t-interval of the mean over the seeds; None for one seed."""
     n: int
     """Seeds."""
+
+    def within(self, low: float, high: float) -> Summary:
+        """The same with an interval that ends where the number does: that of two or three seeds can be wider."""
+        if self.ci95 is None:
+            return self
+        return replace(self, ci95=(max(self.ci95[0], low), min(self.ci95[1], high)))
 
     def __str__(self) -> str:
         return f"{self.mean:.3f}" if self.std is None else f"{self.mean:.3f} ± {self.std:.3f}"

@@ -54,9 +54,9 @@ class SeedRate(Rate):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % t-interval of the mean over the seeds; Wilson's of one alone."""
+        """95 % t-interval of the mean over the seeds, within 0 and 1; Wilson's of one alone."""
         summary = summarise([rate.value for rate in self.seeds])
-        return super().interval if summary is None or summary.ci95 is None else summary.ci95
+        return super().interval if summary is None else summary.within(0.0, 1.0).ci95 or super().interval
 
     def __add__(self, other: Rate) -> Rate:
         """Both sets of episodes together, seed by seed if they are of as many."""
@@ -88,7 +88,7 @@ class Gain:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Its 95 % interval: over the seeds where each has a before of its own, else `newcombe_interval`.
+        """Its 95 % interval, within -1 and 1: over the seeds where each has a before of its own, else Newcombe's.
 
         The second is of the interval over the seeds after, if there are several, and of the one before.
         """
@@ -96,8 +96,9 @@ class Gain:
         if len(before) == len(after) > 1:
             summary = summarise([new.value - old.value for old, new in zip(before, after, strict=True)])
             assert summary is not None
-            assert summary.ci95 is not None
-            return summary.ci95
+            ends = summary.within(-1.0, 1.0).ci95
+            assert ends is not None
+            return ends
         return newcombe_interval(self.before, self.after)
 
     def __str__(self) -> str:

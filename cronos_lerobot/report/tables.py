@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from cronos_lerobot.protocol.metrics import performance_gap, success_at, summarise
+from cronos_lerobot.protocol.metrics import Summary, performance_gap, success_at, summarise
 from cronos_lerobot.report.comparisons import Comparison
 from cronos_lerobot.report.runs import EvaluationRun, Group, TrainingRun, agent_metrics, evaluation_rates
 from cronos_lerobot.report.statistics import Gain, Rate
@@ -65,17 +65,18 @@ def seed_rows(groups: Iterable[Group]) -> list[Row]:
         ]
         row: Row = {"runs": group.label, "seeds": len(curves), "split": curves[0][-1]["split"]}
         row |= {"n": curves[0][-1]["n"], "interaction_steps": end}
-        row |= _summary_columns("success", [success_at(x, y, end) for x, y in zip(steps, success, strict=True)])
+        rate = summarise([success_at(x, y, end) for x, y in zip(steps, success, strict=True)])
+        row |= _summary_columns("success", rate and rate.within(0.0, 1.0))
         last = [curve[-1] for curve in curves]
         row |= {name: sum(e.get(name, 0) for e in last) for name in APART}
-        row |= _summary_columns("interventions", at_end)
-        row |= _summary_columns("D / steps", by_steps) | _summary_columns("C / interventions", by_resets)
+        row |= _summary_columns("interventions", summarise(at_end))
+        row |= _summary_columns("D / steps", summarise(by_steps))
+        row |= _summary_columns("C / interventions", summarise(by_resets))
         rows.append(row)
     return rows
 
 
-def _summary_columns(name: str, values: list[float]) -> Row:
-    summary = summarise(values)
+def _summary_columns(name: str, summary: Summary | None) -> Row:
     if summary is None:
         return {name: None, f"{name} std": None, f"{name} ci95_low": None, f"{name} ci95_high": None}
     low, high = summary.ci95 or (None, None)

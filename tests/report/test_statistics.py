@@ -1,0 +1,36 @@
+"""Intervals of rates and gains are those of the books, and end where rates and gains do."""
+
+import pytest
+
+from cronos_lerobot.report.statistics import Gain, Rate, SeedRate, newcombe_interval
+
+
+def test_newcombe_interval_of_the_paper():
+    """Newcombe 1998, Table II, example (a), method 10: 56/70 against 48/80."""
+    low, high = newcombe_interval(before=Rate(48, 80), after=Rate(56, 70))
+    assert (round(low, 4), round(high, 4)) == (0.0524, 0.3339)
+
+
+def test_newcombe_interval_at_the_edge():
+    """0/10 against 10/10 ends at 1 and stays clear of 0."""
+    low, high = newcombe_interval(before=Rate(0, 10), after=Rate(10, 10))
+    # Wilson of 10/10 is [10 / (10 + 1.96^2), 1] = [0.7225, 1], so 1 - sqrt(2) * 0.2775.
+    assert (round(low, 3), high) == (0.608, 1.0)
+
+
+def test_gain_of_nothing_covers_zero():
+    gain = Gain(Rate(30, 64), Rate(30, 64))
+    assert gain.value == 0
+    assert gain.interval[0] < 0 < gain.interval[1]
+    assert gain.interval[0] == pytest.approx(-gain.interval[1])
+
+
+def test_intervals_over_seeds_end_where_rates_and_gains_do():
+    """t with two degrees of freedom is 4.3027."""
+    # Mean .9, standard deviation .1: .9 +- 4.3027 * .1 / sqrt(3) = .9 +- .2484.
+    after = SeedRate.of([Rate(8, 10), Rate(9, 10), Rate(10, 10)])
+    assert after.interval == (pytest.approx(0.6516, abs=1e-4), 1.0)
+    # Gains .7, .8 and .9, as far apart: .8 +- .2484.
+    before = SeedRate.of([Rate(1, 10)] * 3)
+    assert Gain(before, after).interval == (pytest.approx(0.5516, abs=1e-4), 1.0)
+    assert Gain(after, before).interval == (-1.0, pytest.approx(-0.5516, abs=1e-4))
