@@ -24,10 +24,10 @@ class Comparison:
 
 
 def compare_training(groups: list[Group]) -> list[Comparison]:
-    """First and last periodic evaluation of every group, its seeds together."""
+    """First and last periodic evaluation of every group, its seeds together, where they were made alike."""
     comparisons = []
     for group in groups:
-        runs = [run for run in group.runs if len(run.evaluations) > 1]
+        runs = [run for run in group.runs if len(run.alike) > 1 and run.begins_alike]
         if not runs:
             continue
         first, last = (

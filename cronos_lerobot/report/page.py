@@ -66,7 +66,7 @@ class Report:
     suites: list[SuiteRun] = field(default_factory=list)
     """Those of `cronos-eval`."""
     left_out: list[str] = field(default_factory=list)
-    """What could not be read, a sentence for each."""
+    """What could not be read or is not shown, a sentence for each."""
 
     @property
     def comparisons(self) -> list[Comparison]:

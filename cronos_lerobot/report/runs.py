@@ -78,6 +78,39 @@ class TrainingRun:
         """The latest record, for its counters."""
         return max([*self.updates, *self.evaluations], key=lambda record: record["interaction_steps"])
 
+    @property
+    def alike(self) -> list[Evaluation]:
+        """The evaluations that were made as the last one: a resumed run may have had other `--eval.*` before."""
+        return [one for one in self.evaluations if _made(one) == _made(self.evaluations[-1])]
+
+    @property
+    def begins_alike(self) -> bool:
+        """Whether the first evaluation was made as the last one: else there is no success before the training."""
+        return self.alike[:1] == self.evaluations[:1]
+
+    @property
+    def left_out(self) -> str | None:
+        """Which evaluations are not among those `alike`, and why, in words; None if all are."""
+        others = [one for one in self.evaluations if _made(one) != _made(self.evaluations[-1])]
+        if not others:
+            return None
+        settings = dict.fromkeys(_describe_made(one) for one in others)
+        text = (
+            f"{len(others)} of {len(self.evaluations)} evaluations of {self.folder}: they are of"
+            f" {' and of '.join(settings)}, the last one is of {_describe_made(self.evaluations[-1])}"
+        )
+        return text if self.begins_alike else f"{text}; what is left has no before, D or C"
+
+
+def _made(evaluation: Evaluation) -> tuple[Any, ...]:
+    """What evaluations of one curve have in common; runs have not always noted the temperature."""
+    return evaluation["split"], evaluation.get("temperature"), evaluation["n"]
+
+
+def _describe_made(evaluation: Evaluation) -> str:
+    split, temperature, n = _made(evaluation)
+    return f"{split}, n={n}" + (f", temperature {temperature}" if temperature is not None else "")
+
 
 @dataclass
 class EvaluationRun:
@@ -125,7 +158,8 @@ class FoundRuns:
     suites: list[SuiteRun]
     """Those of cronos-eval."""
     left_out: list[str]
-    """What could not be read, a sentence for each: crashed before its first record, damaged, of version 0."""
+    """What could not be read, a sentence for each: crashed before its first record, damaged, of version 0. And
+    the evaluations of runs that are not `alike`."""
 
 
 def find_runs(folders: Iterable[Path], scene: str = "kitchen_2x2") -> FoundRuns:
@@ -172,7 +206,8 @@ def find_runs(folders: Iterable[Path], scene: str = "kitchen_2x2") -> FoundRuns:
     if left_out and not (training or evaluation or suites):
         raise ValueError("; ".join(left_out.values()))
     evaluations = [run for runs in evaluation.values() for run in runs]
-    return FoundRuns(list(training.values()), evaluations, read_suite_runs(suites), list(left_out.values()))
+    said = [*left_out.values(), *(run.left_out for run in training.values() if run.left_out)]
+    return FoundRuns(list(training.values()), evaluations, read_suite_runs(suites), said)
 
 
 def files_called(folder: Path, name: str) -> Iterator[Path]:

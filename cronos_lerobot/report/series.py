@@ -30,14 +30,17 @@ class Curve:
 
 
 def evaluation_curve(group: Group, axis: str) -> Curve | None:
-    """Success of the periodic evaluations against `axis`: `interaction_steps` or `interventions`."""
-    runs = [run for run in group.runs if run.evaluations]
-    curves = [([e[axis] for e in run.evaluations], [e["success"] for e in run.evaluations], run) for run in runs]
+    """Success of the periodic evaluations against `axis`, `interaction_steps` or `interventions`.
+
+    Of each run those made as its last one.
+    """
+    runs = [run.alike for run in group.runs if run.evaluations]
+    curves = [([e[axis] for e in run], [e["success"] for e in run]) for run in runs]
     if len(runs) == 1:
-        x, y, run = curves[0]
-        ends = np.array([e["ci95"] for e in run.evaluations])
+        x, y = curves[0]
+        ends = np.array([e["ci95"] for e in runs[0]])
         return Curve(np.array(x), np.array(y), ends[:, 0], ends[:, 1], is_band_over_seeds=False)
-    return mean_curve([(x, y) for x, y, _ in curves]) if curves else None
+    return mean_curve(curves) if curves else None
 
 
 def update_curve(group: Group, value: Callable[[Record], float | None]) -> Curve | None:

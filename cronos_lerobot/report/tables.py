@@ -47,11 +47,13 @@ def _gain_columns(gain: Gain) -> Row:
 def seed_rows(groups: Iterable[Group]) -> list[Row]:
     """What the seeds of each group came to, up to the last step that all of them have reached.
 
-    Success, interventions, and the areas D and C divided by the lengths of their axes.
+    Success, interventions, and the areas D and C divided by the lengths of their axes, of evaluations made alike:
+    without areas where those do not begin with the run.
     """
     rows = []
     for group in groups:
-        curves = [run.evaluations for run in group.runs if len(run.evaluations) > 1]
+        runs = [run for run in group.runs if len(run.alike) > 1]
+        curves = [run.alike for run in runs]
         if not curves:
             continue
         end = min(curve[-1]["interaction_steps"] for curve in curves)
@@ -70,8 +72,9 @@ def seed_rows(groups: Iterable[Group]) -> list[Row]:
         last = [curve[-1] for curve in curves]
         row |= {name: sum(e.get(name, 0) for e in last) for name in APART}
         row |= _summary_columns("interventions", summarise(at_end))
-        row |= _summary_columns("D / steps", summarise(by_steps))
-        row |= _summary_columns("C / interventions", summarise(by_resets))
+        are_whole = all(run.begins_alike for run in runs)
+        row |= _summary_columns("D / steps", summarise(by_steps) if are_whole else None)
+        row |= _summary_columns("C / interventions", summarise(by_resets) if are_whole else None)
         rows.append(row)
     return rows
 
@@ -99,6 +102,7 @@ def evaluation_rows(groups: Iterable[Group]) -> list[Row]:
         for run in group.runs:
             for evaluation in run.evaluations:
                 counters = {name: evaluation[name] for name in ("interaction_steps", "interventions", "split")}
+                counters["temperature"] = evaluation.get("temperature")
                 rates = evaluation_rates(evaluation)
                 overall = Rate(round(evaluation["success"] * evaluation["n"]), evaluation["n"])
                 for task, rate in {ALL: overall, **rates}.items():
