@@ -10,11 +10,14 @@ from typing import Any
 
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+from lerobot.datasets.utils import INFO_PATH
+from lerobot.utils.constants import HF_LEROBOT_HOME, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from lerobot_env_cronos import CronosEnvConfig
 from lerobot_env_cronos.scene.model import CAMERAS
 from lerobot_env_cronos.scene.scenes import SCENES
 from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS
+
+from cronos_lerobot.data.origin import read_origin
 
 Features = Mapping[str, PolicyFeature]
 
@@ -35,12 +38,33 @@ def observations_of(features: Features) -> dict[str, Any]:
 
 
 def trained_scene(path: Path | None) -> dict[str, str]:
-    """The scene that a checkpoint of `cronos-train` was trained in."""
+    """The scene that a checkpoint was trained in: by `cronos-train`, or by LeRobot on a dataset of a scene.
+
+    Empty if it does not say, or if its dataset is not on this machine.
+
+    Raises:
+        ValueError: its config is damaged.
+    """
     file = Path(path or "") / TRAIN_CONFIG_NAME
     if not file.is_file():
         return {}
-    scene = (json.loads(file.read_text()).get("env") or {}).get("scene")
+    config = json.loads(file.read_text())
+    scene = config["env"].get("scene") if config.get("env") else None
+    dataset = config.get("dataset") or {}
+    if scene is None and isinstance(repo_id := dataset.get("repo_id"), str):
+        scene = scene_of_dataset(repo_id, dataset.get("root"))
     return {"scene": scene} if scene in SCENES else {}
+
+
+def scene_of_dataset(repo_id: str, root: Path | str | None) -> str | None:
+    """The scene of a dataset on this machine, in `root` or LeRobot's cache; None if there is none that says it."""
+    folder = Path(root or HF_LEROBOT_HOME / repo_id)
+    try:
+        features = json.loads((folder / INFO_PATH).read_text())["features"]
+        return read_origin(folder, features, f"dataset {repo_id}").scene
+    except (OSError, ValueError, KeyError):
+        # Not here, of another version, or not of these scenes at all.
+        return None
 
 
 def check_observations(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:

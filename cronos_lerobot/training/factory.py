@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,10 @@ from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, SequentialVecto
 from lerobot_env_cronos.hub_config import is_of_this_package
 from safetensors import SafetensorError
 
+from cronos_lerobot.agents.imitation.config import DemosConfig
 from cronos_lerobot.agents.steering.steered import STEERING
 from cronos_lerobot.agents.weights import wrap
-from cronos_lerobot.evaluation.policy_env import check_task_observation
+from cronos_lerobot.evaluation.policy_env import check_task_observation, scene_of_dataset, trained_scene
 from cronos_lerobot.training.config import CronosTrainConfig
 
 
@@ -76,12 +78,15 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
     """Return the config's policy on its device, its preprocessor and its postprocessor.
 
     Raises:
-        ValueError: the policy was made for other observations or actions, or its files are damaged.
+        ValueError: the policy was made for other observations or actions, or its files are damaged; or
+            demonstrations are of another scene.
     """
     policy_config, env_config = config.policy, _cronos(config)
     assert policy_config is not None
     check_task_observation(policy_config, env_config)
     check_features(policy_config, env_config)
+    if not config.resume:
+        check_demonstrations(config.algorithm, env_config.scene)
     path = policy_config.pretrained_path
     if not (path or getattr(policy_config, "checkpoint", None)):
         logging.warning("Training a policy from scratch: its states are not normalised, its success starts at 0.")
@@ -91,6 +96,7 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
             return policy, *make_pre_post_processors(policy_config)
         if not config.resume:
             warn_of_actor(policy_config, config.algorithm.type)
+            warn_of_other_scene(Path(path), env_config.scene)
         # Like lerobot-train: the checkpoint's processors, on the device of this run.
         device = {"device_processor": {"device": policy_config.device}}
         return policy, *make_pre_post_processors(policy_config, str(path), preprocessor_overrides=device)
@@ -114,6 +120,35 @@ def warn_of_actor(policy: PreTrainedConfig, algorithm: str) -> None:
         logging.warning(
             f"{path} has an actor that steers the policy ({STEERING}): --algorithm.type={algorithm} begins with "
             "the frozen policy, without that actor, which stays where it is and is in no checkpoint of this run."
+        )
+
+
+def warn_of_other_scene(checkpoint: Path, scene: str) -> None:
+    """Say so if a checkpoint in a folder was trained in another scene: what it reads may have the same sizes."""
+    trained = {}
+    # What is damaged here keeps no run from beginning.
+    with suppress(ValueError):
+        trained = trained_scene(checkpoint)
+    if trained.get("scene", scene) != scene:
+        logging.warning(
+            f"{checkpoint} was trained in --env.scene={trained['scene']}, this run is in --env.scene={scene}: the "
+            "policy does not know its objects."
+        )
+
+
+def check_demonstrations(algorithm: Any, scene: str) -> None:
+    """Check that an agent's demonstrations, where they are on this machine and say so, are of the run's scene.
+
+    Raises:
+        ValueError: they are of another one, whose columns may have the same sizes.
+    """
+    demos = getattr(algorithm, "demos", None)
+    if not isinstance(demos, DemosConfig) or demos.repo_id is None:
+        return
+    if (other := scene_of_dataset(demos.repo_id, demos.root)) not in (None, scene):
+        raise ValueError(
+            f"--algorithm.demos.repo_id={demos.repo_id} is of --env.scene={other}, this run is in "
+            f"--env.scene={scene}: record demonstrations there."
         )
 
 

@@ -1,0 +1,79 @@
+"""What was learned or demonstrated in another scene is told from the run's: its sizes may be the same."""
+
+import json
+import logging
+
+import pytest
+from lerobot.configs import PreTrainedConfig
+from lerobot_env_cronos import CronosEnvConfig
+from tiny_checkpoints import STATE, save_policy
+
+from cronos_lerobot.agents.imitation.config import DemosConfig, ImitationConfig
+from cronos_lerobot.agents.ppo.config import PPOConfig
+from cronos_lerobot.evaluation.policy_env import trained_scene
+from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig, record_demos
+from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.factory import (
+    check_demonstrations,
+    make_policy_and_processors,
+    warn_of_other_scene,
+)
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    """Demonstrations in the playroom."""
+    root = tmp_path_factory.mktemp("demos") / "playroom"
+    env = CronosEnvConfig(scene="playroom_2x2", obs_type="environment_state_agent_pos", num_threads=1)
+    record_demos(RecordDemosConfig(env=env, dataset=DemoDatasetConfig("me/demos", root, 1), num_envs=1))
+    return root
+
+
+def checkpoint(folder, **config):
+    (folder / "train_config.json").write_text(json.dumps(config))
+    return folder
+
+
+def test_the_scene_is_the_runs_or_that_of_the_cloned_demonstrations(demos, tmp_path):
+    dataset = {"repo_id": "me/demos", "root": str(demos)}
+    assert trained_scene(checkpoint(tmp_path, env=None, dataset=dataset)) == {"scene": "playroom_2x2"}
+    env = {"type": "cronos", "scene": "kitchen_3x3"}
+    assert trained_scene(checkpoint(tmp_path, env=env, dataset=dataset)) == {"scene": "kitchen_3x3"}
+    assert trained_scene(checkpoint(tmp_path, env=None, dataset=dataset | {"root": str(tmp_path)})) == {}
+    assert trained_scene(checkpoint(tmp_path, env=None, dataset=None)) == {}
+    assert trained_scene(tmp_path / "none") == {}
+
+
+def test_a_policy_of_another_scene_is_told(tmp_path, caplog):
+    folder = checkpoint(tmp_path, env={"scene": "playroom_2x2"})
+    with caplog.at_level(logging.WARNING):
+        warn_of_other_scene(folder, "playroom_2x2")
+        warn_of_other_scene(tmp_path / "none", "kitchen_2x2")
+        assert not caplog.records
+        warn_of_other_scene(folder, "kitchen_2x2")
+    (record,) = caplog.records
+    assert "was trained in --env.scene=playroom_2x2, this run is in --env.scene=kitchen_2x2" in record.message
+
+
+def test_demonstrations_of_another_scene_are_refused(demos, tmp_path):
+    config = ImitationConfig(demos=DemosConfig("me/demos", demos), demos_share=0.5)
+    with pytest.raises(ValueError, match=r"me/demos is of --env\.scene=playroom_2x2, .* --env\.scene=kitchen_2x2"):
+        check_demonstrations(config, "kitchen_2x2")
+    check_demonstrations(config, "playroom_2x2")
+    check_demonstrations(PPOConfig(), "kitchen_2x2")
+    # One that is not here yet comes from the Hub.
+    config = ImitationConfig(demos=DemosConfig("me/demos", tmp_path / "none"), demos_share=0.5)
+    check_demonstrations(config, "kitchen_2x2")
+
+
+def test_a_run_looks_at_both(demos, tmp_path, caplog):
+    policy_config = PreTrainedConfig.from_pretrained(
+        save_policy(tmp_path, "pocketvla", STATE, hidden_width=16, hidden_depth=1)
+    )
+    policy_config.pretrained_path = checkpoint(tmp_path, env={"scene": "playroom_2x2"})
+    config = CronosTrainConfig(CronosEnvConfig(**STATE), policy_config)
+    make_policy_and_processors(config)
+    assert "was trained in --env.scene=playroom_2x2" in caplog.text
+    config.algorithm = ImitationConfig(demos=DemosConfig("me/demos", demos), demos_share=0.5)
+    with pytest.raises(ValueError, match="record demonstrations there"):
+        make_policy_and_processors(config)
