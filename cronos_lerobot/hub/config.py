@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -12,10 +11,6 @@ from huggingface_hub.errors import HFValidationError
 from huggingface_hub.utils import validate_repo_id
 
 from cronos_lerobot.hub.push import Target
-from cronos_lerobot.locks import FolderInUseError, FolderLock
-
-READ_ONLY = (errno.EACCES, errno.EPERM, errno.EROFS)
-"""Errors of a folder that this process may only read."""
 
 
 def check_name(flag: str, name: str) -> None:
@@ -124,27 +119,6 @@ class StreamConfig(PublishConfig):
     """Folder of the dataset: --record.root of cronos-train, by default <run>/streams."""
     run: Path | None = None
     """Folder of the training run, for the card; by default the one that the dataset lies in, if it does."""
-
-    def __post_init__(self) -> None:
-        self._lock: FolderLock | None = None
-
-    def hold(self) -> None:
-        """Keep writers out of the dataset while this config is there: a push reads its files to the very end.
-
-        Raises:
-            FolderInUseError: it is still being recorded.
-        """
-        if self.root is None or self._lock is not None:
-            return
-        try:
-            self._lock = FolderLock(self.root).acquire()
-        except FolderInUseError as error:
-            why = f"{self.root} is still being recorded, publish it afterwards"
-            raise FolderInUseError(f"{why}: {error}") from error
-        except OSError as error:
-            # A dataset that is shared may be published by who cannot make a lock beside it.
-            if error.errno not in READ_ONLY:
-                raise
 
 
 @dataclass

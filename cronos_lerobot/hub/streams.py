@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +19,14 @@ from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.hub.cards import render_card
 from cronos_lerobot.hub.config import StreamConfig
 from cronos_lerobot.hub.runs import read_run, run_facts
+from cronos_lerobot.locks import FolderInUseError, FolderLock
 from cronos_lerobot.training.logging import MANIFEST, METRICS
 
 FOLDERS = ("data", "meta", "videos")
 """Of a LeRobotDataset; others, such as pictures that wait to be encoded, stay here."""
 REPLACES = [f"{folder}/*" for folder in FOLDERS]
+READ_ONLY = (errno.EACCES, errno.EPERM, errno.EROFS)
+"""Errors of a folder that this process may only read."""
 
 
 def read_info(config: StreamConfig) -> dict[str, Any]:
@@ -46,19 +52,38 @@ def read_codebase_version(config: StreamConfig) -> str:
     return read_info(config)["codebase_version"]
 
 
-def write_stream_repository(config: StreamConfig, folder: Path) -> str:
-    """Write the tree of a dataset's repository into `folder`; returns what it is, in words.
+@contextmanager
+def not_being_recorded(root: Path) -> Generator[None]:
+    """Keep writers out of a dataset while its files are checked and pushed.
 
-    A dry run copies the files; a push, whose tree is gone afterwards, links them: the config holds the dataset.
+    One that may only be read, as a shared one, is not locked.
 
     Raises:
         FolderInUseError: it is still being recorded.
+    """
+    lock = FolderLock(root)
+    try:
+        lock.acquire()
+    except FolderInUseError as error:
+        raise FolderInUseError(f"{root} is still being recorded, publish it afterwards: {error}") from error
+    except OSError as error:
+        if error.errno not in READ_ONLY:
+            raise
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def write_stream_repository(config: StreamConfig, folder: Path) -> str:
+    """Write the tree of a dataset's repository into `folder`; returns what it is, in words.
+
+    A dry run copies the files; a push, whose tree is gone afterwards, links them.
+
+    Raises:
         ValueError: --root is missing, the dataset is empty or not ours, or a file of it is damaged.
         FileNotFoundError: there is no dataset, or --run is no run.
     """
-    # Before the lock, which would make the folder around a --root that is not there.
-    read_info(config)
-    config.hold()
     info = read_info(config)
     assert config.root is not None
     origin = check_dataset(config.root)

@@ -56,11 +56,19 @@ def publish_benchmark(config: BenchmarkConfig) -> None:
 def publish_stream(config: StreamConfig) -> None:
     """`cronos-publish stream`."""
     config.validate()
-    from cronos_lerobot.hub.streams import REPLACES, read_codebase_version, write_stream_repository
+    from cronos_lerobot.hub.streams import (
+        REPLACES,
+        not_being_recorded,
+        read_codebase_version,
+        write_stream_repository,
+    )
 
     # LeRobot reads a dataset at its version's tag unless it is told a revision: that is not for a branch.
-    tag = read_codebase_version(config) if config.branch is None else None
-    _publish(config, write_stream_repository, replaces=REPLACES, tag=tag)
+    version = read_codebase_version(config)
+    tag = version if config.branch is None else None
+    assert config.root is not None
+    with not_being_recorded(config.root):
+        _publish(config, write_stream_repository, replaces=REPLACES, tag=tag)
 
 
 def publish_policy(config: PolicyConfig) -> None:

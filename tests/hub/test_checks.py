@@ -18,7 +18,7 @@ from cronos_lerobot.data.writer import SegmentWriter
 from cronos_lerobot.hub.config import PolicyConfig, PublishConfig, StreamConfig
 from cronos_lerobot.hub.policy import write_policy_repository
 from cronos_lerobot.hub.results import check_policy
-from cronos_lerobot.hub.streams import write_stream_repository
+from cronos_lerobot.hub.streams import not_being_recorded, write_stream_repository
 from cronos_lerobot.locks import FolderInUseError, FolderLock
 from cronos_lerobot.scripts.publish import main
 from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig, record_demos
@@ -55,27 +55,29 @@ def test_what_is_still_being_recorded_is_not_published_nor_gone_on_with_meanwhil
     monkeypatch.setattr(sys, "argv", ["cronos-publish", "stream", *flags])
     with pytest.raises(SystemExit, match=rf"^error: {copy} is still being recorded, publish it afterwards: .*\.$"):
         main()
-    assert not list((tmp_path / "out").iterdir())
+    assert not (tmp_path / "out").exists()
     writer.finalize()
-    config = StreamConfig(repo_id="me/d", root=copy)
-    (tmp_path / "tree").mkdir()
-    write_stream_repository(config, tmp_path / "tree")
-    # A push still reads what the tree links to.
-    with pytest.raises(FolderInUseError, match="is being written by process"):
-        SegmentWriter.resume("me/demos", copy)
-    del config
+
+    def write_meanwhile(config, folder):
+        with pytest.raises(FolderInUseError, match="is being written by process"):
+            SegmentWriter.resume("me/demos", copy)
+        return "a dataset"
+
+    monkeypatch.setattr("cronos_lerobot.hub.streams.write_stream_repository", write_meanwhile)
+    main()
     SegmentWriter.resume("me/demos", copy).finalize()
 
 
-def test_a_dataset_that_may_only_be_read_is_published(copy, tmp_path, monkeypatch):
+def test_a_dataset_that_may_only_be_read_is_published(copy, monkeypatch):
     def read_only(self):
         raise OSError(errno.EROFS, "Read-only file system", str(self.path))
 
     monkeypatch.setattr(FolderLock, "acquire", read_only)
-    assert "kitchen_2x2" in publish(copy, tmp_path / "out")
-    monkeypatch.setattr("cronos_lerobot.hub.config.READ_ONLY", ())
-    with pytest.raises(OSError, match="Read-only"):
-        publish(copy, tmp_path / "again")
+    with not_being_recorded(copy):
+        pass
+    monkeypatch.setattr("cronos_lerobot.hub.streams.READ_ONLY", ())
+    with pytest.raises(OSError, match="Read-only"), not_being_recorded(copy):
+        pass
 
 
 def only(root, pattern):
