@@ -22,6 +22,7 @@ ROWS = {
     "t80_decay_wide": "episodic, with smaller and smaller updates",
     "t1280_eer_wide": "a reset every 1280 steps",
     "t1280_eer_cl_hsr_wide": "the paper's best: curriculum, lost bodies put back",
+    "t1280_eer_cl_hsr_decay_wide": "the paper's best, with smaller and smaller updates",
     "t4400_eer_staggered_early_decay_wide": "few resets: most of them early, each stream at a time of its own,"
     " smaller and smaller updates",
     "t80_decay_wide_resets": "episodic, from a base that was shown reset tasks as well, in more demonstrations",
