@@ -49,7 +49,7 @@ def trained_scene(path: Path | None) -> dict[str, str]:
     if not file.is_file():
         return {}
     config = json.loads(file.read_text())
-    scene = config["env"].get("scene") if config.get("env") else None
+    scene = (config.get("env") or {}).get("scene")
     dataset = config.get("dataset") or {}
     if scene is None and isinstance(repo_id := dataset.get("repo_id"), str):
         scene = scene_of_dataset(repo_id, dataset.get("root"))

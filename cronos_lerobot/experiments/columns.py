@@ -142,7 +142,7 @@ def order_columns(orders: Sequence[Order]) -> Columns:
         "difference": [f"{one.found.difference.value:+.3f}{one.unit}" if one.found else MISSING for one in orders],
         "95 %": [_signed_interval(one.difference.ci95) if one else MISSING for one in found],
         "of": [_of(one) if one else MISSING for one in found],
-        "holds": [one.holds + (f": {one.reason}" if one.holds == NOT_APPLICABLE else "") for one in orders],
+        "holds": [one.holds + f": {one.reason}" * bool(one.reason) for one in orders],
     }
 
 

@@ -36,8 +36,8 @@ def describe(job: Job, what: str) -> str:
         return f"{job.name}: FAILED, the end of {job.log}:\n{log_tail(job)}"
     if what == CHANGED:
         return (
-            f"{job.name}: NOT REUSED, {job.output} was made by another command or version. Delete it, choose"
-            f" another --root, or go back to what made it. What differs:\n    " + "\n    ".join(changes(job))
+            f"{job.name}: NOT REUSED, {job.output} is not known to be this command's, in this version. Delete it,"
+            f" choose another --root, or go back to what made it. Why:\n    " + "\n    ".join(changes(job))
         )
     if what == BLOCKED:
         return f"{job.name}: blocked, it needs a job that is not done"

@@ -46,12 +46,12 @@ class Order:
         """`yes` and `no` where p < .05; of rows alike, where their interval is within `MARGIN`, or beyond it.
 
         Rows that are said to do alike and differ, nobody knows whether by more than the margin, are `undecided`.
-        Those whose base policies leave nothing to learn are `not applicable`.
+        Those whose base policies leave nothing to learn are `not applicable`, whatever is found.
         """
-        if self.found is None:
-            return NOT_RUN
         if self.reason:
             return NOT_APPLICABLE
+        if self.found is None:
+            return NOT_RUN
         value, p, ends = self.found.difference.value, self.found.difference.p, self.found.difference.ci95
         separated = p is not None and p < ALPHA
         if self.says == "alike":

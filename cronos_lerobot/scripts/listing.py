@@ -35,9 +35,7 @@ def print_plan(jobs: list[Job]) -> None:
             print(f"# {job.name}: done ({job.output}){commits}")
             continue
         if found := changes(job):
-            print(
-                f"# {job.name}: NOT REUSED, made by another command or version ({job.output}): {'; '.join(found)}"
-            )
+            print(f"# {job.name}: NOT REUSED ({job.output}): {'; '.join(found)}")
             continue
         if status(job) == RUNNING:
             print(f"# {job.name}: is being run by another process")

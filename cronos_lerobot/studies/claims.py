@@ -90,14 +90,14 @@ def _sentences(number: int) -> str:
 def _claim(order: dict[str, Any]) -> tuple[str, ...]:
     said = f"{order['row']} {WORDS[order['says']]} {order['reference']} ({order['where']})"
     suite = f"{order['suite']}, {order['split'].replace('_', '-')}"
-    if order.get("difference") is None:
-        return said, suite, MISSING, order["holds"]
-    found = f"{order['difference']:+.3f}{order['unit']}"
-    if order["ci95_low"] is not None:
-        found += f" [{order['ci95_low']:+.3f}, {order['ci95_high']:+.3f}]"
     # Files of before there was a reason have none.
     reason = order.get("not_applicable")
     holds = order["holds"] + (f": {reason}" if reason else "")
+    if order.get("difference") is None:
+        return said, suite, MISSING, holds
+    found = f"{order['difference']:+.3f}{order['unit']}"
+    if order["ci95_low"] is not None:
+        found += f" [{order['ci95_low']:+.3f}, {order['ci95_high']:+.3f}]"
     return said, suite, found + ", these policies" * (not order["of_trainings"]), holds
 
 
