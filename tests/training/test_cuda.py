@@ -1,0 +1,140 @@
+"""`cronos-train`, `cronos-eval` and `accelerate launch` with policies on a GPU; skipped where there is none."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+from forked_commands import run_forked
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot_env_cronos import CronosEnvConfig
+from safetensors.torch import load_file
+from test_adapters import DIFFUSION, FLAGS, SMOLVLA, VLA_FLAGS
+from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
+from test_flow_head import TINY, TRAIN
+from test_pi0_commands import PIXELS, SIZES
+from test_steering_commands import STEERED
+from test_trainer import metrics, weights
+from tiny_checkpoints import save_policy
+from tiny_pi0 import save_tiny_tokenizer, tiny_gemma, tokenizer_from, use_tokenizer
+from tiny_smolvla import pretend_num2words, save_tiny_smolvlm
+
+from cronos_lerobot.scripts import eval as cronos_eval
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch finds no CUDA GPU")
+
+FLOW = ("--policy.type=pocketvla", "--policy.head=flow", *TINY, *TRAIN)
+
+
+def smolvla(folder):
+    """An untrained small one, as a checkpoint."""
+    pretend_num2words()
+    save_tiny_smolvlm(folder / "vlm")
+    return save_policy(folder / "clone", "smolvla", PIXELS, vlm_model_name=str(folder / "vlm"), **SMOLVLA)
+
+
+def pi0(folder):
+    """An untrained small one, as a checkpoint."""
+    save_tiny_tokenizer(folder / "tokenizer")
+    with tiny_gemma(), tokenizer_from(folder / "tokenizer"):
+        clone = save_policy(folder / "clone", "pi0", PIXELS, **SIZES)
+    use_tokenizer(clone, folder / "tokenizer")
+    return clone
+
+
+KINDS = {
+    "pocketvla from the state": (None, (*SMALL, *OBSERVATIONS["state"]), 32),
+    "pocketvla from pixels": (None, (*SMALL, *OBSERVATIONS["pixels"]), 32),
+    "its flow head": (None, (*FLOW, *OBSERVATIONS["state"]), 40),
+    "act": (None, FLAGS, 160),
+    "diffusion": (None, (*DIFFUSION, "--policy.noise_scheduler_type=DDIM"), 160),
+    "smolvla": (smolvla, (*VLA_FLAGS, "--algorithm.critic_observation=environment_state"), 40),
+    "smolvla with lora": (smolvla, (*VLA_FLAGS, "--peft.r=2"), 40),
+    "smolvla steered": (smolvla, STEERED, 40),
+    "pi0": (pi0, VLA_FLAGS, 40),
+}
+"""What makes the checkpoint, flags on a CPU, and the steps of two updates or more, of which half end at a save."""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_trains_saves_resumes_and_is_evaluated(kind, tmp_path, monkeypatch):
+    """Counters and draws of a resumed run are the unbroken one's; floats may differ by atomic additions."""
+    make, flags, steps = KINDS[kind]
+    flags = [flag.replace("device=cpu", "device=cuda") for flag in flags if not flag.startswith("--save_freq")]
+    if make is not None:
+        flags.append(f"--policy.path={make(tmp_path)}")
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    with tiny_gemma():
+        for folder, until in ((whole, steps), (broken, steps // 2)):
+            cronos_train(
+                monkeypatch, *flags, f"--save_freq={steps // 2}", f"--steps={until}", f"--output_dir={folder}"
+            )
+        last = broken / "checkpoints/last/pretrained_model"
+        cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", f"--steps={steps}")
+    counted = ("kind", "interaction_steps", "interventions", "interventions_by_kind", "updates", "segments")
+    runs = [[{name: line.get(name) for name in counted} for line in metrics(run)] for run in (whole, broken)]
+    assert runs[0] == runs[1]
+    assert runs[0]
+    files = [run / "checkpoints/last/pretrained_model" for run in (whole, broken)]
+    name = "adapter_model.safetensors" if "lora" in kind else "model.safetensors"
+    first, second = (load_file(folder / name) for folder in files)
+    for tensor in first:
+        torch.testing.assert_close(first[tensor], second[tensor], rtol=1e-2, atol=1e-3, msg=tensor)
+    with tiny_gemma():
+        monkeypatch.setattr(sys, "argv", [
+            "cronos-eval", f"--policy.path={files[0]}", "--policy.device=cuda", "--eval.n_episodes=1",
+            "--eval.videos=0", "--eval.suites=independent", "--eval.splits=train", "--eval.repetitions=1",
+            f"--output_dir={tmp_path / 'evaluation'}",
+            *(flag for flag in flags if flag.startswith("--env.task_observation")),
+        ])  # fmt: skip
+        cronos_eval.main()
+
+
+@pytest.mark.parametrize("observation", OBSERVATIONS)
+def test_it_acts_as_on_a_cpu(observation, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    cronos_train(monkeypatch, *SMALL, *OBSERVATIONS[observation], "--steps=16", f"--output_dir={run}")
+    folder = run / "checkpoints/last/pretrained_model"
+    values = []
+    for device in ("cpu", "cuda"):
+        config = PreTrainedConfig.from_pretrained(folder)
+        config.pretrained_path, config.device, config.dtype = folder, device, "float32"
+        env_config = CronosEnvConfig(observation_height=64, observation_width=64)
+        if observation == "state":
+            env_config = CronosEnvConfig(obs_type="environment_state_agent_pos")
+        policy = make_policy(config, env_cfg=env_config).eval()
+        preprocessor, _ = make_pre_post_processors(
+            config, str(folder), preprocessor_overrides={"device_processor": {"device": device}}
+        )
+        rng = np.random.default_rng(0)
+        batch = {
+            name: torch.from_numpy(rng.random((4, *feature.shape), dtype=np.float32))
+            for name, feature in config.input_features.items()
+        }
+        batch = preprocessor(batch | {"task": ["put the ketchup bottle on the cloth"] * 4})
+        with torch.no_grad():
+            drawn = policy.sample_actions(batch, temperature=0)
+        assert drawn["actions"].device.type == device
+        values.append((drawn["actions"].cpu(), drawn["log_prob"].cpu(), drawn["value"].cpu()))
+    for one, other in zip(*values, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3)
+
+
+def test_accelerate_launch(tmp_path):
+    """One process, for one GPU: gradients go through NCCL where there are more."""
+    run = tmp_path / "run"
+    flags = [flag.replace("device=cpu", "device=cuda") for flag in (*SMALL, *OBSERVATIONS["state"])]
+    code = "from cronos_lerobot.scripts.train import main; main()"
+    script = tmp_path / "train.py"
+    script.write_text(code)
+    launch = [
+        sys.executable, "-m", "accelerate.commands.launch", "--num_processes=1", "--num_machines=1",
+        "--mixed_precision=no", "--dynamo_backend=no", script, *flags, f"--output_dir={run}",
+    ]  # fmt: skip
+    done = run_forked(launch)
+    assert done.returncode == 0, done.stderr[-3000:]
+    manifest = json.loads((run / "manifest.json").read_text())
+    assert manifest["starts"][0]["config"]["policy"]["device"] == "cuda"
+    assert weights(run)
