@@ -28,7 +28,7 @@ from zipfile import BadZipFile
 import numpy as np
 import torch
 from lerobot.common.train_utils import get_step_identifier, load_training_num_processes, save_training_step
-from lerobot.optim import load_optimizer_state, save_optimizer_state
+from lerobot.optim import load_optimizer_state, load_optimizer_state_dict, save_optimizer_state
 from lerobot.utils.constants import (
     CHECKPOINTS_DIR,
     LAST_CHECKPOINT_LINK,
@@ -46,6 +46,7 @@ from lerobot.utils.random_utils import (
 from lerobot.utils.utils import flatten_dict, unflatten_dict
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from torch.optim import Optimizer
 
 from cronos_lerobot.agents.base import LearningAgent
 from cronos_lerobot.agents.state import to_arrays, to_tensors
@@ -145,18 +146,21 @@ def load_checkpoint(run: RunState, config: CronosTrainConfig, folder: Path) -> d
         NotADirectoryError: `folder` is no checkpoint of a run.
         ValueError: `config` has what a resumed run refuses, or a file is damaged; it is named.
     """
-    check_resumed(config, folder)
+    saved = check_resumed(config, folder)
     state_dir = folder / TRAINING_STATE_DIR
     with _reading(state_dir / LOOP) as path:
         state = json.loads(path.read_text())
     _warn_of_other_count(folder, run.processes)
+    is_elsewhere = _is_of_other_device(saved["config"], config, run.processes)
     with _reading(weights_file(run.agent.policy, folder / PRETRAINED_MODEL_DIR)) as path:
         load_weights(run.agent.policy, path.parent)
     if run.agent.optimizer is not None:
         with _reading(state_dir / OPTIMIZER_STATE):
-            load_optimizer_state(run.agent.optimizer, state_dir)
+            (_load_optimizer_of_other_device if is_elsewhere else load_optimizer_state)(
+                run.agent.optimizer, state_dir
+            )
     run.loop.__dict__.update(vars(LoopState.from_state_dict(state["loop"])))
-    run.generators.load_state_dict(state["generators"])
+    run.generators.load_state_dict(state["generators"], run.loop.n)
     with _reading(state_dir / ENV_STATE) as path, np.load(path) as arrays:
         run.env.set_state(dict(arrays))
     run.agent.load_state_dict(_load_agent(state_dir / AGENT))
@@ -252,6 +256,33 @@ def _warn_of_other_count(folder: Path, processes: Processes) -> None:
             "they were, but with other random numbers, and an optimizer step now takes algorithm.minibatch_size * "
             f"algorithm.grad_accumulation transitions of {processes.count} processes."
         )
+
+
+def _is_of_other_device(saved: dict[str, Any], config: CronosTrainConfig, processes: Processes) -> bool:
+    """Whether the policy was on another kind of device; says what that means."""
+    was, now = (saved["policy"] or {}).get("device"), getattr(config.policy, "device", None)
+    if not was or not now or torch.device(was).type == torch.device(now).type:
+        return False
+    if processes.is_main:
+        logging.warning(
+            f"The checkpoint is of a run on {was}, which goes on on {now}: with other random numbers and another "
+            "rounding, so that it will not be what it would have been there."
+        )
+    return True
+
+
+def _load_optimizer_of_other_device(optimizer: Optimizer | dict[str, Optimizer], folder: Path) -> None:
+    """As LeRobot's `load_optimizer_state`, but how its steps are computed stays what it is on this device."""
+    if isinstance(optimizer, dict):
+        for name, part in optimizer.items():
+            _load_optimizer_of_other_device(part, folder / name)
+        return
+    saved = load_optimizer_state_dict(folder)
+    for group, own in zip(saved["param_groups"], optimizer.param_groups, strict=True):
+        group |= {name: own[name] for name in ("fused", "foreach", "capturable") if name in own}
+        group |= {name: tuple(value) for name, value in group.items() if isinstance(own.get(name), tuple)}
+    saved["state"] = {int(index): state for index, state in saved["state"].items()}
+    optimizer.load_state_dict(saved)
 
 
 def _remove_partial(folder: Path) -> None:

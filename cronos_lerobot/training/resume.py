@@ -32,7 +32,7 @@ _TABLE = {
         "observation_width camera_name renderer render_size task suite split advance end_effector_reset fps "
         "max_parallel_tasks disable_env_checker features features_map",
     },
-    "policy.": {FOLLOWED: "push_to_hub repo_id private tags license", REFUSED: "path *"},
+    "policy.": {FOLLOWED: "device push_to_hub repo_id private tags license", REFUSED: "path *"},
     "protocol.": {
         FOLLOWED: "update_interval scene_reset_interval curriculum end_effector_reset heuristic_reset "
         "extra_resets reset_budget reset_phase scene_reset critic.* task_order num_configurations "

@@ -44,14 +44,28 @@ class NamedGenerators:
             "torch": {name: rng.get_state().tolist() for name, rng in self._torch.items()},
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue every generator made so far where `state` has it; one that it does not know begins anew."""
+    def load_state_dict(self, state: dict[str, Any], step: int = 0) -> None:
+        """Continue every generator made so far where `state` has it; one that it does not know begins anew.
+
+        Those of torch that another kind of device drew with cannot be continued: they begin with numbers that
+        belong to `step`, so that what was drawn before does not come again.
+
+        Args:
+            state: of `state_dict`.
+            step: that the run goes on from.
+        """
         for name, rng in self._numpy.items():
             if name in state["numpy"]:
                 rng.bit_generator.state = state["numpy"][name]
         for name, generator in self._torch.items():
-            if name in state["torch"]:
-                generator.set_state(torch.tensor(state["torch"][name], dtype=torch.uint8))
+            if name not in state["torch"]:
+                continue
+            saved = torch.tensor(state["torch"][name], dtype=torch.uint8)
+            # Each kind of device has a state of its own length.
+            if len(saved) == len(generator.get_state()):
+                generator.set_state(saved)
+            else:
+                generator.manual_seed(int(self._sequence(name, step).generate_state(1, np.uint64)[0] >> 1))
 
-    def _sequence(self, name: str) -> np.random.SeedSequence:
-        return np.random.SeedSequence([self.seed, zlib.crc32(name.encode())])
+    def _sequence(self, name: str, *entropy: int) -> np.random.SeedSequence:
+        return np.random.SeedSequence([self.seed, zlib.crc32(name.encode()), *entropy])

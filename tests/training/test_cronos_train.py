@@ -39,6 +39,10 @@ def weights(folder):
     return load_file(folder / "checkpoints/last/pretrained_model/model.safetensors")
 
 
+def optimizer_state(checkpoint):
+    return load_file(checkpoint / "training_state/optimizer_state.safetensors")
+
+
 STOPPED = """
 import os, signal, sys, threading, time
 from pathlib import Path
@@ -84,6 +88,44 @@ def test_a_run_that_is_told_to_stop_saves_and_resumes(observation, tmp_path, mon
     # Not given, PyTorch's own number of threads is on record, and a resumed run takes it from there.
     starts = json.loads((broken / "manifest.json").read_text())["starts"]
     assert [start["config"]["torch_threads"] for start in starts] == [torch.get_num_threads()] * 2
+
+
+@pytest.mark.parametrize("device", [(), ("--policy.device=cpu",)])
+def test_a_run_of_a_gpu_goes_on_on_a_cpu(device, tmp_path, monkeypatch, capsys):
+    """Its generators of torch have a state that none of a CPU has: 16 bytes. Everything else is where it was."""
+    flags = [flag for flag in SMALL if not flag.startswith("--steps")]
+    run = tmp_path / "run"
+    cronos_train(monkeypatch, *flags, *OBSERVATIONS["state"], "--steps=16", f"--output_dir={run}")
+    last = run / "checkpoints/last"
+    loop = json.loads((last / "training_state/loop.json").read_text())
+    assert loop["generators"]["torch"]
+    loop["generators"]["torch"] = {name: [1] * 16 for name in loop["generators"]["torch"]}
+    (last / "training_state/loop.json").write_text(json.dumps(loop))
+    for name in ("training_state/run.json", "pretrained_model/train_config.json"):
+        text = (last / name).read_text()
+        (last / name).write_text(text.replace('"device": "cpu"', '"device": "cuda"'))
+        assert text.count('"device": "cpu"') == 1
+    # PyTorch's choice on a GPU.
+    groups = (last / "training_state/optimizer_param_groups.json").read_text()
+    assert groups.count('"fused": true') == 2
+    (last / "training_state/optimizer_param_groups.json").write_text(
+        groups.replace('"fused": true', '"fused": null')
+    )
+    if torch.cuda.is_available() and not device:
+        pytest.skip("it would go on on the GPU")
+    before, taken = weights(run), optimizer_state(last)
+    resumed = ("--resume=true", f"--config_path={last}/pretrained_model/train_config.json", *device)
+    cronos_train(monkeypatch, *resumed, "--steps=32")
+    printed = "".join(capsys.readouterr())
+    assert "The checkpoint is of a run on cuda, which goes on on cpu" in printed
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert [line["interaction_steps"] for line in lines if line["kind"] == "update"] == [16, 32]
+    assert any(not torch.equal(tensor, before[name]) for name, tensor in weights(run).items())
+    # The moments went on, and its steps are computed as on a CPU.
+    done = {name: int(value) for name, value in optimizer_state(last).items() if name.endswith("/step")}
+    assert done
+    assert all(steps > taken[name] > 0 for name, steps in done.items())
+    assert (last / "training_state/optimizer_param_groups.json").read_text().count('"fused": true') == 2
 
 
 def test_checkpoint_is_a_lerobot_policy(tmp_path, monkeypatch):

@@ -19,6 +19,7 @@ from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.training import resume
 from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
 from cronos_lerobot.training.logging import MetricsFile
+from cronos_lerobot.training.seeding import NamedGenerators
 
 DOCS = Path(__file__).parents[2] / "docs/training.md"
 
@@ -82,6 +83,31 @@ def test_what_is_refused_is_named_with_both_values(tmp_path):
     for message, options in REFUSALS.items():
         with pytest.raises(ValueError, match=message):
             make_trainer(resumed(tmp_path / "run", **options)).load()
+
+
+def test_generators_of_another_device_begin_with_numbers_of_the_step():
+    """A generator of CUDA has a state of 16 bytes, one of the CPU 5,056."""
+
+    def draws(state, step):
+        generators = NamedGenerators(5)
+        generator, rng = generators.for_torch("actions"), generators.for_numpy("tasks")
+        if state is not None:
+            generators.load_state_dict(state, step)
+        return torch.rand(3, generator=generator).tolist(), rng.random(3).tolist()
+
+    first, saved = draws(None, 0), NamedGenerators(5)
+    saved.for_numpy("tasks").random(3)
+    torch.rand(3, generator=saved.for_torch("actions"))
+    same = saved.state_dict()
+    other = same | {"torch": {"actions": [0] * 16}}
+    went_on = draws(same, 40)
+    assert draws(same, 80) == went_on
+    assert went_on[0] != first[0]
+    # NumPy's go on, whatever the device.
+    assert draws(other, 40)[1] == went_on[1] != first[1]
+    assert draws(other, 40) == draws(other, 40)
+    different = [draws(other, 40)[0], draws(other, 80)[0], went_on[0], first[0]]
+    assert len(set(map(tuple, different))) == 4
 
 
 def test_a_run_of_another_version_is_refused(tmp_path):
