@@ -185,7 +185,8 @@ class RowResult:
             places = [point.interventions for point in curve]
             before, after = [x for x in places if x < interventions], [x for x in places if x > interventions]
             gaps += [(max(before), min(after))] if before and after else []
-        return AtBudget(summarise(values), max(gaps, key=lambda gap: gap[1] - gap[0], default=None))
+        summary = summarise(values)
+        return AtBudget(summary and summary.within(0.0, 1.0), max(gaps, key=lambda gap: gap[1] - gap[0], default=None))
 
     def apart(self, split: str) -> dict[str, int]:
         """Of all finished seeds' successes at the end, those found complete and those never grasped."""
