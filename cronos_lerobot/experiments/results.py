@@ -186,7 +186,9 @@ class RowResult:
             before, after = [x for x in places if x < interventions], [x for x in places if x > interventions]
             gaps += [(max(before), min(after))] if before and after else []
         summary = summarise(values)
-        return AtBudget(summary and summary.within(0.0, 1.0), max(gaps, key=lambda gap: gap[1] - gap[0], default=None))
+        return AtBudget(
+            summary and summary.within(0.0, 1.0), max(gaps, key=lambda gap: gap[1] - gap[0], default=None)
+        )
 
     def apart(self, split: str) -> dict[str, int]:
         """Of all finished seeds' successes at the end, those found complete and those never grasped."""

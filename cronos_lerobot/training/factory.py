@@ -9,10 +9,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from huggingface_hub import file_exists
+from huggingface_hub import file_exists, hf_hub_download
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from huggingface_hub.errors import HfHubHTTPError
 from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import ACTION
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, SequentialVectorEnv, get_scene
@@ -96,7 +97,7 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
             return policy, *make_pre_post_processors(policy_config)
         if not config.resume:
             warn_of_actor(policy_config, config.algorithm.type)
-            warn_of_other_scene(Path(path), env_config.scene)
+            warn_of_other_scene(policy_config, env_config.scene)
         # Like lerobot-train: the checkpoint's processors, on the device of this run.
         device = {"device_processor": {"device": policy_config.device}}
         return policy, *make_pre_post_processors(policy_config, str(path), preprocessor_overrides=device)
@@ -123,16 +124,24 @@ def warn_of_actor(policy: PreTrainedConfig, algorithm: str) -> None:
         )
 
 
-def warn_of_other_scene(checkpoint: Path, scene: str) -> None:
-    """Say so if a checkpoint in a folder was trained in another scene: what it reads may have the same sizes."""
-    trained = {}
-    # What is damaged here keeps no run from beginning.
-    with suppress(ValueError):
-        trained = trained_scene(checkpoint)
+def warn_of_other_scene(policy: PreTrainedConfig, scene: str) -> None:
+    """Say so if a checkpoint was trained in another scene: what it reads may have the same sizes.
+
+    Args:
+        policy: whose `pretrained_path` is a folder or of the Hub.
+        scene: of the run.
+    """
+    folder, trained = Path(policy.pretrained_path or ""), {}
+    # What is damaged, or not there, keeps no run from beginning.
+    with suppress(ValueError, OSError, HfHubHTTPError):
+        if not folder.is_dir():
+            revision = getattr(policy, "pretrained_revision", None)
+            folder = Path(hf_hub_download(str(folder), TRAIN_CONFIG_NAME, revision=revision)).parent
+        trained = trained_scene(folder)
     if trained.get("scene", scene) != scene:
         logging.warning(
-            f"{checkpoint} was trained in --env.scene={trained['scene']}, this run is in --env.scene={scene}: the "
-            "policy does not know its objects."
+            f"{policy.pretrained_path} was trained in --env.scene={trained['scene']}, this run is in --env.scene="
+            f"{scene}: the policy does not know its objects."
         )
 
 

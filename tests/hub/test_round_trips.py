@@ -112,6 +112,21 @@ def test_lerobot_eval_runs_the_benchmark_from_the_hub(bench, policy, commands, t
     assert info["overall"]["n_episodes"] == 2
 
 
+def test_a_policy_of_the_hub_that_was_trained_in_another_scene_is_told(policy, commands):
+    code = """
+from types import SimpleNamespace
+from cronos_lerobot.training.factory import warn_of_other_scene
+for path in ("me/policy", "me/nobody"):
+    for scene in ("playroom_2x2", "kitchen_2x2"):
+        print("run in", scene)
+        warn_of_other_scene(SimpleNamespace(pretrained_path=path, pretrained_revision=None), scene)
+"""
+    commands.forget()
+    output = commands.run("python", code)
+    told = "me/policy was trained in --env.scene=playroom_2x2, this run is in --env.scene=kitchen_2x2"
+    assert output.count("was trained in") == output.count(told) == 1
+
+
 def test_lerobot_eval_runs_the_repositorys_own_code(bench, policy, commands, tmp_path):
     hub_env = ("--env.type=cronos_hub", "--env.hub_path=me/bench")
     flags = (
