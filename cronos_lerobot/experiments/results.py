@@ -349,7 +349,7 @@ def sequential(row: RowResult, split: str, orderings: str = "all") -> dict[str, 
         name: sum(position.get(name, 0) for result in found for position in result["positions"]) for name in APART
     }
     return apart | {
-        "positions": [summarise(column) for column in rates.T],
+        "positions": [summary and summary.within(0.0, 1.0) for summary in map(summarise, rates.T)],
         "chain_length": summarise(lengths),
         "n": found[0]["n"],
         "seeds": len(found),

@@ -61,9 +61,8 @@ def _main_row(result: ExperimentResult, row: RowResult, shared: float | None) ->
     paper = paper_results()["final_success"].get(result.experiment.name, {}).get(setting.name)
     cells |= {"paper_mean": paper[0] if paper else None, "paper_std": paper[1] if paper else None}
     starts = [seed.curve("train")[0] for seed in row.finished if seed.curve("train")]
-    cells |= _numbers(
-        "base_success", summarise([point.success for point in starts if not point.interaction_steps])
-    )
+    base = summarise([point.success for point in starts if not point.interaction_steps])
+    cells |= _numbers("base_success", base and base.within(0.0, 1.0))
     cells |= _numbers("interventions", summarise([seed.run.last["interventions"] for seed in row.finished]))
     cells |= _numbers("D", summarise([gap.area for gap in row.gaps(INTERACTION_STEPS)]))
     cells |= _numbers("D_normalised", row.gap(INTERACTION_STEPS))

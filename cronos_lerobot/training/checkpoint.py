@@ -165,7 +165,7 @@ def load_checkpoint(run: RunState, config: CronosTrainConfig, folder: Path) -> d
         run.env.set_state(dict(arrays))
     run.agent.load_state_dict(_load_agent(state_dir / AGENT))
     _load_strategies(run, state_dir / STRATEGIES)
-    _load_rng_state(state_dir, run.processes.rank, (config.seed, run.processes.rank, run.loop.n))
+    _load_rng_state(state_dir, run.processes.rank, (config.seed, run.processes.rank, run.loop.n), is_elsewhere)
     with _reading(state_dir / OBSERVERS) as path:
         return to_arrays(torch.load(path))
 
@@ -236,12 +236,15 @@ def _merge(states: list[dict[str, Any]]) -> dict[str, Any]:
     return {kind: {name: s for state in states for name, s in state[kind].items()} for kind in ("numpy", "torch")}
 
 
-def _load_rng_state(folder: Path, rank: int, entropy: tuple[int, ...]) -> None:
-    """Go on with the process's own random numbers; one that was not there yet begins with those of `entropy`."""
+def _load_rng_state(folder: Path, rank: int, entropy: tuple[int, ...], is_elsewhere: bool) -> None:
+    """Go on with the process's own random numbers.
+
+    One that was not there yet, or not on this kind of device, begins with those of `entropy`.
+    """
     path = folder / PROCESS_RNG.format(rank=rank)
-    if rank == 0:
+    if rank == 0 and not is_elsewhere:
         load_rng_state(folder)
-    elif path.exists():
+    elif path.exists() and not is_elsewhere:
         deserialize_rng_state(unflatten_dict(load_file(path)))
     else:
         # Those of the first process would be drawn twice.
@@ -265,8 +268,8 @@ def _is_of_other_device(saved: dict[str, Any], config: CronosTrainConfig, proces
         return False
     if processes.is_main:
         logging.warning(
-            f"The checkpoint is of a run on {was}, which goes on on {now}: with other random numbers and another "
-            "rounding, so that it will not be what it would have been there."
+            f"This run began on {was} and goes on with {now}: other random numbers, another rounding and, of "
+            "pixels, other pictures. It will not be what it would have been there."
         )
     return True
 

@@ -9,9 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from httpx import HTTPError
 from huggingface_hub import file_exists, hf_hub_download
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
-from huggingface_hub.errors import HfHubHTTPError
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.policies import make_policy, make_pre_post_processors
@@ -115,7 +115,7 @@ def warn_of_actor(policy: PreTrainedConfig, algorithm: str) -> None:
     else:
         try:
             has_actor = file_exists(path, STEERING, revision=getattr(policy, "pretrained_revision", None))
-        except (OSError, HfHubHTTPError):
+        except (OSError, HTTPError):
             return
     if has_actor:
         logging.warning(
@@ -133,7 +133,7 @@ def warn_of_other_scene(policy: PreTrainedConfig, scene: str) -> None:
     """
     folder, trained = Path(policy.pretrained_path or ""), {}
     # What is damaged, or not there, keeps no run from beginning.
-    with suppress(ValueError, OSError, HfHubHTTPError):
+    with suppress(ValueError, OSError, HTTPError):
         if not folder.is_dir():
             revision = getattr(policy, "pretrained_revision", None)
             folder = Path(hf_hub_download(str(folder), TRAIN_CONFIG_NAME, revision=revision)).parent

@@ -119,3 +119,12 @@ def test_observations_are_mapped_once_and_may_stand_in_for_the_stored_ones(batch
     for minibatch in buffer.minibatches(5, np.random.default_rng(1), mapped):
         assert list(minibatch.observation) == ["negative"]
         np.testing.assert_array_equal(minibatch.observation["negative"], -np.array(expected)[minibatch.indices])
+
+
+def test_a_rollout_that_goes_on_in_another_format_is_refused():
+    """NumPy would write fractions into whole numbers without a word."""
+    buffer = filled(2)
+    images, sample = np.full((N, 2, 2, 3), 0.5, np.float32), Decision(*np.zeros((4, N, 7), np.float32))
+    columns = {"observation.images.front": images, "observation.state": np.zeros((N, 1), np.float32)}
+    with pytest.raises(ValueError, match=r"has observation\.images\.front as uint8, now it comes as float32"):
+        buffer.add(columns, ["task"] * N, sample, np.zeros(N), np.full(N, False), np.zeros(N))

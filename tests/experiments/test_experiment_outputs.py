@@ -62,7 +62,7 @@ def test_success_at_interventions_is_that_of_the_curve(options):
     rows = by_row(tables.main_rows(result))
     assert rows["t80"]["success_at_28_mean"] == pytest.approx(0.25 + 0.25 * 28 / 64)
     assert rows["t320_eer"]["success_at_28_mean"] == pytest.approx(0.75 + 0.25 * 12 / 16)
-    # Two seeds: Student's interval would go from -1.1 to 2.4.
+    # Two seeds: Student's interval would go from -0.8 to 2.4.
     make_run(options, "figure3", "t320_eer", 2, (2, 4, 6))
     two = by_row(tables.main_rows(results(options, "figure3")))["t320_eer"]
     assert (two["success_at_28_ci95_low"], two["success_at_28_ci95_high"]) == (0, 1)

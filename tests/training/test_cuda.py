@@ -21,6 +21,7 @@ from tiny_checkpoints import save_policy
 from tiny_pi0 import save_tiny_tokenizer, tiny_gemma, tokenizer_from, use_tokenizer
 from tiny_smolvla import pretend_num2words, save_tiny_smolvlm
 
+from cronos_lerobot.agents.steering.steered import STEERING
 from cronos_lerobot.scripts import eval as cronos_eval
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch finds no CUDA GPU")
@@ -58,9 +59,20 @@ KINDS = {
 """What makes the checkpoint, flags on a CPU, and the steps of two updates or more, of which half end at a save."""
 
 
+def steps_of(folder):
+    """Of the optimizers in a training state: how many steps each parameter has had."""
+    files = sorted(folder.rglob("optimizer_state.safetensors"))
+    return [
+        {name: int(value) for name, value in load_file(file).items() if name.endswith("/step")} for file in files
+    ]
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_trains_saves_resumes_and_is_evaluated(kind, tmp_path, monkeypatch):
-    """Counters and draws of a resumed run are the unbroken one's; floats may differ by atomic additions."""
+    """A resumed run has the unbroken one's counters, generators and optimizer steps.
+
+    Floats may differ by atomic additions.
+    """
     make, flags, steps = KINDS[kind]
     flags = [flag.replace("device=cpu", "device=cuda") for flag in flags if not flag.startswith("--save_freq")]
     if make is not None:
@@ -73,13 +85,21 @@ def test_it_trains_saves_resumes_and_is_evaluated(kind, tmp_path, monkeypatch):
             )
         last = broken / "checkpoints/last/pretrained_model"
         cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", f"--steps={steps}")
-    counted = ("kind", "interaction_steps", "interventions", "interventions_by_kind", "updates", "segments")
-    runs = [[{name: line.get(name) for name in counted} for line in metrics(run)] for run in (whole, broken)]
+    counted = ("kind", "interaction_steps", "interventions", "interventions_by_kind", "updates")
+    runs = [[{name: line[name] for name in counted} for line in metrics(run)] for run in (whole, broken)]
     assert runs[0] == runs[1]
     assert runs[0]
     files = [run / "checkpoints/last/pretrained_model" for run in (whole, broken)]
-    name = "adapter_model.safetensors" if "lora" in kind else "model.safetensors"
-    first, second = (load_file(folder / name) for folder in files)
+    states = [folder.with_name("training_state") for folder in files]
+    # That of a generator counts what it has drawn.
+    loops = [json.loads((state / "loop.json").read_text())["generators"] for state in states]
+    assert loops[0] == loops[1]
+    assert loops[0]["torch"]
+    steps_taken = [steps_of(state) for state in states]
+    assert steps_taken[0] == steps_taken[1]
+    assert steps_taken[0]
+    names = {"smolvla with lora": "adapter_model.safetensors", "smolvla steered": STEERING}
+    first, second = (load_file(folder / names.get(kind, "model.safetensors")) for folder in files)
     for tensor in first:
         torch.testing.assert_close(first[tensor], second[tensor], rtol=1e-2, atol=1e-3, msg=tensor)
     with tiny_gemma():
@@ -90,6 +110,22 @@ def test_it_trains_saves_resumes_and_is_evaluated(kind, tmp_path, monkeypatch):
             *(flag for flag in flags if flag.startswith("--env.task_observation")),
         ])  # fmt: skip
         cronos_eval.main()
+
+
+@pytest.mark.parametrize("observation", OBSERVATIONS)
+def test_a_run_goes_from_the_gpu_to_the_cpu_and_back(observation, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    flags = [flag.replace("device=cpu", "device=cuda") for flag in (*SMALL, *OBSERVATIONS[observation])]
+    cronos_train(monkeypatch, *flags, "--steps=16", f"--output_dir={run}")
+    seen = [weights(run)]
+    for device, until in (("cpu", 32), ("cuda", 48)):
+        last = run / "checkpoints/last/pretrained_model/train_config.json"
+        resume = ("--resume=true", f"--config_path={last}", f"--policy.device={device}")
+        cronos_train(monkeypatch, *resume, f"--steps={until}")
+        seen.append(weights(run))
+        assert all(torch.isfinite(tensor).all() for tensor in seen[-1].values())
+        assert any(not torch.equal(tensor, seen[-2][name]) for name, tensor in seen[-1].items())
+    assert [line["interaction_steps"] for line in metrics(run) if line["kind"] == "update"] == [16, 32, 48]
 
 
 @pytest.mark.parametrize("observation", OBSERVATIONS)

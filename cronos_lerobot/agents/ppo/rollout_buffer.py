@@ -145,6 +145,7 @@ class RolloutBuffer:
 
         Raises:
             RuntimeError: the buffer is full.
+            ValueError: a column has another type than in the rows before.
         """
         if self.rows == self.num_rows:
             raise RuntimeError(f"The rollout buffer is full: it holds {self.num_rows} rows; update and clear it.")
@@ -154,6 +155,12 @@ class RolloutBuffer:
         assert self.log_probs is not None
         row = self.rows
         for name, column in observation.items():
+            if column.dtype != (kept := self.observations[name].dtype):
+                raise ValueError(
+                    f"the rollout has {name} as {kept}, now it comes as {column.dtype}: the run was on another "
+                    "kind of device, where the policy computes in another format. Go on there, or from an "
+                    "earlier checkpoint."
+                )
             self.observations[name][row] = column
         self.instruction_ids[row] = [self._instruction_id(text) for text in instructions]
         self.traces[row] = decision.trace
