@@ -18,7 +18,7 @@ from cronos_lerobot.experiments.jobs import Job, known_changes, other_commits, r
 from cronos_lerobot.experiments.plan import base_evaluation_jobs, checkpoint_evaluations, train_job
 from cronos_lerobot.experiments.runner import DONE, FAILED
 from cronos_lerobot.experiments.specs import Options, RunSpec, base_folder, run_specs
-from cronos_lerobot.protocol.metrics import Gap, Summary, performance_gap, success_at, summarise
+from cronos_lerobot.protocol.metrics import Gap, Summary, performance_gap, success_at, summarise, summarise_rates
 from cronos_lerobot.report.runs import Group, TrainingRun, read_training_run
 from cronos_lerobot.training.logging import METRICS
 from cronos_lerobot.training.resume import flatten
@@ -185,10 +185,7 @@ class RowResult:
             places = [point.interventions for point in curve]
             before, after = [x for x in places if x < interventions], [x for x in places if x > interventions]
             gaps += [(max(before), min(after))] if before and after else []
-        summary = summarise(values)
-        return AtBudget(
-            summary and summary.within(0.0, 1.0), max(gaps, key=lambda gap: gap[1] - gap[0], default=None)
-        )
+        return AtBudget(summarise_rates(values), max(gaps, key=lambda gap: gap[1] - gap[0], default=None))
 
     def apart(self, split: str) -> dict[str, int]:
         """Of all finished seeds' successes at the end, those found complete and those never grasped."""
@@ -349,7 +346,7 @@ def sequential(row: RowResult, split: str, orderings: str = "all") -> dict[str, 
         name: sum(position.get(name, 0) for result in found for position in result["positions"]) for name in APART
     }
     return apart | {
-        "positions": [summary and summary.within(0.0, 1.0) for summary in map(summarise, rates.T)],
+        "positions": [summarise_rates(column) for column in rates.T],
         "chain_length": summarise(lengths),
         "n": found[0]["n"],
         "seeds": len(found),

@@ -134,6 +134,12 @@ class Summary:
         return f"{self.mean:.3f}" if self.std is None else f"{self.mean:.3f} ± {self.std:.3f}"
 
 
+def summarise_rates(values: Numbers) -> Summary | None:
+    """As `summarise`, of numbers between 0 and 1, where the interval ends, too."""
+    summary = summarise(values)
+    return summary and summary.within(0.0, 1.0)
+
+
 def summarise(values: Numbers) -> Summary | None:
     """Mean, standard deviation and t-interval over the seeds; None if a value is missing or none is there.
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from cronos_lerobot.protocol.metrics import Summary, performance_gap, success_at, summarise
+from cronos_lerobot.protocol.metrics import Summary, performance_gap, success_at, summarise, summarise_rates
 from cronos_lerobot.report.comparisons import Comparison
 from cronos_lerobot.report.runs import EvaluationRun, Group, TrainingRun, agent_metrics, evaluation_rates
 from cronos_lerobot.report.statistics import Gain, Rate
@@ -67,8 +67,8 @@ def seed_rows(groups: Iterable[Group]) -> list[Row]:
         ]
         row: Row = {"runs": group.label, "seeds": len(curves), "split": curves[0][-1]["split"]}
         row |= {"n": curves[0][-1]["n"], "interaction_steps": end}
-        rate = summarise([success_at(x, y, end) for x, y in zip(steps, success, strict=True)])
-        row |= _summary_columns("success", rate and rate.within(0.0, 1.0))
+        rates = [success_at(x, y, end) for x, y in zip(steps, success, strict=True)]
+        row |= _summary_columns("success", summarise_rates(rates))
         last = [curve[-1] for curve in curves]
         row |= {name: sum(e.get(name, 0) for e in last) for name in APART}
         row |= _summary_columns("interventions", summarise(at_end))

@@ -155,10 +155,9 @@ def load_checkpoint(run: RunState, config: CronosTrainConfig, folder: Path) -> d
     with _reading(weights_file(run.agent.policy, folder / PRETRAINED_MODEL_DIR)) as path:
         load_weights(run.agent.policy, path.parent)
     if run.agent.optimizer is not None:
+        load = _load_optimizer_of_other_device if is_elsewhere else load_optimizer_state
         with _reading(state_dir / OPTIMIZER_STATE):
-            (_load_optimizer_of_other_device if is_elsewhere else load_optimizer_state)(
-                run.agent.optimizer, state_dir
-            )
+            load(run.agent.optimizer, state_dir)
     run.loop.__dict__.update(vars(LoopState.from_state_dict(state["loop"])))
     run.generators.load_state_dict(state["generators"], run.loop.n)
     with _reading(state_dir / ENV_STATE) as path, np.load(path) as arrays:
@@ -242,13 +241,13 @@ def _load_rng_state(folder: Path, rank: int, entropy: tuple[int, ...], is_elsewh
     One that was not there yet, or not on this kind of device, begins with those of `entropy`.
     """
     path = folder / PROCESS_RNG.format(rank=rank)
-    if rank == 0 and not is_elsewhere:
-        load_rng_state(folder)
-    elif path.exists() and not is_elsewhere:
+    if is_elsewhere or (rank > 0 and not path.exists()):
+        # Those of the first process, or of the run's beginning, would be drawn twice.
+        set_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
+    elif rank > 0:
         deserialize_rng_state(unflatten_dict(load_file(path)))
     else:
-        # Those of the first process would be drawn twice.
-        set_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
+        load_rng_state(folder)
 
 
 def _warn_of_other_count(folder: Path, processes: Processes) -> None:
@@ -283,7 +282,6 @@ def _load_optimizer_of_other_device(optimizer: Optimizer | dict[str, Optimizer],
     saved = load_optimizer_state_dict(folder)
     for group, own in zip(saved["param_groups"], optimizer.param_groups, strict=True):
         group |= {name: own[name] for name in ("fused", "foreach", "capturable") if name in own}
-        group |= {name: tuple(value) for name, value in group.items() if isinstance(own.get(name), tuple)}
     saved["state"] = {int(index): state for index, state in saved["state"].items()}
     optimizer.load_state_dict(saved)
 

@@ -131,7 +131,7 @@ def warn_of_other_scene(policy: PreTrainedConfig, scene: str) -> None:
         policy: whose `pretrained_path` is a folder or of the Hub.
         scene: of the run.
     """
-    folder, trained = Path(policy.pretrained_path or ""), {}
+    folder, trained = Path(str(policy.pretrained_path)), {}
     # What is damaged, or not there, keeps no run from beginning.
     with suppress(ValueError, OSError, HTTPError):
         if not folder.is_dir():

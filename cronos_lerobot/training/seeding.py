@@ -44,7 +44,7 @@ class NamedGenerators:
             "torch": {name: rng.get_state().tolist() for name, rng in self._torch.items()},
         }
 
-    def load_state_dict(self, state: dict[str, Any], step: int = 0) -> None:
+    def load_state_dict(self, state: dict[str, Any], step: int) -> None:
         """Continue every generator made so far where `state` has it; one that it does not know begins anew.
 
         Those of torch that another kind of device drew with cannot be continued: they begin with numbers that

@@ -2,8 +2,7 @@
 
 import json
 import logging
-from dataclasses import dataclass
-from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from lerobot.configs import PreTrainedConfig
@@ -46,19 +45,14 @@ def test_the_scene_is_the_runs_or_that_of_the_cloned_demonstrations(demos, tmp_p
     assert trained_scene(tmp_path / "none") == {}
 
 
-@dataclass
-class PolicyOf:
-    pretrained_path: Path
-
-
 def test_a_policy_of_another_scene_is_told(tmp_path, caplog):
     folder = checkpoint(tmp_path, env={"scene": "playroom_2x2"})
     with caplog.at_level(logging.WARNING):
-        warn_of_other_scene(PolicyOf(folder), "playroom_2x2")
+        warn_of_other_scene(SimpleNamespace(pretrained_path=folder), "playroom_2x2")
         # No name of a repository, so that nothing is looked for.
-        warn_of_other_scene(PolicyOf(tmp_path / "none"), "kitchen_2x2")
+        warn_of_other_scene(SimpleNamespace(pretrained_path=tmp_path / "none"), "kitchen_2x2")
         assert not caplog.records
-        warn_of_other_scene(PolicyOf(folder), "kitchen_2x2")
+        warn_of_other_scene(SimpleNamespace(pretrained_path=folder), "kitchen_2x2")
     (record,) = caplog.records
     assert "was trained in --env.scene=playroom_2x2, this run is in --env.scene=kitchen_2x2" in record.message
 

@@ -145,7 +145,7 @@ class RolloutBuffer:
 
         Raises:
             RuntimeError: the buffer is full.
-            ValueError: a column has another type than in the rows before.
+            TypeError: a column has another type than in the rows before.
         """
         if self.rows == self.num_rows:
             raise RuntimeError(f"The rollout buffer is full: it holds {self.num_rows} rows; update and clear it.")
@@ -155,13 +155,8 @@ class RolloutBuffer:
         assert self.log_probs is not None
         row = self.rows
         for name, column in observation.items():
-            if column.dtype != (kept := self.observations[name].dtype):
-                raise ValueError(
-                    f"the rollout has {name} as {kept}, now it comes as {column.dtype}: the run was on another "
-                    "kind of device, where the policy computes in another format. Go on there, or from an "
-                    "earlier checkpoint."
-                )
-            self.observations[name][row] = column
+            # An assignment would write fractions into whole numbers: a policy may see others on another device.
+            np.copyto(self.observations[name][row], column, casting="no")
         self.instruction_ids[row] = [self._instruction_id(text) for text in instructions]
         self.traces[row] = decision.trace
         self.log_probs[row] = decision.log_prob
