@@ -16,6 +16,7 @@ from cronos_lerobot.report.figures import (
     draw_curve,
     segment_curve,
     style_axes,
+    style_of,
     style_segment_axis,
 )
 from cronos_lerobot.report.series import Curve, mean_curve, segment_rates
@@ -178,12 +179,16 @@ def _sequential_panel(ax: Axes, rows: list) -> None:
         x = np.arange(len(found["positions"]))
         means = [position.mean for position in found["positions"]]
         spread = [position.std or 0.0 for position in found["positions"]]
+        color, _, hatch = style_of(i)
         ax.bar(
             x + (place - (len(rows) - 1) / 2) * width,
             means,
             0.92 * width,
             yerr=spread,
-            color=COLORS[i % len(COLORS)],
+            color=color,
+            hatch=hatch,
+            edgecolor="white",
+            linewidth=0,
             ecolor=INK,
             label=row_label(row, found["seeds"]),
         )

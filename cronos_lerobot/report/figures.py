@@ -24,6 +24,8 @@ from cronos_lerobot.report.statistics import Rate
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")
 """Okabe and Ito's palette: told apart by the colour-blind too."""
+LINES_AND_HATCHES = (("-", ""), ("--", "////"), (":", "...."))
+"""Of lines and bars, for each time that the colours begin anew."""
 SPLIT_LABELS = {"train": "training configurations", "held_out": "held-out configurations"}
 INK, GRID = "#333333", "#e4e4e4"
 AGENT_PANELS = (
@@ -167,6 +169,11 @@ def _label(group: Group) -> str:
     return group.label if len(group.runs) == 1 else f"{group.label} ({len(group.runs)} seeds)"
 
 
+def style_of(i: int) -> tuple[str, str, str]:
+    """The colour, the line and the hatch that tell row number `i` of a figure from the others."""
+    return (COLORS[i % len(COLORS)], *LINES_AND_HATCHES[i // len(COLORS) % len(LINES_AND_HATCHES)])
+
+
 def draw_curve(
     ax: Axes,
     curve: Curve | None,
@@ -177,11 +184,11 @@ def draw_curve(
     width: float = 1.6,
     marker_size: float = 4,
 ) -> None:
-    """Draw a line and its band in the colour number `i`; nothing if there is no curve."""
+    """Draw a line and its band in the style number `i`; nothing if there is no curve."""
     if curve is None:
         return
-    color = COLORS[i % len(COLORS)]
-    ax.plot(curve.x, curve.y, color=color, lw=width, marker=marker, ms=marker_size, label=label)
+    color, line, _ = style_of(i)
+    ax.plot(curve.x, curve.y, line, color=color, lw=width, marker=marker, ms=marker_size, label=label)
     ax.fill_between(curve.x, curve.low, curve.high, color=color, alpha=0.18, lw=0)
 
 

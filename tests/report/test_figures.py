@@ -1,14 +1,25 @@
 """Figures of a report: what is drawn, of whom."""
 
+import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from synthetic_runs import read_csv, write_training_run
 
-from cronos_lerobot.report.figures import agent_figure
+from cronos_lerobot.report.figures import agent_figure, draw_curve, style_of
 from cronos_lerobot.report.page import write_report
 from cronos_lerobot.report.runs import find_runs, group_runs
-from cronos_lerobot.report.series import mean_curve, segment_spans
+from cronos_lerobot.report.series import Curve, mean_curve, segment_spans
 from cronos_lerobot.report.statistics import Rate
 from cronos_lerobot.scripts.report import make_report
+
+
+def test_more_rows_than_colours_are_told_apart():
+    """With eight rows the first and the last were once of one blue."""
+    ax = Figure().subplots()
+    for i in range(21):
+        draw_curve(ax, Curve(np.arange(2), *np.ones((3, 2)), False), i, str(i))
+    assert len({(line.get_color(), line.get_linestyle()) for line in ax.lines}) == 21
+    assert len({(color, hatch) for color, _, hatch in map(style_of, range(21))}) == 21
 
 
 @pytest.mark.parametrize("intervals", [(160,), (160, 320), (160, 320, 640)])
