@@ -24,7 +24,7 @@ from cronos_lerobot.report.statistics import Rate
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")
 """Okabe and Ito's palette: told apart by the colour-blind too."""
-LINES_AND_HATCHES = (("-", ""), ("--", "////"), (":", "...."))
+LINES_AND_HATCHES = (("-", ""), ("--", "////"), (":", "...."), ("-.", "xxxx"))
 """Of lines and bars, for each time that the colours begin anew."""
 SPLIT_LABELS = {"train": "training configurations", "held_out": "held-out configurations"}
 INK, GRID = "#333333", "#e4e4e4"

@@ -16,10 +16,10 @@ from cronos_lerobot.scripts.report import make_report
 def test_more_rows_than_colours_are_told_apart():
     """With eight rows the first and the last were once of one blue."""
     ax = Figure().subplots()
-    for i in range(21):
+    for i in range(28):
         draw_curve(ax, Curve(np.arange(2), *np.ones((3, 2)), False), i, str(i))
-    assert len({(line.get_color(), line.get_linestyle()) for line in ax.lines}) == 21
-    assert len({(color, hatch) for color, _, hatch in map(style_of, range(21))}) == 21
+    assert len({(line.get_color(), line.get_linestyle()) for line in ax.lines}) == 28
+    assert len({(color, hatch) for color, _, hatch in map(style_of, range(28))}) == 28
 
 
 @pytest.mark.parametrize("intervals", [(160,), (160, 320), (160, 320, 640)])
