@@ -117,6 +117,21 @@ def test_a_cards_commands_are_right_for_every_policy(
         assert (front["base_model"], front["base_model_relation"]) == ("me/clone", "adapter")
 
 
+def test_a_card_says_how_actions_were_sampled(tmp_path, monkeypatch):
+    monkeypatch.setattr(hub_policy, "FIGURES", {})
+    checkpoint = write_checkpoint(tmp_path, "pocketvla", CronosEnvConfig(**STATE), PPOConfig())
+    shared = {"kind": "evaluation", "interaction_steps": 32, "success": 0.5, "ci95": [0.1, 0.9], "n": 4}
+    with (tmp_path / "run/metrics.jsonl").open("a") as file:
+        for interventions, temperature in enumerate((0.6, 0, None)):
+            record = shared | {"interventions": interventions, "split": "held_out", "temperature": temperature}
+            file.write(json.dumps(record) + "\n")
+    lines = [line for line in dry_run(checkpoint, tmp_path / "out").splitlines() if "0.500 [0.100, 0.900]" in line]
+    assert lines == [
+        f"| 32 | {interventions} | 0.500 [0.100, 0.900] | 4 | held-out | {sampling} |"
+        for interventions, sampling in enumerate(("temperature 0.6", "greedy", "the policy's own"))
+    ]
+
+
 def test_adapters_of_a_policy_that_nobody_else_has_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(hub_policy, "FIGURES", {})
     checkpoint = write_checkpoint(tmp_path, "pi0", CronosEnvConfig(), PPOConfig(), **ADAPTER)
