@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -153,7 +154,12 @@ class RowResult:
 
     def gap(self, axis: str, split: str = "train", up_to: float | None = None) -> Summary | None:
         """D or C, divided by the length of the axis, over the finished seeds."""
-        return summarise([gap.normalised for gap in self.gaps(axis, split, up_to)])
+        return summarise_rates([gap.normalised for gap in self.gaps(axis, split, up_to)])
+
+    def area(self, axis: str, split: str = "train") -> Summary | None:
+        """D or C themselves, over the finished seeds."""
+        summary = summarise([gap.area for gap in self.gaps(axis, split)])
+        return summary and summary.within(0.0, inf)
 
     def gaps(self, axis: str, split: str = "train", up_to: float | None = None) -> list[Gap]:
         """D or C of every finished seed."""

@@ -64,9 +64,9 @@ def _main_row(result: ExperimentResult, row: RowResult, shared: float | None) ->
     before = [point.success for point in starts if not point.interaction_steps]
     cells |= _numbers("base_success", summarise_rates(before))
     cells |= _numbers("interventions", summarise([seed.run.last["interventions"] for seed in row.finished]))
-    cells |= _numbers("D", summarise([gap.area for gap in row.gaps(INTERACTION_STEPS)]))
+    cells |= _numbers("D", row.area(INTERACTION_STEPS))
     cells |= _numbers("D_normalised", row.gap(INTERACTION_STEPS))
-    cells |= _numbers("C", summarise([gap.area for gap in row.gaps(INTERVENTIONS)]))
+    cells |= _numbers("C", row.area(INTERVENTIONS))
     cells |= _numbers("C_normalised", row.gap(INTERVENTIONS))
     cells |= {"shared_budget": shared} | _numbers("C_normalised_shared", row.gap(INTERVENTIONS, up_to=shared))
     for budget in budgets(result):

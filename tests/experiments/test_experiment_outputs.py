@@ -53,6 +53,16 @@ def test_main_table(options):
     assert row["t1280"]["seeds"] == 0
 
 
+def test_intervals_of_areas_end_where_areas_do(options):
+    make_run(options, "table1", "t80", 1, (8, 8, 8))
+    make_run(options, "table1", "t80", 2, (2, 2, 2))
+    t80 = by_row(tables.main_rows(results(options, "table1")))["t80"]
+    # Gaps 0 and .75: .375 +- 12.706 * .375.
+    assert (t80["C_normalised_ci95_low"], t80["C_normalised_ci95_high"]) == (0.0, 1.0)
+    assert (t80["D_ci95_low"], t80["C_ci95_low"]) == (0.0, 0.0)
+    assert t80["D_ci95_high"] == pytest.approx(10_240 * 0.375 * 13.706, rel=1e-4)
+
+
 def test_success_at_interventions_is_that_of_the_curve(options):
     make_run(options, "figure3", "t80", 1, (2, 4, 6))
     make_run(options, "figure3", "t320_eer", 1, (2, 6, 8))
