@@ -14,6 +14,7 @@ import pytest
 from forked_commands import run_forked
 from lerobot.datasets import LeRobotDataset
 
+from cronos_lerobot.locks import FolderInUseError, FolderLock
 from cronos_lerobot.report import page
 from cronos_lerobot.scripts import demo, pipeline, probe
 from cronos_lerobot.scripts.demo import SCALES, make_steps
@@ -60,6 +61,13 @@ def test_lost_output_is_made_again(folder):
     (folder / "a.txt").unlink()
     run_steps(steps, folder)
     assert contents(folder) == {"a": "x", "b": "x"}
+
+
+def test_two_at_once_do_not_remove_what_the_other_makes(folder):
+    with FolderLock(folder), pytest.raises(FolderInUseError, match="is being written by process"):
+        run_steps([append_step(folder, "a")], folder)
+    run_steps([append_step(folder, "a")], folder)
+    assert contents(folder) == {"a": "x"}
 
 
 def test_failed_step_is_resumed_where_it_can_be(folder):

@@ -20,7 +20,7 @@ from lerobot_env_cronos.hub_config import is_of_this_package
 
 from cronos_lerobot.evaluation.plan import Part, make_parts
 from cronos_lerobot.evaluation.policy_env import check_observations, observations_of, trained_scene
-from cronos_lerobot.evaluation.policy_source import PolicySource, find_policy, fingerprint
+from cronos_lerobot.evaluation.policy_source import PolicySource, files_fingerprint, find_policy, fingerprint
 
 QUICK_CONFIGURATIONS, QUICK_ORDERINGS = 16, 3
 EXPERT = "scripted expert"
@@ -275,6 +275,11 @@ class CronosEvalConfig:
     def policy_fingerprint(self) -> str:
         """What tells the policy from another one of its name."""
         return EXPERT if self.policy is None else fingerprint(self.policy)
+
+    @property
+    def policy_files(self) -> str | None:
+        """The same of its weights and processors alone, whatever flags made of its config; None of the expert."""
+        return None if self.policy is None else files_fingerprint(Path(self.policy.pretrained_path or ""))
 
     def identity(self) -> dict[str, Any]:
         """Everything that decides the result of a chain, as JSON values."""

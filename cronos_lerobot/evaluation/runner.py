@@ -234,6 +234,7 @@ class Evaluation:
             "format": FORMAT,
             "policy": config.policy_name,
             "policy_fingerprint": config.policy_fingerprint,
+            "policy_files": config.policy_files,
             "policy_revision": config.source.revision if config.source else None,
             "scene": self.scene.name,
             "benchmark": {

@@ -21,6 +21,7 @@ from cronos_lerobot.hub import env_file
 from cronos_lerobot.hub.cards import render_card
 from cronos_lerobot.hub.config import BenchmarkConfig
 from cronos_lerobot.hub.pictures import configuration_pictures, configuration_sheet, task_sheet
+from cronos_lerobot.hub.runs import describe_source
 
 FRAMEWORK = "cronos-lerobot"
 """`evaluation_framework` of eval.yaml."""
@@ -114,6 +115,7 @@ def _card(benchmark: Benchmark, config: BenchmarkConfig, title: str) -> str:
         title=title,
         repo_id=config.repo_id,
         benchmark=benchmark,
+        source=describe_source(benchmark.source),
         scene=scene,
         environment=gymnasium_id(scene.name),
         bodies=[BODIES[name] for name in scene.bodies],

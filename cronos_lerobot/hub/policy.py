@@ -13,6 +13,8 @@ from matplotlib.figure import Figure
 from safetensors import SafetensorError, safe_open
 
 from cronos_lerobot.agents.steering.steered import STEERING
+from cronos_lerobot.evaluation.config import EXPERT
+from cronos_lerobot.evaluation.policy_source import files_fingerprint
 from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.hub.cards import render_card
 from cronos_lerobot.hub.config import PolicyConfig
@@ -20,6 +22,7 @@ from cronos_lerobot.hub.eval_flags import cronos_eval_flags, lerobot_eval_flags
 from cronos_lerobot.hub.peft_base import find_base, name_base
 from cronos_lerobot.hub.runs import (
     Checkpoint,
+    describe_source,
     find_checkpoint,
     is_repository,
     read_run,
@@ -45,7 +48,7 @@ def write_policy_repository(config: PolicyConfig, folder: Path) -> str:
 
     Raises:
         ValueError: --path is missing, the policy is damaged or of another robot, its adapters are of a policy
-            that is not on the Hub, or results.json is none.
+            that is not on the Hub, or results.json is none, or of another policy or scene.
         FileNotFoundError: there is no policy, or no results.json.
     """
     if config.path is None:
@@ -60,10 +63,26 @@ def write_policy_repository(config: PolicyConfig, folder: Path) -> str:
         name_base(folder, adapters_of)
     run = read_run(checkpoint.run, checkpoint.step) if checkpoint.run else None
     curves = _draw_curves(run, folder) if run else []
-    results = read_results(config.results) if config.results else None
+    results = _read_scores(config.results, checkpoint) if config.results else None
     (folder / "README.md").write_text(_card(config, checkpoint, policy, adapters_of, run, curves, results))
     steps = f" after {run.last['interaction_steps']} interaction steps" if run else ""
     return f"{policy['type']} policy{steps}"
+
+
+def _read_scores(path: Path, checkpoint: Checkpoint) -> dict[str, Any]:
+    """Results of `cronos-eval` of this policy.
+
+    Raises:
+        FileNotFoundError: there are none.
+        ValueError: they are of the expert, or of a policy with other weights.
+    """
+    results = read_results(path)
+    evaluated = results.get("policy")
+    # Results of before there was a hash of the files alone are taken at their word.
+    files = results.get("policy_files") or files_fingerprint(checkpoint.model)
+    if evaluated == EXPERT or files != files_fingerprint(checkpoint.model):
+        raise ValueError(f"--results={path} is of {evaluated}, whose weights are not those of {checkpoint.model}")
+    return results
 
 
 def _read_policy(model: Path) -> dict[str, Any]:
@@ -122,6 +141,8 @@ def _card(
     if config.scene and env.get("scene") and config.scene != env["scene"]:
         raise ValueError(f"--scene={config.scene}, but the policy was trained in {env['scene']}")
     scene = env.get("scene") or config.scene or (results or {}).get("scene")
+    if results and results["scene"] != scene:
+        raise ValueError(f"--results={config.results} is of {results['scene']}, the policy of {scene}")
     return render_card(
         "policy",
         repo_id=config.repo_id,
@@ -141,6 +162,7 @@ def _card(
         cronos_eval_flags=cronos_eval_flags(policy, env, scene),
         curves=curves,
         results=results,
+        results_source=describe_source(results["benchmark"]["source"]) if results else None,
     )
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import yaml
 from huggingface_hub import EvalResultEntry, HfApi, eval_result_entries_to_yaml
 from huggingface_hub.errors import EntryNotFoundError
+from huggingface_hub.hf_api import RepoFile
 from lerobot_env_cronos import Benchmark, gymnasium_id, load_benchmark
 from lerobot_env_cronos.benchmark.benchmark import SUITES
 
@@ -18,6 +20,8 @@ from cronos_lerobot.hub.config import ResultsConfig
 from cronos_lerobot.hub.push import PublishError, explained
 
 FILE = ".eval_results/cronos.yaml"
+DECISIVE = ("config.json", "*.safetensors", "policy_*.json", "adapter_config.json")
+"""Files that make a policy."""
 STANDARD = {"advance": "window", "end_effector_reset": False}
 """How the benchmark's chains are run; another way is another score."""
 
@@ -27,12 +31,14 @@ def write_results(config: ResultsConfig, folder: Path) -> str:
 
     Raises:
         ValueError: the results are not of this benchmark, or not of all of it.
-        PublishError: the policy's repository is missing, or its results cannot be read.
+        PublishError: the policy's repository is missing, has other weights now than were evaluated, or its results
+            cannot be read.
     """
     if config.results is None:
         raise ValueError("--results=<results.json of cronos-eval, or its folder> is required")
     results = read_results(config.results)
     check_policy(results, config.repo_id)
+    _check_commit(results, config)
     benchmark = _load(config, results)
     entries = make_entries(results, benchmark, config)
     content = merge(_published(config), eval_result_entries_to_yaml(entries))
@@ -47,7 +53,7 @@ def check_policy(results: dict[str, Any], repo_id: str) -> None:
     """Check that results are of the policy in the repository that they go to.
 
     Raises:
-        ValueError: they are of the scripted expert or of another policy.
+        ValueError: they are of the scripted expert, of another policy, or of a folder.
     """
     evaluated = str(results.get("policy") or "")
     if evaluated == EXPERT:
@@ -56,6 +62,40 @@ def check_policy(results: dict[str, Any], repo_id: str) -> None:
         raise ValueError(
             f"the results are of {evaluated!r}, not of {repo_id}: evaluate with --policy.path={repo_id}"
         )
+    if results.get("policy_revision") is None:
+        raise ValueError(
+            f"the results are of a folder called {evaluated}, not of the repository: evaluate where there is no"
+            " such folder"
+        )
+
+
+def _check_commit(results: dict[str, Any], config: ResultsConfig) -> None:
+    """Check that the policy of the commit that was evaluated is the one that stands there now."""
+    api = HfApi()
+    evaluated = results["policy_revision"]
+    with explained(config.target):
+        here = _policy_files(api, config.repo_id, _revision(api, config))
+        if _policy_files(api, config.repo_id, evaluated) != here:
+            raise PublishError(
+                f"the results are of {config.repo_id} as it was at {evaluated}, which has another policy now:"
+                f" evaluate it again, in a new --output_dir"
+            )
+
+
+def _policy_files(api: HfApi, repo_id: str, revision: str | None) -> dict[str, str]:
+    """Hashes of the files that make a policy, by name."""
+    files = (one for one in api.list_repo_tree(repo_id, revision=revision) if isinstance(one, RepoFile))
+    return {
+        one.path: one.lfs.sha256 if one.lfs else one.blob_id
+        for one in files
+        if any(fnmatch(one.path, pattern) for pattern in DECISIVE)
+    }
+
+
+def _revision(api: HfApi, config: ResultsConfig) -> str | None:
+    """The revision that the results are written onto."""
+    branches = {branch.name for branch in api.list_repo_refs(config.repo_id).branches}
+    return config.branch if config.branch in branches else config.revision
 
 
 def _load(config: ResultsConfig, results: dict[str, Any]) -> Benchmark:
@@ -158,9 +198,7 @@ def _published(config: ResultsConfig) -> list[dict[str, Any]]:
     """The entries that the repository has."""
     api = HfApi()
     with explained(config.target):
-        refs = api.list_repo_refs(config.repo_id)
-        branches = {branch.name for branch in refs.branches}
-        revision = config.branch if config.branch in branches else config.revision
+        revision = _revision(api, config)
         api.model_info(config.repo_id, revision=revision)
         try:
             path = api.hf_hub_download(config.repo_id, FILE, revision=revision)

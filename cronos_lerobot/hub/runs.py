@@ -99,6 +99,7 @@ def run_facts(run: TrainingRun) -> dict[str, Any]:
         "commit_then": run.starts[-1]["git_commit"],
         "command": command_line(run.starts[0]["command"]),
         "num_starts": len(run.starts),
+        "changed": [f"{name}={values}" for name, values in run.changed.items()],
     }
 
 
@@ -151,6 +152,12 @@ def is_repository(name: Any) -> bool:
     """Whether a path or name can be a repository on the Hub: `<owner>/<name>`, and no folder here."""
     text = str(name or "")
     return text.count("/") == 1 and not text.startswith((".", "/", "~")) and not Path(text).exists()
+
+
+def describe_source(source: str) -> str:
+    """Where a benchmark is from, without the folders of whoever used it: a card is public."""
+    is_folder = "/" in source or Path(source).exists()
+    return "a local benchmark" if is_folder and not is_repository(source.partition("@")[0]) else source
 
 
 def train_config_path(model: Path) -> Path:

@@ -9,6 +9,7 @@ from typing import Any
 
 from cronos_lerobot.evaluation.outcomes import WORTH_SAYING, Episode, Outcomes, read_outcomes, shared_episodes
 from cronos_lerobot.evaluation.store import COMPARISON, RESULTS
+from cronos_lerobot.report.comparisons import at_their_end
 from cronos_lerobot.report.runs import TrainingRun, files_called, group_runs, read_training_run
 from cronos_lerobot.report.suites import is_results, policy_name
 from cronos_lerobot.training.logging import METRICS
@@ -139,34 +140,11 @@ def read_side(folders: Sequence[Path]) -> Side:
         labels = "; ".join(group.label for group in groups)
         raise ValueError(f"{_names(folders)}: runs of {len(groups)} experiments, not seeds of one: {labels}")
     own: list[Outcomes] = []
-    for run in _as_long(groups[0].runs, notes) if groups else []:
+    for run in at_their_end(groups[0].runs, notes) if groups else []:
         _keep(notes, lambda run=run: own.append(last_evaluation(run)))
     if not evaluations and not own:
         raise ValueError("; ".join(notes))
     return Side(tuple(folders), list(evaluations.values()), own, notes)
-
-
-def _as_long(runs: Sequence[TrainingRun], notes: list[str]) -> list[TrainingRun]:
-    """The runs whose last evaluation comes as late as that of the longest; the others are not at their end.
-
-    A run that has spent its reset budget is at its end wherever that is.
-    """
-    ends = [run.evaluations[-1]["interaction_steps"] if run.evaluations else 0 for run in runs]
-    kept = []
-    for run, end in zip(runs, ends, strict=True):
-        if end == max(ends) or _has_spent_its_budget(run):
-            kept.append(run)
-        else:
-            notes.append(
-                f"the own evaluations of {run.folder}: the last is after {end:,} steps, another's after "
-                f"{max(ends):,}"
-            )
-    return kept
-
-
-def _has_spent_its_budget(run: TrainingRun) -> bool:
-    budget = (run.config.get("protocol") or {}).get("reset_budget")
-    return budget is not None and bool(run.evaluations) and run.evaluations[-1]["interventions"] >= budget
 
 
 def _keep(notes: list[str], read: Any) -> None:

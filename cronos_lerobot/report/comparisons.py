@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from cronos_lerobot.report.runs import EvaluationRun, Group, TrainingRun, evaluation_rates
@@ -24,10 +25,13 @@ class Comparison:
 
 
 def compare_training(groups: list[Group]) -> list[Comparison]:
-    """First and last periodic evaluation of every group, its seeds together, where they were made alike."""
+    """First and last periodic evaluation of every group, its seeds together, where they were made alike.
+
+    Of seeds that are not as far as others those that are (`at_their_end`).
+    """
     comparisons = []
     for group in groups:
-        runs = [run for run in group.runs if len(run.alike) > 1 and run.begins_alike]
+        runs = [run for run in at_their_end(group.runs) if len(run.alike) > 1 and run.begins_alike]
         if not runs:
             continue
         first, last = (
@@ -41,6 +45,33 @@ def compare_training(groups: list[Group]) -> list[Comparison]:
         suite = f"periodic evaluation, {runs[0].evaluations[-1]['split']}"
         comparisons.append(Comparison(group.label, suite, gains))
     return comparisons
+
+
+def at_their_end(runs: Sequence[TrainingRun], notes: list[str] | None = None) -> list[TrainingRun]:
+    """The runs whose last evaluation comes as late as that of the longest; the others are not at their end.
+
+    A run that has spent its reset budget is at its end wherever that is.
+
+    Args:
+        runs: of one group.
+        notes: takes a sentence for each run that is left out.
+    """
+    ends = [run.evaluations[-1]["interaction_steps"] if run.evaluations else 0 for run in runs]
+    kept = []
+    for run, end in zip(runs, ends, strict=True):
+        if end == max(ends) or _has_spent_its_budget(run):
+            kept.append(run)
+        elif notes is not None:
+            notes.append(
+                f"the own evaluations of {run.folder}: the last is after {end:,} steps, another's after "
+                f"{max(ends):,}"
+            )
+    return kept
+
+
+def _has_spent_its_budget(run: TrainingRun) -> bool:
+    budget = (run.config.get("protocol") or {}).get("reset_budget")
+    return budget is not None and bool(run.evaluations) and run.evaluations[-1]["interventions"] >= budget
 
 
 def _different_starts(runs: list[TrainingRun]) -> list[TrainingRun]:

@@ -79,6 +79,19 @@ class TrainingRun:
         return max([*self.updates, *self.evaluations], key=lambda record: record["interaction_steps"])
 
     @property
+    def changed(self) -> dict[str, str]:
+        """Flags of the protocol and the agent that a resume changed, with the values that they had in turn."""
+        parts = ("protocol", "algorithm")
+        flags = [
+            _flatten({part: start["config"].get(part) or {} for part in parts if "config" in start})
+            for start in self.starts
+        ]
+        # One that a start did not have yet is of another version.
+        shared = set.intersection(*map(set, flags)) if flags else set()
+        values = {name: list(dict.fromkeys(start[name] for start in flags)) for name in sorted(shared)}
+        return {name: ", then ".join(several) for name, several in values.items() if len(several) > 1}
+
+    @property
     def alike(self) -> list[Evaluation]:
         """The evaluations that were made as the last one: a resumed run may have had other `--eval.*` before."""
         return [one for one in self.evaluations if _made(one) == _made(self.evaluations[-1])]
@@ -295,14 +308,16 @@ def _below_root(config: dict[str, Any]) -> dict[str, Any]:
 def group_runs(runs: list[TrainingRun]) -> list[Group]:
     """Group runs by their config but for seed and length, labelled by what tells the groups apart.
 
+    A run that was resumed with other flags of the protocol or the agent is of a kind of its own, as its label says.
+
     Of several runs of one seed a group has the longest.
     """
     groups: dict[str, Group] = {}
     flat = {}
     for run in runs:
         config = {key: value for key, value in run.config.items() if key not in NOT_THE_EXPERIMENT}
-        experiment = _below_root(config)
-        key = json.dumps(experiment, sort_keys=True) if experiment else str(run.folder)
+        config = _below_root(config)
+        key = json.dumps([config, run.changed], sort_keys=True) if config else str(run.folder)
         group = groups.setdefault(key, Group(run.name))
         # A longer run of the same seed begins with the shorter one: counted twice it would narrow the spread.
         same = next((other for other in group.runs if run.seed is not None and other.seed == run.seed), None)
@@ -310,7 +325,7 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
             group.runs.append(run)
         elif run.last["interaction_steps"] > same.last["interaction_steps"]:
             group.runs[group.runs.index(same)] = run
-        flat[key] = _flatten(experiment)
+        flat[key] = _flatten(config)
     names = sorted({name for config in flat.values() for name in config})
     differing = [name for name in names if len({config.get(name) for config in flat.values()}) > 1]
     others = [name for name in differing if name not in DESCRIBED]
@@ -322,6 +337,8 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
                 describe_protocol(group.runs[0].config["protocol"]) if is_alone or others != differing else ""
             )
             group.label = ", ".join(filter(None, (protocol, _name_values(flat[key], others))))
+        if changed := group.runs[0].changed:
+            group.label += f" (resumed with {_name_values(changed, list(changed))})"
     return list(groups.values())
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cronos_lerobot.experiments.arithmetic import portable_arithmetic
+from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.training.stopping import SAME_S
 
 ECHO_S = 1.0
@@ -52,8 +53,14 @@ def run_steps(steps: Sequence[Step], folder: Path) -> None:
 
     Raises:
         FileExistsError: the folder holds something else.
+        FolderInUseError: another process runs the steps there.
         StepFailedError: a command failed; running the steps again goes on from there.
     """
+    with FolderLock(folder):
+        _run_steps(steps, folder)
+
+
+def _run_steps(steps: Sequence[Step], folder: Path) -> None:
     state = _read_state(folder)
     stale = False
     for number, step in enumerate(steps, start=1):

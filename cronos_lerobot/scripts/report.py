@@ -76,8 +76,9 @@ def make_report(
     """
     from lerobot_env_cronos import get_scene
 
+    from cronos_lerobot.report.comparisons import at_their_end
     from cronos_lerobot.report.page import Report
-    from cronos_lerobot.report.runs import FoundRuns, find_runs
+    from cronos_lerobot.report.runs import FoundRuns, find_runs, group_runs
 
     get_scene(scene)
     found, old, new = (
@@ -89,6 +90,8 @@ def make_report(
         if not video.is_file():
             raise FileNotFoundError(f"No video {video}.")
     left_out = list(dict.fromkeys(found.left_out + old.left_out + new.left_out))
+    for group in group_runs(found.training):
+        at_their_end(group.runs, left_out)
     return Report(
         found.training, rest, old.evaluations, new.evaluations, videos or [], title, found.suites, left_out
     )

@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cronos_lerobot.data.stream_filter import PROVENANCE
+from cronos_lerobot.locks import FolderInUseError
 from cronos_lerobot.report.runs import read_evaluation_runs
 from cronos_lerobot.report.statistics import Rate
 from cronos_lerobot.scripts.demo import SCALES, Scale, clone_step, eval_step, record_step, train_step
@@ -137,7 +138,7 @@ def main() -> None:
     scale = SCALES[args.scale] if args.scale == "smoke" else replace(SCALES["full"], train_steps=args.steps)
     try:
         run_steps(make_steps(scale, args.seeds, args.output_dir, args.ways, args.head), args.output_dir)
-    except FileExistsError as error:
+    except (FileExistsError, FolderInUseError) as error:
         sys.exit(f"error: {error}")
     except StepFailedError as error:
         sys.exit(f"error: {error}\nrun the same command again to go on from here")

@@ -169,6 +169,11 @@ def test_a_repository_has_an_owner_and_a_name(name):
 
 @pytest.mark.parametrize("evaluated", ["scripted expert", "me/other", "outputs/train/eer"])
 def test_results_of_something_else_are_refused(evaluated):
-    check_policy({"policy": "me/eer@main"}, "me/eer")
+    check_policy({"policy": "me/eer@main", "policy_revision": "0" * 40}, "me/eer")
     with pytest.raises(ValueError, match=rf"the results are of .*{evaluated}.*, not of .*me/eer"):
         check_policy({"policy": evaluated}, "me/eer")
+
+
+def test_results_of_a_folder_called_like_a_repository_are_refused():
+    with pytest.raises(ValueError, match="are of a folder called me/eer, not of the repository"):
+        check_policy({"policy": "me/eer", "policy_revision": None}, "me/eer")

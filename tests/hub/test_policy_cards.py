@@ -11,11 +11,15 @@ import yaml
 from flags import parse_flags
 from lerobot.configs.types import PolicyFeature
 from lerobot_env_cronos.config import CronosEnvConfig
+from lerobot_env_cronos.scene.scenes import SCENES
 from safetensors.numpy import save_file
 
 from cronos_lerobot.agents.imitation.config import ImitationConfig
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.steering.config import SteeringConfig
+from cronos_lerobot.evaluation.policy_source import files_fingerprint
+from cronos_lerobot.evaluation.results import independent_results
+from cronos_lerobot.evaluation.store import FORMAT
 from cronos_lerobot.hub import policy as hub_policy
 from cronos_lerobot.hub.config import PolicyConfig
 from cronos_lerobot.hub.eval_flags import lerobot_eval_flags
@@ -130,6 +134,60 @@ def test_a_card_says_how_actions_were_sampled(tmp_path, monkeypatch):
         f"| 32 | {interventions} | 0.500 [0.100, 0.900] | 4 | held-out | {sampling} |"
         for interventions, sampling in enumerate(("temperature 0.6", "greedy", "the policy's own"))
     ]
+
+
+def write_scores(folder, **changes):
+    """results.json of two episodes, of one suite, on a benchmark in a folder of the user's."""
+    task = SCENES["kitchen_2x2"].tasks[0]
+    one = {"configuration": 0, "length": 1, "found_complete": [], "never_grasped": []}
+    environment = "lerobot_env_cronos/kitchen_2x2-v1"
+    results = {
+        "format": FORMAT, "policy": "outputs/run", "policy_files": None, "scene": "kitchen_2x2", "seed": 3,
+        "temperature": None, "advance": "window", "end_effector_reset": False,
+        "benchmark": {"environment": environment, "source": "/home/me/secret/bench", "fingerprint": "f"},
+        "independent": {"train": independent_results([one | {"number": 0}] * 2, [task])},
+    } | changes  # fmt: skip
+    folder.mkdir(parents=True)
+    (folder / "results.json").write_text(json.dumps(results))
+    return folder
+
+
+def test_the_scores_of_one_suite_are_on_the_card_and_no_folder_of_the_users(tmp_path, monkeypatch):
+    monkeypatch.setattr(hub_policy, "FIGURES", {})
+    checkpoint = write_checkpoint(tmp_path, "act", CronosEnvConfig(**STATE), ImitationConfig())
+    files = files_fingerprint(checkpoint / "pretrained_model")
+    card = dry_run(checkpoint, tmp_path / "out", results=write_scores(tmp_path / "eval", policy_files=files))
+    assert "| independent, train | success | 1.000 " in card
+    assert "benchmark `a local benchmark`, sampling: the policy's own, seed 3" in card
+    assert "/home/me" not in card
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"policy": "scripted expert"}, "is of scripted expert, whose weights are not those of"),
+        ({"policy": "outputs/other", "policy_files": "0123"}, "is of outputs/other, whose weights are not those"),
+        ({"scene": "playroom_2x2"}, "is of playroom_2x2, the policy of kitchen_2x2"),
+    ],
+    ids=["expert", "other weights", "other scene"],
+)
+def test_scores_of_something_else_are_refused(tmp_path, monkeypatch, changes, message):
+    monkeypatch.setattr(hub_policy, "FIGURES", {})
+    checkpoint = write_checkpoint(tmp_path, "act", CronosEnvConfig(**STATE), ImitationConfig())
+    with pytest.raises(ValueError, match=message):
+        dry_run(checkpoint, tmp_path / "out", results=write_scores(tmp_path / "eval", **changes))
+
+
+def test_a_card_says_what_a_resume_changed(tmp_path, monkeypatch):
+    monkeypatch.setattr(hub_policy, "FIGURES", {})
+    checkpoint = write_checkpoint(tmp_path, "pocketvla", CronosEnvConfig(**STATE), PPOConfig())
+    manifest = tmp_path / "run/manifest.json"
+    (start,) = json.loads(manifest.read_text())["starts"]
+    again = json.loads(json.dumps(start))
+    again["config"]["protocol"]["scene_reset_interval"] = 320
+    manifest.write_text(json.dumps({"starts": [start, again, again]}))
+    changed = "protocol.scene_reset_interval=1280, then 320"
+    assert f"| flags that a resume changed | {changed} |" in dry_run(checkpoint, tmp_path / "out")
 
 
 def test_adapters_of_a_policy_that_nobody_else_has_are_refused(tmp_path, monkeypatch):

@@ -264,6 +264,21 @@ def test_results_of_another_benchmark_are_refused(policy, evaluation, commands, 
     assert "is of kitchen_2x2, not of playroom_2x2" in refused.output
 
 
+def test_results_of_a_policy_that_has_changed_since_are_refused(policy, evaluation, commands, hub, tmp_path):
+    publish = ("cronos-publish", "results", f"--results={evaluation}", f"--repo_id={policy}", "--branch=retrained")
+    commands.run("python", f"""
+from huggingface_hub import HfApi
+HfApi().create_branch("{policy}", branch="retrained")
+HfApi().upload_file(path_or_fileobj=b"{{}}", repo_id="{policy}", path_in_repo="policy_preprocessor.json",
+    revision="retrained")
+""")  # fmt: skip
+    refused = commands.try_(*publish)
+    assert refused.code == 1
+    assert re.search(
+        rf"results are of {policy} as it was at [0-9a-f]{{40}}, which has another policy now", refused.output
+    )
+
+
 # Faults --------------------------------------------------------------------------------------------------
 
 
