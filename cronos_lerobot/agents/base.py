@@ -86,6 +86,14 @@ class TrainablePolicy(Protocol):
         ...
 
 
+def is_trainable(policy: Any) -> bool:
+    """Whether `policy` has what TrainablePolicy names, as its own or, of adapters around it, as what they are of.
+
+    `isinstance` would not see the latter.
+    """
+    return all(callable(getattr(policy, name, None)) for name in POLICY_METHODS)
+
+
 def check_trainable(policy: Any) -> None:
     """Check that `policy` has what TrainablePolicy names.
 

@@ -138,6 +138,8 @@ class DemoCollector:
         self._noise = ActionNoise(config.noise, env.num_envs)
         self._misses = GraspMisses(config.misses, env)
         self._failures_in_a_row = 0
+        for task in self._kept:
+            self._check_starts(task)
 
     def collect(self, num_episodes: int, on_episode: Callable[[int], object] = lambda frames: None) -> None:
         """Write `num_episodes` more episodes: in the end each task has the same number, as far as that divides.
@@ -194,6 +196,8 @@ class DemoCollector:
             if self.policy is not None:
                 # What it planned at rest, it planned for what it saw before.
                 self.policy.forget(np.array([stream]))
+            if not episode.preludes and info["is_success"][stream]:
+                self._discard(stream, episode)
             return
         episode.steps += 1
         resting = info["is_success"][stream] and not info["is_grasped"][stream]
@@ -246,10 +250,12 @@ class DemoCollector:
             self._discard(stream, episode)
 
     def _discard(self, stream: int, episode: _Episode) -> None:
-        """After what the policy did nothing can be shown: the task is complete, or the simulation broke down."""
+        """Nothing can be shown: the task was complete from the start, or the simulation broke down in the policy's
+        hands."""
         self._episodes[stream] = None
         self._count_failure(
-            "start.policy had left the task complete or the simulation broken down, or the expert failed",
+            "start.policy or start.leaning_share had left the task complete or the simulation broken down, or the"
+            " expert failed",
             repr(episode.task.instruction),
         )
 
@@ -303,6 +309,25 @@ class DemoCollector:
         most = self.config.start.earlier_tasks
         return self._others(task, rng, int(rng.integers(most))) if most > 1 else []
 
+    def _check_starts(self, task: Task) -> None:
+        """Check that the scene has what `config.start` wants done before a task.
+
+        Raises:
+            ValueError: it has not.
+        """
+        start, scene = self.config.start, self.env.scene
+        if task.receptacle is not None and not start.is_after_another:
+            return
+        others = [other for other in scene.tasks if other != task]
+        before_reset = task.receptacle is None and any(other.object == task.object for other in scene.tasks)
+        if not others or not (before_reset or self.policy is not None or self._choices(task)):
+            raise ValueError(
+                f"nothing can be done before {task.instruction!r} in {scene.name}, which has {len(scene.objects)} "
+                f"object(s) and {len(scene.receptacles)} receptacle(s), as --start.arm_pose={start.arm_pose}, "
+                f"--start.occupied_receptacles={str(start.occupied_receptacles).lower()} and "
+                f"--start.misplaced_objects={str(start.misplaced_objects).lower()} ask"
+            )
+
     def _others(self, task: Task, rng: np.random.Generator, count: int) -> list[Task]:
         others = [other for other in self.env.scene.tasks if other != task]
         return [others[i] for i in rng.integers(len(others), size=count)]
@@ -315,18 +340,22 @@ class DemoCollector:
         if task.receptacle is None:
             own = [other for other in self.env.scene.tasks if other.object == task.object]
             return own[rng.integers(len(own))]
-        start = self.config.start
         if self.policy is not None:
             return self._others(task, rng, 1)[0]
+        choices = self._choices(task)
+        return choices[rng.integers(len(choices))]
+
+    def _choices(self, task: Task) -> list[Task]:
+        """What an expert may do before a task that is no reset task."""
+        start = self.config.start
         # Whether the task before had the same object, and the same receptacle.
         wanted = {(False, True)} if start.occupied_receptacles else set()
         wanted |= {(True, False)} if start.misplaced_objects else set()
-        choices = [
+        return [
             other
             for other in self.env.scene.tasks
             if (other.object == task.object, other.receptacle == task.receptacle) in (wanted or {(False, False)})
         ]
-        return choices[rng.integers(len(choices))]
 
     def _begin_prelude(self, ids: np.ndarray, episode: _Episode) -> None:
         self.env.set_task(ids, episode.preludes[:1])

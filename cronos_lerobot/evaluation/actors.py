@@ -17,7 +17,7 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 
-from cronos_lerobot.agents.base import Columns, TrainablePolicy
+from cronos_lerobot.agents.base import Columns, is_trainable
 from cronos_lerobot.agents.chunk_player import make_player
 from cronos_lerobot.agents.history import ObservationHistory, observation_steps
 from cronos_lerobot.agents.processing import PolicyProcessors, make_processors, observation_columns
@@ -186,7 +186,7 @@ def make_actor(
         temperature: of the sampling, if the policy has one (`sample_actions`).
         env_processors: LeRobot's processors between environment and policy, (before, after), if any.
     """
-    if isinstance(policy, TrainablePolicy | SteeredPolicy):
+    if isinstance(policy, SteeredPolicy) or is_trainable(policy):
         return SamplingPolicy(policy, processors, temperature)
     return SelectingPolicy(policy, processors, env_processors or (_as_it_is, _as_it_is))
 

@@ -19,6 +19,9 @@ from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS
 
 from cronos_lerobot.data.origin import read_origin
 
+EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
+"""How pictures begin that a policy with `--policy.empty_cameras` fills in by itself."""
+
 Features = Mapping[str, PolicyFeature]
 
 
@@ -70,7 +73,7 @@ def scene_of_dataset(repo_id: str, root: Path | str | None) -> str | None:
 def check_observations(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
     """Check that an environment shows a policy what it takes, of the size that it takes.
 
-    Images may have another size: policies scale them.
+    Images may have another size: what does not scale them was trained with those that it gets.
 
     Raises:
         ValueError: it does not; the sentence has the flag that would.
@@ -79,6 +82,8 @@ def check_observations(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
     given = {env.features_map[name]: feature for name, feature in env.features.items()}
     for name, taken in (policy.input_features or {}).items():
         feature = given.get(name)
+        if feature is None and name.startswith(EMPTY_CAMERA):
+            continue
         if feature is None:
             flags = {OBS_ENV_STATE: "--env.obs_type=environment_state_agent_pos"}
             flag = flags.get(name, "--env.obs_type=pixels_agent_pos with --env.camera_name=<its cameras>")

@@ -8,7 +8,7 @@ from typing import Any
 from cronos_lerobot.experiments import tables
 from cronos_lerobot.experiments.differences import Gain, RowDifference
 from cronos_lerobot.experiments.orders import NOT_APPLICABLE, Order
-from cronos_lerobot.experiments.results import APART, AtBudget, ExperimentResult
+from cronos_lerobot.experiments.results import APART, AtBudget, ExperimentResult, RowResult
 from cronos_lerobot.protocol.metrics import Summary
 from cronos_lerobot.report.paired import ALPHA, holm
 from cronos_lerobot.report.series import segment_rates, segment_spans
@@ -51,6 +51,8 @@ def main_columns(result: ExperimentResult) -> Columns:
         columns["paper"] = [f"{row['paper_mean']:.3f} ± {row['paper_std']:.3f}" for row in rows]
     columns["base"] = [_number(row["base_success_mean"], 3) for row in rows]
     columns["interventions"] = [_number(row["interventions_mean"], 0) for row in rows]
+    if any(row.takeovers[0] for row in result.rows):
+        columns["takeovers"] = [_takeovers(row) for row in result.rows]
     columns["D / steps"] = [_cell(row.gap("interaction_steps")) for row in result.rows]
     columns["C / interventions"] = [_cell(row.gap("interventions")) for row in result.rows]
     shared = rows[0]["shared_budget"] if rows else None
@@ -58,6 +60,12 @@ def main_columns(result: ExperimentResult) -> Columns:
         title = f"C up to {shared:,}"
         columns[title] = [_cell(row.gap("interventions", up_to=shared)) for row in result.rows]
     return columns
+
+
+def _takeovers(row: RowResult) -> str:
+    """How many of the interventions, and what each counts (spec: a table with takeovers names the price)."""
+    count, price = row.takeovers
+    return f"{count:,.0f} at {price} each" if count else MISSING
 
 
 def gain_columns(found: Sequence[Gain]) -> Columns:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -121,7 +122,7 @@ def markdown(
     figures: Sequence[str],
 ) -> str:
     """The page: what was run, the table, what the paper's text says, the figures, what is missing."""
-    lines = [*_introduction(result), "", *_table(main_columns(result)), "", NOTES, "", PPO_NOTES]
+    lines = [*_introduction(result), "", *_table(main_columns(result)), "", NOTES, *_learning_notes(result)]
     if result.experiment.source:
         lines += _about_the_paper(result)
     if grown := gain_columns(learned):
@@ -187,7 +188,17 @@ def _introduction(result: ExperimentResult) -> list[str]:
         lines += [f"{experiment.source} of the paper, repeated by `cronos-reproduce`.", ""]
     steps = options.scale.steps[experiment.steps]
     text = f"{experiment.scene}, {options.obs_type}, {steps:,} interaction steps ({options.scale.name} scale),"
-    return [*lines, f"{text} sampling temperature {options.temperature} in evaluations."]
+    lines.append(f"{text} sampling temperature {options.temperature} in evaluations.")
+    if options.extra:
+        flags = " ".join(map(shlex.quote, options.extra))
+        lines += ["", f"All runs have these flags besides, whatever a row is called: `{flags}`."]
+    return lines
+
+
+def _learning_notes(result: ExperimentResult) -> list[str]:
+    """Nothing where flags after `--` choose another agent: they are named above."""
+    chosen = any(flag.startswith("--algorithm.type") for flag in result.options.extra)
+    return [] if chosen else ["", PPO_NOTES]
 
 
 def _about_the_paper(result: ExperimentResult) -> list[str]:

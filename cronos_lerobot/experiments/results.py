@@ -152,6 +152,13 @@ class RowResult:
         """Success at the end, over the finished seeds; one alone has the interval of its evaluation."""
         return summarise_points(self.finals(split))
 
+    @property
+    def takeovers(self) -> tuple[float, int]:
+        """Mean number of an expert's takeovers among a finished run's interventions, and as many one counts."""
+        counts = [seed.run.last["interventions_by_kind"].get("takeover", 0) for seed in self.finished]
+        prices = [seed.run.config["protocol"].get("takeover_price", 1) for seed in self.finished]
+        return (float(np.mean(counts)), max(prices)) if counts else (0.0, 1)
+
     def gap(self, axis: str, split: str = "train", up_to: float | None = None) -> Summary | None:
         """D or C, divided by the length of the axis, over the finished seeds."""
         return summarise_rates([gap.normalised for gap in self.gaps(axis, split, up_to)])

@@ -308,7 +308,7 @@ def _below_root(config: dict[str, Any]) -> dict[str, Any]:
 def group_runs(runs: list[TrainingRun]) -> list[Group]:
     """Group runs by their config but for seed and length, labelled by what tells the groups apart.
 
-    A run that was resumed with other flags of the protocol or the agent is of a kind of its own, as its label says.
+    A run that was resumed with other flags of the protocol or the agent is of its own kind, as its label says.
 
     Of several runs of one seed a group has the longest.
     """

@@ -153,6 +153,7 @@ def print_statistics(config: StatisticsConfig) -> None:
     for table in make_tables(result):
         console.print(table)
     if config.output is not None:
+        config.output.parent.mkdir(parents=True, exist_ok=True)
         partial = config.output.with_name(f".{config.output.name}.partial")
         partial.write_text(json.dumps(result, indent=2))
         partial.replace(config.output)

@@ -23,7 +23,12 @@ from safetensors import SafetensorError
 from cronos_lerobot.agents.imitation.config import DemosConfig
 from cronos_lerobot.agents.steering.steered import STEERING
 from cronos_lerobot.agents.weights import wrap
-from cronos_lerobot.evaluation.policy_env import check_task_observation, scene_of_dataset, trained_scene
+from cronos_lerobot.evaluation.policy_env import (
+    EMPTY_CAMERA,
+    check_task_observation,
+    scene_of_dataset,
+    trained_scene,
+)
 from cronos_lerobot.training.config import CronosTrainConfig
 
 
@@ -86,6 +91,11 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
     assert policy_config is not None
     check_task_observation(policy_config, env_config)
     check_features(policy_config, env_config)
+    if policy_config.use_amp:
+        raise ValueError(
+            "--policy.use_amp=true is followed by evaluations alone: cronos-train acts and learns in the policy's "
+            "own precision. Give --policy.use_amp=false."
+        )
     if not config.resume:
         check_demonstrations(config.algorithm, env_config.scene)
     path = policy_config.pretrained_path
@@ -170,11 +180,21 @@ def check_features(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
     shown = {env.features_map[name]: feature for name, feature in env.features.items()}
     for name, feature in ((policy.input_features or {}) | (policy.output_features or {})).items():
         if name not in shown:
+            if name.startswith(EMPTY_CAMERA):
+                # Of --policy.empty_cameras: the policy fills it in by itself.
+                continue
             raise ValueError(
                 f"the policy reads {name}, which is not shown with --env.obs_type={env.obs_type} and "
                 f"--env.camera_name={env.camera_name}; that shows {sorted(shown.keys() - {ACTION})}."
             )
         size, own = feature.shape, shown[name].shape
+        # A picture is (channels, height, width) to LeRobot's policies, (height, width, channels) to environments.
+        if feature.type is FeatureType.VISUAL and tuple(size[1:]) != (pixels := tuple(own[:2])):
+            logging.warning(
+                "The policy was made for %s of %d x %d pixels and learns here from %d x %d: not every policy "
+                "scales pictures. --env.observation_height=%d --env.observation_width=%d shows it its own, as "
+                "evaluations of its checkpoints will.", name, *size[1:], *pixels, *size[1:],
+            )  # fmt: skip
         if feature.type is not FeatureType.VISUAL and tuple(size) != tuple(own):
             raise ValueError(
                 f"the policy was made for {name} of {size[0]} numbers, {env.scene} has {own[0]}: it is of another "

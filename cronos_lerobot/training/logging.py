@@ -8,6 +8,7 @@ import platform
 import sys
 import time
 from contextlib import suppress
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -146,7 +147,12 @@ class RunLogger:
     def _open_wandb(self) -> Any:
         from lerobot.common.wandb_utils import WandBLogger
 
-        return WandBLogger(self.config)  # ty: ignore[invalid-argument-type]
+        config = self.config
+        if config.resume and not (Path(config.output_dir or "") / "wandb").is_dir():
+            # A run that begins to be logged there has no former one to go on with.
+            config = copy(config)
+            config.resume = False
+        return WandBLogger(config)  # ty: ignore[invalid-argument-type]
 
 
 class SilentLogger:

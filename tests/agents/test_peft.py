@@ -11,11 +11,13 @@ from peft import PeftModel
 from test_act_adapter import make_act
 from test_diffusion_adapter import HORIZON, make_diffusion
 from test_imitation_agent import learn, make_imitating
+from test_self_imitation import make_pocketvla
 from test_vla_adapters import OPTIONS, STATISTICS, TEXTS, generator, one_update
 from tiny_pi0 import tiny_gemma
 from tiny_vlas import CHUNK, KINDS, PADDED, PLAYED, make_batch, make_processors, make_vla, save_vla
 
 from cronos_lerobot.agents.adapters.registry import make_trainable
+from cronos_lerobot.agents.base import is_trainable
 from cronos_lerobot.agents.ppo.agent import PPOAgent
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.ppo.ppo import PPO
@@ -23,6 +25,7 @@ from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.agents.processing import make_processors as around
 from cronos_lerobot.agents.weights import load_weights, save_policy, unwrapped, weights_file, wrap
+from cronos_lerobot.evaluation.actors import SamplingPolicy, make_actor
 
 
 def load_as_lerobot(kind, base, adapters):
@@ -191,3 +194,15 @@ def test_imitation_trains_adapters_only(kind, tmp_path):
 def test_a_policy_from_scratch_is_not_wrapped(tmp_path):
     with pytest.raises(ValueError, match=r"Supply a `policy\.pretrained_path`"):
         wrap(make_vla("pi0", tmp_path), PeftConfig())
+
+
+def test_adapters_around_a_policy_that_trains_by_itself_leave_it_one(tmp_path):
+    """The methods are those of the policy below; `isinstance` of the protocol does not see them."""
+    policy = make_pocketvla("gaussian")
+    assert not is_trainable(torch.nn.Linear(1, 1))
+    policy.config.pretrained_path = tmp_path
+    wrapped = wrap(policy, PeftConfig(r=2, target_modules="all-linear"))
+    assert isinstance(wrapped, PeftModel)
+    assert is_trainable(wrapped)
+    assert make_trainable(wrapped, OPTIONS) is wrapped
+    assert isinstance(make_actor(wrapped, PolicyProcessors(*identity_processors()), 0.5), SamplingPolicy)

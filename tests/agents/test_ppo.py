@@ -119,6 +119,13 @@ def test_untrainable_policy_is_named():
         PPO(torch.nn.Linear(1, 1), processors, PPOConfig(), np.random.default_rng(0))
 
 
+def test_a_critic_that_is_frozen_is_told_and_not_trained_without():
+    policy = DummyPolicy()
+    policy.critic.requires_grad_(False)
+    with pytest.raises(ValueError, match=r"no critic to train: .* DummyPolicy .* is frozen, as adapters"):
+        make_ppo(policy=policy)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

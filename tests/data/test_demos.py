@@ -245,6 +245,13 @@ def test_objects_that_lean_on_others(env):
     assert off_the_table >= 6
 
 
+def test_what_fell_onto_its_receptacle_is_nothing_to_show(env, tmp_path):
+    """Without a look at the start some of these would be demonstrations of standing still."""
+    config = DemoConfig(start=StartConfig(leaning_share=1.0), steps_after_release=2)
+    dataset, _ = collect(env, tmp_path / "d", config, 12)
+    assert not any(episode["next.success"][0] for episode in episodes_of(dataset))
+
+
 def test_failures_are_dropped_unless_asked_for(env, tmp_path):
     """An expert that does nothing fails every episode."""
 

@@ -12,10 +12,12 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from lerobot_env_cronos import CronosEnv, CronosVectorEnv, IndependentVectorEnv, SequentialVectorEnv, get_scene
 from lerobot_env_cronos.autoreset import CronosGymVectorEnv
+from lerobot_env_cronos.scene.physics import PHYSICS_V0
 
 ID = "lerobot_env_cronos/kitchen_2x2-v1"
 STATE = {"obs_type": "environment_state_agent_pos"}
 TASKS = get_scene("kitchen_2x2").tasks
+INSTRUCTIONS = [task.instruction for task in TASKS]
 
 
 def actions(n, steps, seed=0):
@@ -129,9 +131,8 @@ def test_a_single_environment_speaks_python_and_stays_over():
 
 
 def test_options_of_a_reset_are_followed_or_refused():
-    with pytest.raises(
-        ValueError, match=r"unknown options \['config'\] of reset; valid options: \['configuration'\]"
-    ):
+    valid = r"\['configuration', 'lerobot_new_rollout'\]"
+    with pytest.raises(ValueError, match=rf"unknown options \['config'\] of reset; valid options: {valid}"):
         gym.make(ID, **STATE).reset(options={"config": 3})
     with pytest.raises(ValueError, match=r"configuration must be in 0\.\.63, got 'three'"):
         gym.make(ID, **STATE).reset(options={"configuration": "three"})
@@ -166,6 +167,44 @@ def test_a_copy_goes_on_bit_for_bit(make, duplicate):
     assert_equal(env.reset(), other.reset())
     env.close()
     other.close()
+
+
+@pytest.mark.parametrize("make", [
+    lambda: IndependentVectorEnv(2, task=TASKS[0], **STATE),
+    lambda: SequentialVectorEnv(2, ordering=TASKS[::-1], window=5, end_effector_reset=True, **STATE),
+    lambda: gym.make_vec(ID, num_envs=2, **STATE),
+    lambda: gym.make_vec(ID, num_envs=2, autoreset_mode=AutoresetMode.DISABLED, **STATE),
+])  # fmt: skip
+def test_a_state_is_gone_back_to_from_beyond_the_end_of_the_episode(make):
+    env = make().unwrapped
+    env.reset(seed=5)
+    tape = actions(2, 100)
+    for action in tape[:3]:
+        env.step(action)
+    state = env.get_state()
+    first = [list(env.step(action)) for action in tape[3:]]
+    assert any(truncated.any() for _, _, _, truncated, _ in first)
+    env.set_state(state)
+    for action, expected in zip(tape[3:], first, strict=True):
+        assert_equal(expected, list(env.step(action)))
+    env.close()
+
+
+def test_a_copy_has_the_physics_of_what_was_copied():
+    class Slower(CronosVectorEnv):
+        physics = PHYSICS_V0
+
+    env = Slower(1, **STATE)
+    assert copy.deepcopy(env).simulation.model.opt.timestep == env.simulation.model.opt.timestep == 0.005
+
+
+def test_lerobots_rollout_can_run_what_gymnasium_makes():
+    single = SyncVectorEnv([lambda: gym.make(ID, disable_env_checker=True, **STATE)])
+    for env in (single, gym.make_vec(ID, num_envs=1, **STATE)):
+        env.reset(seed=[0], options={"lerobot_new_rollout": True})
+        assert env.call("_max_episode_steps") == (80,)
+        assert env.call("task_description")[0] in INSTRUCTIONS
+    assert single.call("task")[0] in INSTRUCTIONS
 
 
 def test_a_single_environment_can_be_copied():

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,29 @@ def test_a_renderer_hands_over_what_is_worth_it(simulation):
     assert np.array_equal(frames, np.tile(few, (2 * MIN_FRAMES, 1, 1, 1)))
     renderer.close()
     assert children() == before
+
+
+def test_two_threads_that_ask_get_their_own_frames(simulation):
+    renderer = ClassicRenderer(simulation.render_model, *SIZE, "front", processes=2)
+    if renderer._processes == 1:
+        pytest.skip("drawn by a GPU, which needs no processes")
+    states = [np.tile(simulation.qpos[i], (2 * MIN_FRAMES, 1)) for i in (0, 1)]
+    expected = [renderer.render(qpos) for qpos in states]
+    assert not np.array_equal(*expected)
+    with ThreadPoolExecutor(2) as threads:
+        drawn = list(threads.map(renderer.render, states * 20))
+    assert all(np.array_equal(frames, expected[i % 2]) for i, frames in enumerate(drawn))
+    renderer.close()
+
+
+def test_a_picture_larger_than_the_models_buffer_is_whole(simulation):
+    model = simulation.render_model
+    model.vis.global_.offwidth, model.vis.global_.offheight = 64, 48
+    small = ClassicRenderer(model, 48, 64, "front").render(simulation.qpos[:1])
+    large = ClassicRenderer(model, 192, 256, "front").render(simulation.qpos[:1])
+    blocks = large[0].reshape(48, 4, 64, 4, 3).mean((1, 3))
+    # The same picture but for edges.
+    assert np.median(np.abs(blocks - small[0])) < 3
 
 
 def test_a_killed_process_is_an_error_and_not_a_wait(simulation, pool):

@@ -14,6 +14,7 @@ from synthetic_runs import INSTRUCTIONS, write_training_run
 
 from cronos_lerobot.experiments import plots, tables
 from cronos_lerobot.experiments.definitions import EXPERIMENTS
+from cronos_lerobot.experiments.few_resets import SCREENED
 from cronos_lerobot.experiments.jobs import write_record
 from cronos_lerobot.experiments.outputs import write_outputs
 from cronos_lerobot.experiments.plan import train_job
@@ -193,6 +194,38 @@ def test_run_of_another_command_is_named_and_left_out(options):
     assert "none there, --algorithm.target_kl=0.02 here" in text
     row = by_row(tables.main_rows(result))["t80"]
     assert (row["seeds"], row["success_train_mean"]) == (0, None)
+
+
+def test_flags_besides_those_of_the_rows_are_on_the_page(options, tmp_path):
+    rows = EXPERIMENTS["table1"].rows
+    plain = write_outputs(EXPERIMENTS["table1"], rows, options, tmp_path / "plain")
+    assert "The learning algorithm is `ppo`" in plain
+    assert "All runs have these flags" not in plain
+    other = replace(options, extra=("--algorithm.type=ppo_paper", "--protocol.curriculum=[[8,320]]"))
+    page = write_outputs(EXPERIMENTS["table1"], rows, other, tmp_path / "other")
+    flags = "`--algorithm.type=ppo_paper '--protocol.curriculum=[[8,320]]'`"
+    assert f"All runs have these flags besides, whatever a row is called: {flags}." in page
+    assert "The learning algorithm is" not in page
+
+
+def test_takeovers_are_told_apart_with_what_one_counts(options, tmp_path):
+    experiment = EXPERIMENTS["few_resets"]
+    for row in ("t1280_eer", "tnone_eer_takeover"):
+        spec = make_run(options, "few_resets", row, 1, (2, 4, 6))
+    metrics = spec.train_folder / "metrics.jsonl"
+    lines = [json.loads(line) for line in metrics.read_text().splitlines()]
+    for line in lines:
+        line["interventions_by_kind"]["takeover"] = 3
+    metrics.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    manifest = spec.train_folder / "manifest.json"
+    content = json.loads(manifest.read_text())
+    content["starts"][0]["config"]["protocol"]["takeover_price"] = 5
+    manifest.write_text(json.dumps(content))
+    page = write_outputs(experiment, experiment.rows, options, tmp_path / "out")
+    titles, _, *rows = [line.split(" | ") for line in page.splitlines() if line.startswith("| ")]
+    # Those of the wide base come after these, by the same names.
+    cells = {row[titles.index("row")]: row[titles.index("takeovers")] for row in rows[: len(SCREENED)][::-1]}
+    assert (cells["takeover"], cells["staggered"]) == ("3 at 5 each", "–")
 
 
 def test_run_that_its_reset_budget_ended_early_counts_and_is_named(options, tmp_path):

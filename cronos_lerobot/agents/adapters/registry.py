@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor, nn
 
-from cronos_lerobot.agents.base import Batch, TrainablePolicy, check_trainable
+from cronos_lerobot.agents.base import Batch, check_trainable, is_trainable
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def make_trainable(policy: Any, options: AdapterOptions) -> Any:
     Raises:
         ValueError: it is neither; the message says who can train it all the same.
     """
-    if isinstance(policy, TrainablePolicy):
+    if is_trainable(policy):
         return policy
     policy_type = getattr(policy.config, "type", None)
     if policy_type in ADAPTERS:

@@ -18,7 +18,7 @@ from cronos_lerobot.agents.base import (
     Batch,
     Columns,
     LearningAgent,
-    TrainablePolicy,
+    is_trainable,
     plain_sample,
 )
 from cronos_lerobot.agents.chunk_player import ChunkPlayer, Player, make_player
@@ -155,7 +155,7 @@ class ImitationAgent(LearningAgent):
             self._learner.load_state_dict(self.policy.state_dict() | state.get("learner", {}))
 
     def _make_player(self, generator: torch.Generator) -> Player:
-        if not isinstance(self.policy, TrainablePolicy):
+        if not is_trainable(self.policy):
             return make_player(self.policy)
 
         def plan(frames: list[Batch]) -> Tensor:

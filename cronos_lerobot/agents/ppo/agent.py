@@ -15,7 +15,7 @@ from cronos_lerobot.agents.history import ObservationHistory, observation_steps
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
 from cronos_lerobot.agents.ppo.state import join_rollouts, set_optimizer
-from cronos_lerobot.agents.processing import observation_columns
+from cronos_lerobot.agents.processing import observation_columns, to_array
 from cronos_lerobot.agents.state import to_arrays, to_tensors
 from cronos_lerobot.stopwatch import Stopwatch
 
@@ -175,7 +175,7 @@ class PPOAgent(LearningAgent):
             )
         return encoded, Decision(
             actions=self.ppo.processors.physical_actions(actions.flatten(0, 1)).reshape(actions.shape),
-            trace=sample["trace"].cpu().numpy(),
+            trace=to_array("trace", sample["trace"]),
             log_prob=sample["log_prob"].float().cpu().numpy(),
             value=sample["value"].float().cpu().numpy(),
         )

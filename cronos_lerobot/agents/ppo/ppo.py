@@ -67,7 +67,7 @@ class PPO:
 
     Raises:
         TypeError: the policy is not trainable.
-        ValueError: cloning would train nothing of it.
+        ValueError: cloning would train nothing of it, or there is no critic to train.
     """
 
     def __init__(
@@ -96,6 +96,12 @@ class PPO:
             group["lr"] = lrs[group["name"]]
             group["params"] = [p for p in group["params"] if p.requires_grad]
             self._params[group["name"]] += group["params"]
+        if not self._params["value"]:
+            raise ValueError(
+                f"PPO has no critic to train: all that {type(policy).__name__} estimates values with is frozen, as"
+                " adapters of --peft.* leave it. Adapters of the policy's own (--policy.lora_rank of openvla, "
+                "--policy.path of adapters for smolvla and pi0) keep it."
+            )
         _freeze_all_but(self._params["policy"] + self._params["value"], policy)
         self.self_imitation = self_imitation
         if self_imitation is not None:

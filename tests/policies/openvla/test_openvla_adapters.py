@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot_policy_openvla import OpenVLAPolicy
 from lerobot_policy_openvla.adapters import ADAPTER_CONFIG, ADAPTER_WEIGHTS
 from openvla_samples import log_probs_and_values, make_batch, make_policy, reference_of
@@ -88,6 +89,19 @@ def test_published_adapters(published, published_adapter, tmp_path):
     apart.save_pretrained(tmp_path / "saved")
     again = OpenVLAPolicy.from_pretrained(tmp_path / "saved")
     assert torch.equal(log_probs_and_values(again), log_probs_and_values(apart))
+
+
+def test_a_merged_adapter_is_in_the_saved_weights_and_not_merged_again(published, published_adapter, tmp_path):
+    policy = make_policy(published, adapter=str(published_adapter), merge_adapter=True)
+    policy.save_pretrained(tmp_path)
+    again = OpenVLAPolicy.from_pretrained(tmp_path)
+    assert torch.equal(log_probs_and_values(again), log_probs_and_values(policy))
+    # As `--policy.path` hands the config over, and once more.
+    config = PreTrainedConfig.from_pretrained(tmp_path)
+    again = OpenVLAPolicy.from_pretrained(tmp_path, config=config)
+    again.save_pretrained(tmp_path / "again")
+    once_more = OpenVLAPolicy.from_pretrained(tmp_path / "again")
+    assert torch.equal(log_probs_and_values(once_more), log_probs_and_values(policy))
 
 
 def test_fresh_adapters_on_top_of_a_merged_one(published, published_adapter, tmp_path):

@@ -110,6 +110,19 @@ def test_clone_then_train_kill_resume(cloned, tmp_path, monkeypatch):
     assert torch.equal(policy.state_dict()["value_head.layers.4.bias"], after["value_head.layers.4.bias"])
 
 
+def test_a_whole_network_goes_on(published, tmp_path, monkeypatch):
+    """Without adapters; the run keeps the checkpoint that it began with."""
+    start = ("--policy.type=openvla", f"--policy.checkpoint={published}", "--policy.unnorm_key=bridge_orig")
+    start += ("--policy.device=cpu", "--algorithm.type=ppo_paper", *SMALL_LOOP)
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    cronos_train(monkeypatch, *start, "--steps=16", f"--output_dir={whole}")
+    cronos_train(monkeypatch, *start, "--steps=8", f"--output_dir={broken}")
+    last = broken / "checkpoints/last/pretrained_model"
+    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=16")
+    after = load_file(whole / "checkpoints/last/pretrained_model/model.safetensors")
+    assert all(torch.equal(tensor, after[name]) for name, tensor in load_file(last / "model.safetensors").items())
+
+
 def test_the_papers_preset(published, tmp_path, monkeypatch):
     """The file's flags reach the run; a frozen vision tower's features are kept, and the ratio starts at 1."""
     output = tmp_path / "run"

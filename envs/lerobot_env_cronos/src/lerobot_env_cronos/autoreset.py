@@ -1,5 +1,6 @@
 """Episodes that follow one another by themselves: what `gymnasium.make_vec` makes of a scene."""
 
+import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 from lerobot_env_cronos.episodic import IndependentVectorEnv, draw_start, find_task
 from lerobot_env_cronos.scene.scenes import get_scene
-from lerobot_env_cronos.vector_env import check_options
+from lerobot_env_cronos.vector_env import LEROBOT_OPTIONS, check_options
 
 
 class CronosGymVectorEnv(IndependentVectorEnv):
@@ -57,10 +58,21 @@ class CronosGymVectorEnv(IndependentVectorEnv):
         self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode}
         self._generators = [np_random()[0] for _ in range(num_envs)]
 
+    def get_state(self) -> dict[str, np.ndarray]:
+        """See `IndependentVectorEnv.get_state`; with the generators that draw the next episodes, as JSON."""
+        drawn = [json.dumps(generator.bit_generator.state) for generator in self._generators]
+        return super().get_state() | {"generators": np.array(drawn)}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """See `CronosVectorEnv.set_state`."""
+        super().set_state(state)
+        for generator, text in zip(self._generators, state["generators"], strict=True):
+            generator.bit_generator.state = json.loads(str(text))
+
     def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None):
         """Start an episode in every environment; environment i is seeded with `seed + i` or `seeds[i]`."""
         gym.vector.VectorEnv.reset(self, seed=seed if isinstance(seed, int) else None)
-        options = check_options(options, ("configuration", "reset_mask"))
+        options = check_options(options, ("configuration", "reset_mask", *LEROBOT_OPTIONS))
         mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             raise ValueError(f"reset_mask must be ({self.num_envs},) bool with a True in it, got {mask}")

@@ -46,6 +46,16 @@ class EpisodicVectorEnv(CronosVectorEnv):
         self.done = np.zeros(num_envs, dtype=bool)
         self._last: dict[str, Any] | None = None
 
+    def get_state(self) -> dict[str, np.ndarray]:
+        """See `CronosVectorEnv.get_state`; with who is done."""
+        return super().get_state() | {"done": self.done.copy()}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """See `CronosVectorEnv.set_state`."""
+        super().set_state(state)
+        self.done[:] = state["done"]
+        self._last = None
+
     def observe_running(self, running: np.ndarray) -> dict[str, Any]:
         """The observation of all environments, made anew for `running` (k,) only; arrays are fresh."""
         if self._last is None or len(running) == self.num_envs:
@@ -72,6 +82,15 @@ class IndependentVectorEnv(EpisodicVectorEnv):
         self._max_episode_steps = STEPS_PER_TASK
         super().__init__(num_envs, scene, **kwargs)
         self._elapsed = np.zeros(num_envs, dtype=int)
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """See `EpisodicVectorEnv.get_state`; with the steps of each episode so far."""
+        return super().get_state() | {"elapsed": self._elapsed.copy()}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """See `CronosVectorEnv.set_state`."""
+        super().set_state(state)
+        self._elapsed[:] = state["elapsed"]
 
     def reset(self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None):
         """Start new episodes everywhere, at starts number `seed + i` or `seeds[i]`, modulo their count."""
@@ -174,6 +193,7 @@ class CronosEnv(gym.Env):
         self.render_mode = render_mode
         chosen = find_task(scene, task)
         self._tasks = get_scene(scene).tasks if chosen is None else (chosen,)
+        self._max_episode_steps = STEPS_PER_TASK
         self._env = IndependentVectorEnv(1, scene, task=self._tasks[0], split=split, **kwargs)
         self.observation_space = self._env.single_observation_space
         self.action_space = self._env.single_action_space
@@ -184,10 +204,13 @@ class CronosEnv(gym.Env):
         """The current language instruction."""
         return self._env.instructions[0]
 
+    task = task_description
+    """The same, by the other name that LeRobot asks for."""
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Start an episode; see the class."""
         super().reset(seed=seed)
-        chosen = check_options(options, ("configuration",)).get("configuration")
+        chosen = check_options(options, ("configuration", *LEROBOT_OPTIONS)).get("configuration")
         start, self._env.task = draw_start(self.np_random, len(self._env.starts), self._tasks, chosen)
         observation, info = self._env.reset(seed=[start])
         self._over = (False, False)

@@ -86,6 +86,26 @@ class SequentialVectorEnv(EpisodicVectorEnv):
         # Nothing runs before it is started.
         self.done[:] = True
 
+    def get_state(self) -> dict[str, np.ndarray]:
+        """See `EpisodicVectorEnv.get_state`; with the chains, and how far each has come."""
+        valid, longest = self.scene.tasks + self.scene.reset_tasks, max(map(len, self._orderings))
+        numbers = [[valid.index(task) for task in ordering] for ordering in self._orderings]
+        return super().get_state() | {
+            "orderings": np.array([row + [-1] * (longest - len(row)) for row in numbers]),
+            "elapsed": self._elapsed.copy(),
+            "chain_length": self.chain_length.copy(),
+            "position": self.position.copy(),
+            "is_complete": self._is_complete.copy(),
+        }
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """See `CronosVectorEnv.set_state`."""
+        super().set_state(state)
+        valid = self.scene.tasks + self.scene.reset_tasks
+        self._orderings = [tuple(valid[i] for i in row if i >= 0) for row in state["orderings"]]
+        self._elapsed[:], self._is_complete[:] = state["elapsed"], state["is_complete"]
+        self.chain_length[:], self.position[:] = state["chain_length"], state["position"]
+
     def reset(self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None):
         """Start `ordering` everywhere, at starts number `seed + i` or `seeds[i]`, modulo their count."""
         check_options(options, LEROBOT_OPTIONS)

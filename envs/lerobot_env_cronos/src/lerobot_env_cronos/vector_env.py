@@ -274,7 +274,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self.timer = nullcontext
-        self.simulation = Simulation(self.scene, self.num_envs, self._num_threads)
+        self.simulation = Simulation(self.scene, self.num_envs, self._num_threads, self.physics)
         self.simulation.set_state(state["simulation"])
         self._observations.simulation = self.simulation
 

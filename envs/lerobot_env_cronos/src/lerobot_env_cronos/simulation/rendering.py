@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol
@@ -89,12 +90,15 @@ class ClassicRenderer:
         in_software = processes > 1 and SOFTWARE in _GL_THREAD.submit(self._canvas.driver).result()
         self._processes = processes if in_software and not shadows else 1
         self._pool: RenderPool | None = None
+        self._pool_lock = threading.Lock()
 
     def render(self, qpos: np.ndarray) -> np.ndarray:
         """Render states `qpos` (n, nq) to uint8 frames (n, height, width, 3)."""
         gl.claim_process()
         if self._processes > 1 and len(qpos) >= MIN_FRAMES * self._processes:
-            return self._pool_for(len(qpos)).render(qpos)
+            # The processes draw into one shared memory: one batch at a time.
+            with self._pool_lock:
+                return self._pool_for(len(qpos)).render(qpos)
         frames = np.empty((len(qpos), self.height, self.width, 3), np.uint8)
         _GL_THREAD.submit(self._canvas.draw, qpos, frames).result()
         return frames
