@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
+from copy import copy
 from pathlib import Path
 from typing import Any, Literal
 
@@ -232,7 +233,16 @@ class OpenVLAPolicy(PreTrainedPolicy):
         return policy.to(config.device).eval()
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        super()._save_pretrained(save_directory, state_dict)
+        config = self.config
+        if self.saves_base:
+            # All of it is in the folder: what it was built from need not be there where it is loaded.
+            self.config = copy(config)
+            self.config.checkpoint = self.config.checkpoint_revision = self.config.adapter = None
+            self.config.merge_adapter = False
+        try:
+            super()._save_pretrained(save_directory, state_dict)
+        finally:
+            self.config = config
         self.prompt_tokenizer.save(save_directory)
 
     def save_adapter(self, folder: Path) -> None:
