@@ -91,7 +91,11 @@ def is_trainable(policy: Any) -> bool:
 
     `isinstance` would not see the latter.
     """
-    return all(callable(getattr(policy, name, None)) for name in POLICY_METHODS)
+    return not _missing_methods(policy)
+
+
+def _missing_methods(policy: Any) -> list[str]:
+    return [name for name in POLICY_METHODS if not callable(getattr(policy, name, None))]
 
 
 def check_trainable(policy: Any) -> None:
@@ -100,8 +104,7 @@ def check_trainable(policy: Any) -> None:
     Raises:
         TypeError: a method is missing.
     """
-    missing = [name for name in POLICY_METHODS if not callable(getattr(policy, name, None))]
-    if missing:
+    if missing := _missing_methods(policy):
         raise TypeError(
             f"{type(policy).__name__} cannot be trained by reinforcement: it has no {', '.join(missing)}. "
             f"A trainable policy has {', '.join(POLICY_METHODS)}; see cronos_lerobot.agents.base.TrainablePolicy."

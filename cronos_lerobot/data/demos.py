@@ -307,7 +307,10 @@ class DemoCollector:
     def _earlier(self, task: Task, rng: np.random.Generator) -> list[Task]:
         """What was done before the last task before; never the task itself, which would be found complete."""
         most = self.config.start.earlier_tasks
-        return self._others(task, rng, int(rng.integers(most))) if most > 1 else []
+        if most <= 1:
+            return []
+        count, others = int(rng.integers(most)), self._others(task)
+        return [others[i] for i in rng.integers(len(others), size=count)]
 
     def _check_starts(self, task: Task) -> None:
         """Check that the scene has what `config.start` wants done before a task.
@@ -316,11 +319,7 @@ class DemoCollector:
             ValueError: it has not.
         """
         start, scene = self.config.start, self.env.scene
-        if task.receptacle is not None and not start.is_after_another:
-            return
-        others = [other for other in scene.tasks if other != task]
-        before_reset = task.receptacle is None and any(other.object == task.object for other in scene.tasks)
-        if not others or not (before_reset or self.policy is not None or self._choices(task)):
+        if (task.receptacle is None or start.is_after_another) and not self._choices(task):
             raise ValueError(
                 f"nothing can be done before {task.instruction!r} in {scene.name}, which has {len(scene.objects)} "
                 f"object(s) and {len(scene.receptacles)} receptacle(s), as --start.arm_pose={start.arm_pose}, "
@@ -328,26 +327,25 @@ class DemoCollector:
                 f"--start.misplaced_objects={str(start.misplaced_objects).lower()} ask"
             )
 
-    def _others(self, task: Task, rng: np.random.Generator, count: int) -> list[Task]:
-        others = [other for other in self.env.scene.tasks if other != task]
-        return [others[i] for i in rng.integers(len(others), size=count)]
+    def _others(self, task: Task) -> list[Task]:
+        return [other for other in self.env.scene.tasks if other != task]
 
     def _prelude(self, task: Task, rng: np.random.Generator) -> Task:
-        """What was done before: another object put onto the target receptacle, or the task's own onto another one.
-
-        With neither asked for, another object onto another receptacle; before a reset task, its object onto any.
-        """
-        if task.receptacle is None:
-            own = [other for other in self.env.scene.tasks if other.object == task.object]
-            return own[rng.integers(len(own))]
-        if self.policy is not None:
-            return self._others(task, rng, 1)[0]
+        """What was done before."""
         choices = self._choices(task)
         return choices[rng.integers(len(choices))]
 
     def _choices(self, task: Task) -> list[Task]:
-        """What an expert may do before a task that is no reset task."""
+        """What may be done before: another object onto the target receptacle, or the task's own onto another one.
+
+        With neither asked for, another object onto another receptacle; before a reset task, its object onto any. A
+        policy does any other task.
+        """
         start = self.config.start
+        if task.receptacle is None:
+            return [other for other in self.env.scene.tasks if other.object == task.object]
+        if self.policy is not None:
+            return self._others(task)
         # Whether the task before had the same object, and the same receptacle.
         wanted = {(False, True)} if start.occupied_receptacles else set()
         wanted |= {(True, False)} if start.misplaced_objects else set()

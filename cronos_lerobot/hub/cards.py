@@ -33,7 +33,7 @@ def render_card(kind: str, **values: Any) -> str:
         keep_trailing_newline=True,
         autoescape=False,
     )
-    environment.filters |= {"table": table, "code": code, "multiply": operator.mul}
+    environment.filters |= {"table": table, "code": code, "multiply": operator.mul, "sampling": describe_sampling}
     common = {"hub": constants.ENDPOINT, "versions": package_versions(), "commit": git_commit()}
     return environment.get_template(f"{kind}.md").render(common | values)
 
@@ -42,6 +42,13 @@ def table(rows: Iterable[Iterable[Any]], *header: str) -> str:
     """A Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def describe_sampling(temperature: float | None) -> str:
+    """How the actions of an evaluation were drawn, in words."""
+    if temperature is None:
+        return "the policy's own sampling"
+    return f"temperature {temperature}" if temperature else "greedy"
 
 
 def code(text: Any) -> str:

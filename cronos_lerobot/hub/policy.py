@@ -79,8 +79,8 @@ def _read_scores(path: Path, checkpoint: Checkpoint) -> dict[str, Any]:
     results = read_results(path)
     evaluated = results.get("policy")
     # Results of before there was a hash of the files alone are taken at their word.
-    files = results.get("policy_files") or files_fingerprint(checkpoint.model)
-    if evaluated == EXPERT or files != files_fingerprint(checkpoint.model):
+    files = results.get("policy_files")
+    if evaluated == EXPERT or (files and files != files_fingerprint(checkpoint.model)):
         raise ValueError(f"--results={path} is of {evaluated}, whose weights are not those of {checkpoint.model}")
     return results
 

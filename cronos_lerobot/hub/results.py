@@ -16,6 +16,7 @@ from lerobot_env_cronos.benchmark.benchmark import SUITES
 from cronos_lerobot.evaluation.config import EXPERT
 from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.hub.benchmark import task_id
+from cronos_lerobot.hub.cards import describe_sampling
 from cronos_lerobot.hub.config import ResultsConfig
 from cronos_lerobot.hub.push import PublishError, explained
 
@@ -38,10 +39,12 @@ def write_results(config: ResultsConfig, folder: Path) -> str:
         raise ValueError("--results=<results.json of cronos-eval, or its folder> is required")
     results = read_results(config.results)
     check_policy(results, config.repo_id)
-    _check_commit(results, config)
+    with explained(config.target):
+        revision = _revision(config)
+        _check_commit(results, config.repo_id, revision)
     benchmark = _load(config, results)
     entries = make_entries(results, benchmark, config)
-    content = merge(_published(config), eval_result_entries_to_yaml(entries))
+    content = merge(_published(config, revision), eval_result_entries_to_yaml(entries))
     path = folder / FILE
     path.parent.mkdir(parents=True)
     path.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=110))
@@ -69,22 +72,19 @@ def check_policy(results: dict[str, Any], repo_id: str) -> None:
         )
 
 
-def _check_commit(results: dict[str, Any], config: ResultsConfig) -> None:
-    """Check that the policy of the commit that was evaluated is the one that stands there now."""
-    api = HfApi()
+def _check_commit(results: dict[str, Any], repo_id: str, revision: str | None) -> None:
+    """Check that the policy of the commit that was evaluated is the one that stands at `revision`."""
     evaluated = results["policy_revision"]
-    with explained(config.target):
-        here = _policy_files(api, config.repo_id, _revision(api, config))
-        if _policy_files(api, config.repo_id, evaluated) != here:
-            raise PublishError(
-                f"the results are of {config.repo_id} as it was at {evaluated}, which has another policy now:"
-                f" evaluate it again, in a new --output_dir"
-            )
+    if _policy_files(repo_id, evaluated) != _policy_files(repo_id, revision):
+        raise PublishError(
+            f"the results are of {repo_id} as it was at {evaluated}, which has another policy now: evaluate it"
+            " again, in a new --output_dir"
+        )
 
 
-def _policy_files(api: HfApi, repo_id: str, revision: str | None) -> dict[str, str]:
+def _policy_files(repo_id: str, revision: str | None) -> dict[str, str]:
     """Hashes of the files that make a policy, by name."""
-    files = (one for one in api.list_repo_tree(repo_id, revision=revision) if isinstance(one, RepoFile))
+    files = (one for one in HfApi().list_repo_tree(repo_id, revision=revision) if isinstance(one, RepoFile))
     return {
         one.path: one.lfs.sha256 if one.lfs else one.blob_id
         for one in files
@@ -92,9 +92,9 @@ def _policy_files(api: HfApi, repo_id: str, revision: str | None) -> dict[str, s
     }
 
 
-def _revision(api: HfApi, config: ResultsConfig) -> str | None:
+def _revision(config: ResultsConfig) -> str | None:
     """The revision that the results are written onto."""
-    branches = {branch.name for branch in api.list_repo_refs(config.repo_id).branches}
+    branches = {branch.name for branch in HfApi().list_repo_refs(config.repo_id).branches}
     return config.branch if config.branch in branches else config.revision
 
 
@@ -179,14 +179,7 @@ def _notes(suite: str, scores: dict[str, Any], results: dict[str, Any]) -> list[
     else:
         low, high = scores["ci95"]
         what = [f"success in %, 95 % interval {100 * low:.1f} to {100 * high:.1f}"]
-    temperature = results["temperature"]
-    how = (
-        "greedy"
-        if temperature == 0
-        else f"temperature {temperature}"
-        if temperature
-        else "the policy's own sampling"
-    )
+    how = describe_sampling(results["temperature"])
     versions = results["versions"]
     packages = [
         f"{name} {versions[name]}" for name in ("cronos-lerobot", "lerobot_env_cronos") if name in versions
@@ -194,11 +187,10 @@ def _notes(suite: str, scores: dict[str, Any], results: dict[str, Any]) -> list[
     return [f"n={scores['n']}", *what, how, f"seed {results['seed']}", results["obs_type"], ", ".join(packages)]
 
 
-def _published(config: ResultsConfig) -> list[dict[str, Any]]:
+def _published(config: ResultsConfig, revision: str | None) -> list[dict[str, Any]]:
     """The entries that the repository has."""
     api = HfApi()
     with explained(config.target):
-        revision = _revision(api, config)
         api.model_info(config.repo_id, revision=revision)
         try:
             path = api.hf_hub_download(config.repo_id, FILE, revision=revision)

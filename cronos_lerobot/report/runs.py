@@ -81,11 +81,8 @@ class TrainingRun:
     @property
     def changed(self) -> dict[str, str]:
         """Flags of the protocol and the agent that a resume changed, with the values that they had in turn."""
-        parts = ("protocol", "algorithm")
-        flags = [
-            _flatten({part: start["config"].get(part) or {} for part in parts if "config" in start})
-            for start in self.starts
-        ]
+        configs = [start.get("config") or {} for start in self.starts]
+        flags = [_flatten({part: one.get(part) or {} for part in ("protocol", "algorithm")}) for one in configs]
         # One that a start did not have yet is of another version.
         shared = set.intersection(*map(set, flags)) if flags else set()
         values = {name: list(dict.fromkeys(start[name] for start in flags)) for name in sorted(shared)}
@@ -315,8 +312,7 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
     groups: dict[str, Group] = {}
     flat = {}
     for run in runs:
-        config = {key: value for key, value in run.config.items() if key not in NOT_THE_EXPERIMENT}
-        config = _below_root(config)
+        config = _below_root({name: value for name, value in run.config.items() if name not in NOT_THE_EXPERIMENT})
         key = json.dumps([config, run.changed], sort_keys=True) if config else str(run.folder)
         group = groups.setdefault(key, Group(run.name))
         # A longer run of the same seed begins with the shorter one: counted twice it would narrow the spread.

@@ -97,3 +97,11 @@ def test_a_history_is_preprocessed_observation_by_observation():
         alone = processors.batch({name: col[:, step] for name, col in columns.items()}, ["put it", "there"])
         for name in ("observation.images.front", "observation.renamed"):
             assert torch.equal(batch[name][:, step], alone[name])
+
+
+def test_bfloat16_is_refused_by_the_name_of_what_it_is():
+    processors = PolicyProcessors(
+        *identity_processors(), encoder=lambda batch: {"features": batch["observation.state"].bfloat16()}
+    )
+    with pytest.raises(TypeError, match=r"the policy's 'features' is bfloat16.*view\(torch.int16\)"):
+        processors.encode({"observation.state": np.zeros((1, 2), np.float32)}, ["a"])

@@ -1,5 +1,8 @@
 import logging
 import sys
+from collections import Counter
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -250,6 +253,17 @@ def test_what_fell_onto_its_receptacle_is_nothing_to_show(env, tmp_path):
     config = DemoConfig(start=StartConfig(leaning_share=1.0), steps_after_release=2)
     dataset, _ = collect(env, tmp_path / "d", config, 12)
     assert not any(episode["next.success"][0] for episode in episodes_of(dataset))
+
+
+def test_a_scene_too_small_for_what_is_to_come_before_is_refused(env, monkeypatch):
+    monkeypatch.setattr(env, "scene", replace(env.scene, receptacles=env.scene.receptacles[:1]))
+    writer = SimpleNamespace(num_episodes=0, episodes_before=Counter())
+    config = DemoConfig(start=StartConfig(arm_pose="after_task", share=1.0))
+    message = (
+        r"nothing can be done before .* has 2 object\(s\) and 1 receptacle\(s\), as --start.arm_pose=after_task"
+    )
+    with pytest.raises(ValueError, match=message):
+        DemoCollector(env, ScriptedExpert(env), writer, config)
 
 
 def test_failures_are_dropped_unless_asked_for(env, tmp_path):

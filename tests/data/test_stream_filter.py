@@ -163,9 +163,9 @@ def test_command(source, tmp_path, monkeypatch, capsys):
     dataset = ("--dataset.repo_id=me/stream", f"--dataset.root={source.meta.root}")
     cronos_streams(monkeypatch, "check", *dataset)
     assert capsys.readouterr().out == "whole: 3 streams, 24 segments, 96 frames\n"
-    cronos_streams(monkeypatch, "statistics", *dataset, f"--output={tmp_path / 'statistics.json'}")
+    cronos_streams(monkeypatch, "statistics", *dataset, f"--output={tmp_path / 'new/statistics.json'}")
     assert "[0.31, 0.69]" in capsys.readouterr().out  # Wilson's interval of 12 of 24
-    assert json.loads((tmp_path / "statistics.json").read_text())["success"] == [12, 4, 24]
+    assert json.loads((tmp_path / "new/statistics.json").read_text())["success"] == [12, 4, 24]
     output = ("--output.repo_id=me/kept", f"--output.root={tmp_path / 'kept'}")
     cronos_streams(monkeypatch, "filter", *dataset, *output, "--filter.success=true", "--frames_after_success=1")
     assert capsys.readouterr().out == f"12 of 24 segments in {tmp_path / 'kept'}\n"

@@ -132,7 +132,7 @@ def test_a_card_says_how_actions_were_sampled(tmp_path, monkeypatch):
     lines = [line for line in dry_run(checkpoint, tmp_path / "out").splitlines() if "0.500 [0.100, 0.900]" in line]
     assert lines == [
         f"| 32 | {interventions} | 0.500 [0.100, 0.900] | 4 | held-out | {sampling} |"
-        for interventions, sampling in enumerate(("temperature 0.6", "greedy", "the policy's own"))
+        for interventions, sampling in enumerate(("temperature 0.6", "greedy", "the policy's own sampling"))
     ]
 
 
@@ -158,7 +158,7 @@ def test_the_scores_of_one_suite_are_on_the_card_and_no_folder_of_the_users(tmp_
     files = files_fingerprint(checkpoint / "pretrained_model")
     card = dry_run(checkpoint, tmp_path / "out", results=write_scores(tmp_path / "eval", policy_files=files))
     assert "| independent, train | success | 1.000 " in card
-    assert "benchmark `a local benchmark`, sampling: the policy's own, seed 3" in card
+    assert "benchmark `a local benchmark`, the policy's own sampling, seed 3" in card
     assert "/home/me" not in card
 
 

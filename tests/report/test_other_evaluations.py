@@ -1,4 +1,4 @@
-"""A resumed run's evaluations under other settings are no part of its curve, and that is said."""
+"""Evaluations of a run that are no part of its curve, runs that are no seeds of the others: left out, and said."""
 
 import json
 import sys
@@ -10,7 +10,7 @@ from cronos_lerobot.report.comparisons import compare_training
 from cronos_lerobot.report.runs import find_runs, group_runs
 from cronos_lerobot.report.series import evaluation_curve
 from cronos_lerobot.report.tables import seed_rows
-from cronos_lerobot.scripts.report import main
+from cronos_lerobot.scripts.report import main, make_report
 
 
 def evaluated_otherwise(run, changes):
@@ -56,3 +56,30 @@ def test_a_run_whose_first_evaluation_was_made_otherwise_has_no_before_and_no_ar
     (row,) = seed_rows(groups)
     assert (row["success"], row["interventions"], row["split"]) == (0.75, 32, "train")
     assert (row["D / steps"], row["C / interventions"]) == (None, None)
+
+
+def test_a_seed_that_did_not_come_as_far_is_left_out_of_the_gains_and_said(tmp_path):
+    for seed, updates in ((1, 8), (2, 8), (3, 8)):
+        write_training_run(tmp_path / str(seed), seed=seed, successes=(2, 4, 5 + seed), updates=updates)
+    killed = tmp_path / "3/metrics.jsonl"
+    lines = killed.read_text().splitlines(keepends=True)
+    killed.write_text("".join(lines[:-2]))
+    report = make_report([tmp_path])
+    (comparison,) = report.comparisons
+    # Seeds 1 and 2 end at 6 and 7 of 8 successes in each of four tasks.
+    assert (comparison.overall.after.successes, comparison.overall.after.n) == (52, 64)
+    (said,) = report.left_out
+    assert said.endswith("/3: the last is after 5,120 steps, another's after 10,240")
+
+
+def test_a_run_that_was_resumed_with_another_protocol_is_no_seed_of_the_others(tmp_path):
+    for seed in (1, 2):
+        write_training_run(tmp_path / str(seed), seed=seed)
+    manifest = tmp_path / "2/manifest.json"
+    (start,) = json.loads(manifest.read_text())["starts"]
+    before = json.loads(json.dumps(start))
+    before["config"]["protocol"]["scene_reset_interval"] = 80
+    before["config"]["algorithm"]["old"] = 1
+    manifest.write_text(json.dumps({"starts": [before, start]}))
+    groups = group_runs(find_runs([tmp_path]).training)
+    assert [group.label for group in groups] == ["1", "2 (resumed with scene_reset_interval=80, then 320)"]

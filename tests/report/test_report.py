@@ -70,33 +70,6 @@ def test_what_cannot_be_read_is_left_out_and_said(tmp_path, monkeypatch, capsys)
         find_runs([tmp_path / "crashed"])
 
 
-def test_a_seed_that_did_not_come_as_far_is_left_out_of_the_gains_and_said(tmp_path):
-    for seed, updates in ((1, 8), (2, 8), (3, 8)):
-        write_training_run(tmp_path / str(seed), seed=seed, successes=(2, 4, 5 + seed), updates=updates)
-    killed = tmp_path / "3/metrics.jsonl"
-    lines = killed.read_text().splitlines(keepends=True)
-    killed.write_text("".join(lines[:-2]))
-    report = make_report([tmp_path])
-    (comparison,) = report.comparisons
-    # Seeds 1 and 2 end at 6 and 7 of 8 successes in each of four tasks.
-    assert (comparison.overall.after.successes, comparison.overall.after.n) == (52, 64)
-    (said,) = report.left_out
-    assert said.endswith("/3: the last is after 5,120 steps, another's after 10,240")
-
-
-def test_a_run_that_was_resumed_with_another_protocol_is_no_seed_of_the_others(tmp_path):
-    for seed in (1, 2):
-        write_training_run(tmp_path / str(seed), seed=seed)
-    manifest = tmp_path / "2/manifest.json"
-    (start,) = json.loads(manifest.read_text())["starts"]
-    before = json.loads(json.dumps(start))
-    before["config"]["protocol"]["scene_reset_interval"] = 80
-    before["config"]["algorithm"]["old"] = 1
-    manifest.write_text(json.dumps({"starts": [before, start]}))
-    groups = group_runs(find_runs([tmp_path]).training)
-    assert [group.label for group in groups] == ["1", "2 (resumed with scene_reset_interval=80, then 320)"]
-
-
 def write_seeds(folder, policy=None, fingerprints=(None, None)):
     """Two seeds that go from 2 of 8 successes in each task to 5 and 7."""
     for seed, last, fingerprint in ((1, 5, fingerprints[0]), (2, 7, fingerprints[1])):

@@ -5,8 +5,10 @@ import logging
 from types import SimpleNamespace
 
 import pytest
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.utils.constants import OBS_STATE
 from lerobot_env_cronos import CronosEnvConfig
+from lerobot_policy_pocketvla import PocketVLAConfig
 from tiny_checkpoints import STATE, save_policy
 
 from cronos_lerobot.agents.imitation.config import DemosConfig, ImitationConfig
@@ -16,6 +18,7 @@ from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosCo
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.factory import (
     check_demonstrations,
+    check_features,
     make_policy_and_processors,
     warn_of_other_scene,
 )
@@ -79,3 +82,26 @@ def test_a_run_looks_at_both(demos, tmp_path, caplog):
     config.algorithm = ImitationConfig(demos=DemosConfig("me/demos", demos), demos_share=0.5)
     with pytest.raises(ValueError, match="record demonstrations there"):
         make_policy_and_processors(config)
+
+
+def pictured(name, size):
+    """A policy that takes the robot's state and one picture."""
+    features = {OBS_STATE: PolicyFeature(FeatureType.STATE, (13,)), name: PolicyFeature(FeatureType.VISUAL, size)}
+    return SimpleNamespace(input_features=features, output_features={})
+
+
+def test_pictures_of_another_size_are_told_and_empty_cameras_are_not_asked_for(caplog):
+    env = CronosEnvConfig()
+    check_features(pictured("observation.images.empty_camera_0", (3, 64, 64)), env)
+    check_features(pictured("observation.images.front", (3, 128, 128)), env)
+    assert not caplog.records
+    check_features(pictured("observation.images.front", (3, 64, 48)), env)
+    (record,) = caplog.records
+    assert "of 64 x 48 pixels and learns here from 128 x 128" in record.message
+    assert "--env.observation_height=64 --env.observation_width=48" in record.message
+
+
+def test_a_precision_that_training_would_ignore_is_refused():
+    policy = PocketVLAConfig(device="cpu", use_amp=True)
+    with pytest.raises(ValueError, match=r"--policy.use_amp=true is followed by evaluations alone"):
+        make_policy_and_processors(CronosTrainConfig(policy=policy, env=CronosEnvConfig()))

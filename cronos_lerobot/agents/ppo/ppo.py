@@ -99,8 +99,7 @@ class PPO:
         if not self._params["value"]:
             raise ValueError(
                 f"PPO has no critic to train: all that {type(policy).__name__} estimates values with is frozen, as"
-                " adapters of --peft.* leave it. Adapters of the policy's own (--policy.lora_rank of openvla, "
-                "--policy.path of adapters for smolvla and pi0) keep it."
+                " adapters of --peft.* leave what they do not name."
             )
         _freeze_all_but(self._params["policy"] + self._params["value"], policy)
         self.self_imitation = self_imitation

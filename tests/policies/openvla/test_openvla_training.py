@@ -90,19 +90,25 @@ def test_what_lerobot_train_leaves(cloned, published):
     assert (action[:, :6].abs() < 0.21).all()
 
 
-def test_clone_then_train_kill_resume(cloned, tmp_path, monkeypatch):
-    """PPO goes on with the cloned adapter; a resumed run ends with the same weights to the bit."""
-    start = (f"--policy.path={cloned}", "--policy.use_peft=false", "--algorithm.type=ppo_paper", *SMALL_LOOP)
+def train_twice(monkeypatch, tmp_path, *start):
+    """A run of 16 steps, and one of 8 that is resumed to 16: its folder, and the last policy of the other."""
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     cronos_train(monkeypatch, *start, "--steps=16", f"--output_dir={whole}")
     cronos_train(monkeypatch, *start, "--steps=8", f"--output_dir={broken}")
     last = broken / "checkpoints/last/pretrained_model"
     cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=16")
+    return whole, last
+
+
+def test_clone_then_train_kill_resume(cloned, tmp_path, monkeypatch):
+    """PPO goes on with the cloned adapter; a resumed run ends with the same weights to the bit."""
+    start = (f"--policy.path={cloned}", "--policy.use_peft=false", "--algorithm.type=ppo_paper", *SMALL_LOOP)
+    whole, last = train_twice(monkeypatch, tmp_path, *start)
     after = load_file(whole / "checkpoints/last/pretrained_model/model.safetensors")
     assert all(".lora_" in name or name.startswith("value_head.") for name in after)
     for name, tensor in load_file(last / "model.safetensors").items():
         assert torch.equal(tensor, after[name]), name
-    before = load_file(broken / "checkpoints/000008/pretrained_model/model.safetensors")
+    before = load_file(tmp_path / "broken/checkpoints/000008/pretrained_model/model.safetensors")
     changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
     # No reward so early: the value head, which says 0, is right.
     assert changed == {"network"}
@@ -114,13 +120,11 @@ def test_a_whole_network_goes_on(published, tmp_path, monkeypatch):
     """Without adapters; the run keeps the checkpoint that it began with."""
     start = ("--policy.type=openvla", f"--policy.checkpoint={published}", "--policy.unnorm_key=bridge_orig")
     start += ("--policy.device=cpu", "--algorithm.type=ppo_paper", *SMALL_LOOP)
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    cronos_train(monkeypatch, *start, "--steps=16", f"--output_dir={whole}")
-    cronos_train(monkeypatch, *start, "--steps=8", f"--output_dir={broken}")
-    last = broken / "checkpoints/last/pretrained_model"
-    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=16")
-    after = load_file(whole / "checkpoints/last/pretrained_model/model.safetensors")
-    assert all(torch.equal(tensor, after[name]) for name, tensor in load_file(last / "model.safetensors").items())
+    whole, last = train_twice(monkeypatch, tmp_path, *start)
+    resumed = load_file(last / "model.safetensors")
+    for folder, same in ((whole / "checkpoints/last", True), (tmp_path / "broken/checkpoints/000008", False)):
+        other = load_file(folder / "pretrained_model/model.safetensors")
+        assert all(torch.equal(tensor, other[name]) for name, tensor in resumed.items()) == same
 
 
 def test_the_papers_preset(published, tmp_path, monkeypatch):

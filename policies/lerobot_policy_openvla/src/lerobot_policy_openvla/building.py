@@ -44,6 +44,9 @@ def finish_network(network: OpenVLANetwork, config: OpenVLAConfig) -> None:
     """Do to a network what `config` asks for: merge, quantise, adapt, checkpoint gradients."""
     if config.adapter and config.merge_adapter:
         load_adapter(network, config.adapter, merge=True)
+        if not config.lora_rank and config.quantization == "none":
+            # The weights are the policy's own from now on, which are saved and loaded as they are.
+            config.adapter, config.merge_adapter = None, False
     if config.quantization != "none":
         quantize(network, config.quantization, config.device or "cpu")
         network.requires_grad_(False)

@@ -44,13 +44,9 @@ def config_for(
         return config, None
     if (folder / WEIGHTS).is_file():
         if holds_network(folder):
-            saved = PreTrainedConfig.from_pretrained(folder)
             # The caller's stays as it is: a run that is resumed compares it with what it began with.
             config = copy(config)
             config.checkpoint, config.checkpoint_revision = name, revision
-            if config.adapter == getattr(saved, "adapter", None):
-                # It was merged into the weights that were saved.
-                config.adapter, config.merge_adapter = None, False
         return config, folder / WEIGHTS
     if (folder / ADAPTER_WEIGHTS).is_file():
         below: dict[str, Any] = json.loads((folder / ADAPTER_CONFIG).read_text())

@@ -233,16 +233,12 @@ class OpenVLAPolicy(PreTrainedPolicy):
         return policy.to(config.device).eval()
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        config = self.config
+        super()._save_pretrained(save_directory, state_dict)
         if self.saves_base:
             # All of it is in the folder: what it was built from need not be there where it is loaded.
-            self.config = copy(config)
-            self.config.checkpoint = self.config.checkpoint_revision = self.config.adapter = None
-            self.config.merge_adapter = False
-        try:
-            super()._save_pretrained(save_directory, state_dict)
-        finally:
-            self.config = config
+            config = copy(self.config)
+            config.checkpoint = config.checkpoint_revision = None
+            config._save_pretrained(save_directory)
         self.prompt_tokenizer.save(save_directory)
 
     def save_adapter(self, folder: Path) -> None:
