@@ -106,7 +106,7 @@ def write_progress(streams: StreamDataset, output: Path, weighting: Weighting) -
         rows = _progress_rows(frames, flags.get("protocol.reward", "difference"), gamma)
     else:
         made_with["gae_lambda"] = gae_lambda
-        _check_values(frames[VALUE].to_numpy(), flags)
+        _check_values(frames)
         rows = _advantage_rows(frames, gamma, gae_lambda)
     columns = {name: frames[name].to_numpy(np.int64) for name in INDICES}
     columns[COLUMN] = np.concatenate(rows).astype(np.float32)
@@ -133,7 +133,8 @@ def _progress_rows(frames: pd.DataFrame, reward: str, gamma: float) -> list[np.n
     return rows
 
 
-def _check_values(values: np.ndarray, flags: Mapping[str, Any]) -> None:
+def _check_values(frames: pd.DataFrame) -> None:
+    values, episodes = frames[VALUE].to_numpy(), frames["episode_index"].to_numpy()
     instead = f"; --weight_by={PROGRESS} needs none"
     if bad := int((~np.isfinite(values)).sum()):
         raise ValueError(
@@ -142,11 +143,14 @@ def _check_values(values: np.ndarray, flags: Mapping[str, Any]) -> None:
         )
     if not values.any():
         raise ValueError(f"{VALUE} is 0 in every frame: who chose these actions had no critic{instead}")
-    # A value is recorded for each decision, and repeated for all of its actions.
-    if (played := int(flags.get("policy.n_action_steps") or 1)) > 1:
+    # The value of a decision is recorded with each of its actions: two a decision repeat half of them. The flags
+    # need not tell, as those of a policy of one's own, and are lost with LeRobot's tools.
+    within = episodes[1:] == episodes[:-1]
+    repeated = int((within & (values[1:] == values[:-1])).sum())
+    if repeated > within.sum() / 3:
         raise ValueError(
-            f"the policy that was recorded played {played} actions a decision, and {VALUE} is of the first alone:"
-            f" advantages want values of every frame{instead}"
+            f"{VALUE} is the same as in the frame before in {repeated} of {within.sum()} frames: the policy that "
+            f"was recorded played several actions a decision, and advantages want values of every frame{instead}"
         )
 
 

@@ -1,5 +1,7 @@
 """A recorded stream whose progress and weights are worked out by hand, with every kind of boundary."""
 
+from collections.abc import Callable
+
 import numpy as np
 from synthetic_segments import FPS, STATE_DIM, images, observation_space
 from synthetic_streams import ORIGIN, make_step
@@ -58,8 +60,10 @@ def rewards_of(levels: list[float], reward: str) -> np.ndarray:
     return np.diff(levels) if reward == "difference" else np.array(levels[1:], float)
 
 
-def record_weighted(root, *, reward="difference", value=None, origin: Origin = ORIGIN) -> None:
-    """Record one stream with pictures; `value` is that of every frame, its step by default."""
+def record_weighted(
+    root, *, reward="difference", value: Callable[[int], float] = float, origin: Origin = ORIGIN
+) -> None:
+    """Record one stream with pictures; `value` is that of the frame at a step."""
     writer = SegmentWriter(
         "me/stream", root, stream_features(observation_space(environment_state=None)), FPS, origin=origin
     )
@@ -80,7 +84,7 @@ def record_weighted(root, *, reward="difference", value=None, origin: Origin = O
                 },
                 actions=np.full((1, 7), t / 10, np.float32),
                 log_prob=np.zeros(1),
-                value=np.full(1, t if value is None else value, float),
+                value=np.array([value(t)]),
                 reward=np.array([paid]),
                 success=np.array([levels[k + 1] == 1]),
                 preceded_by=np.array([Intervention.NONE if k else intervention]),
