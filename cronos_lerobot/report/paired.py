@@ -122,9 +122,10 @@ def compare_policies(pairs: Pairs, power: float) -> Difference:
 def compare_trainings(pairs: Pairs, power: float) -> Difference | None:
     """Trainings like these, on configurations like these; None if neither side has two.
 
-    The variance is clustered both ways, by training and by configuration (Cameron, Gelbach and Miller 2011,
-    "Robust inference with multiway clustering"): that between the trainings of each side, plus that between the
-    configurations, less what is in both. A side of one policy, such as the base of all, is taken as it is. The
+    The variance is that of two crossed factors, training and configuration, both drawn at random (Searle, Casella
+    and McCulloch 1992, "Variance Components", chapter 4): that between the trainings of each side, plus that
+    between the configurations, less the interaction, which both of them have in them. A side of one policy, and
+    what trainings have in common, such as the base that they begin with, is taken as it is. The
     t-interval has Satterthwaite's degrees of freedom.
     """
     sides = [side for side in (pairs.a, pairs.b) if len(side) > 1]
@@ -134,7 +135,7 @@ def compare_trainings(pairs: Pairs, power: float) -> Difference | None:
     value = float(pairs.differences.mean())
     of_side = [float(side.mean(axis=1).var(ddof=1)) / len(side) for side in sides]
     trainings = sum(of_side)
-    both = sum(_variance_within(side, pairs.clusters) for side in sides)
+    both = sum(_interaction(side, pairs.clusters) for side in sides) if k > 1 else 0.0
     configurations = cluster_variance(pairs.differences, pairs.clusters) if k > 1 else 0.0
     more = max(0.0, configurations - both)
     variance = trainings + more
@@ -164,11 +165,15 @@ def cluster_variance(values: np.ndarray, clusters: np.ndarray) -> float:
     return float(np.sum(sums**2)) * k / (k - 1) / len(values) ** 2
 
 
-def _variance_within(side: np.ndarray, clusters: np.ndarray) -> float:
-    """The part of the variance of a side's mean that is of neither its trainings nor its configurations."""
-    centred = side - side.mean()
-    sums = np.stack([np.bincount(clusters, weights=row) for row in centred])
-    return float(np.sum(sums**2)) / side.size**2
+def _interaction(side: np.ndarray, clusters: np.ndarray) -> float:
+    """The part of the variance of a side's mean that is of neither its trainings nor its configurations alone.
+
+    What is the same in all trainings, such as the noise of one base that each is compared with, is not in it.
+    """
+    n, k = len(side), int(clusters.max()) + 1
+    sums = np.stack([np.bincount(clusters, weights=row) for row in side - side.mean()])
+    rest = sums - sums.mean(axis=0) - sums.mean(axis=1, keepdims=True) + sums.mean()
+    return float(np.sum(rest**2)) * n * k / ((n - 1) * (k - 1)) / side.size**2
 
 
 def effective_pairs(differences: np.ndarray, clusters: np.ndarray) -> float:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import ttest_1samp, ttest_ind
+from scipy.stats import ttest_1samp, ttest_ind, ttest_rel
 
 from cronos_lerobot.evaluation.outcomes import Episode
 from cronos_lerobot.report.paired import (
@@ -111,10 +111,34 @@ def test_trainings_that_do_alike_vary_by_configuration():
     b = np.repeat((d > 0).astype(int)[None], 2, axis=0)
     found = compare_trainings(Pairs(a, b, np.arange(6)), power=0.8)
     assert found is not None
-    # Configurations: sum of squares 5 - 6/4 = 3.5, x 6/5 / 36. In both: of A 5/6 x 2 / 144, of B 4/3 x 2 / 144.
-    variance = 3.5 * 6 / 5 / 36 - (5 / 6 + 4 / 3) * 2 / 144
-    half = 2.5706 * np.sqrt(variance)
-    assert found.ci95 == pytest.approx((0.5 - half, 0.5 + half), abs=1e-4)
+    # Nothing is between trainings, alone or in some of the configurations: a paired t-test of the configurations.
+    theirs = ttest_rel(b[0], a[0])
+    assert found.p == pytest.approx(theirs.pvalue)
+    assert found.ci95 == pytest.approx(tuple(theirs.confidence_interval()))
+
+
+def test_variances_of_a_table_by_hand():
+    # Three trainings (rows) in two configurations, against a policy that does nothing.
+    after = np.array([[2, 0], [2, 1], [2, 2]])
+    found = compare_trainings(Pairs(np.zeros((1, 2), int), after, np.arange(2)), power=0.8)
+    assert found is not None
+    # Of the mean, between the means of rows, 1, 1.5, 2, it is .25 / 3; between those of columns, 2 and 1, .5 / 2.
+    # Cells less both are +-.5 in two rows: 4 x .25 over 2 degrees of freedom, of the mean of six .5 / 6. In all
+    # 1/12 + 1/4 - 1/12, with (1/4)^2 / ((1/12)^2 / 2 + (1/6)^2) = 2 degrees of freedom.
+    half = 4.3027 * np.sqrt(1 / 4)
+    assert found.ci95 == pytest.approx((1.5 - half, 1.5 + half), abs=1e-4)
+
+
+def test_a_base_that_all_trainings_begin_with_is_one_policy():
+    """Whether it is taken from each of them or stands against all: it does not average out over them."""
+    rng = np.random.default_rng(2)
+    base, after = rng.integers(0, 2, (1, 64)), rng.integers(0, 2, (3, 64))
+    scenes = np.arange(16).repeat(4)
+    gained = compare_trainings(Pairs(np.zeros_like(base), after - base, scenes), power=0.8)
+    against = compare_trainings(Pairs(base, after, scenes), power=0.8)
+    assert gained is not None
+    assert against is not None
+    assert gained.ci95 == pytest.approx(against.ci95)
 
 
 def test_one_training_each_says_nothing_of_trainings_and_a_fixed_base_is_none():
@@ -125,30 +149,30 @@ def test_one_training_each_says_nothing_of_trainings_and_a_fixed_base_is_none():
     assert against_base.method.startswith("t-interval and p by training and configuration (1 against 3 trainings")
 
 
-def test_intervals_cover_the_difference_as_often_as_they_say():
+# Each way to train is better in some configurations and worse in others, and trainings differ; or one of them.
+@pytest.mark.parametrize(("by_configuration", "by_training"), [(0.5, 0.5), (1.5, 0.0)])
+def test_intervals_cover_the_difference_as_often_as_they_say(by_configuration, by_training):
     """Trainings and configurations of their own effects: 3 against 3, 24 configurations of 4 episodes."""
     rng, covered, runs = np.random.default_rng(5), 0, 300
+    true = _true_difference(1 + by_configuration**2 + by_training**2)
     for _ in range(runs):
         scenes, episodes = rng.normal(0, 1, 24).repeat(4), (3, 96)
         sides = []
         for better in (0.0, 0.5):
-            own = rng.normal(0, 0.5, (3, 1)) + rng.normal(0, 0.5, 24).repeat(4)
+            own = rng.normal(0, by_training, (3, 1)) + rng.normal(0, by_configuration, 24).repeat(4)
             p = 1 / (1 + np.exp(-(better + scenes + own)))
             sides.append((rng.random(episodes) < p).astype(int))
         found = compare_trainings(Pairs(*sides, np.arange(24).repeat(4)), power=0.8)
         assert found is not None
         assert found.ci95 is not None
-        covered += found.ci95[0] < TRUE_DIFFERENCE < found.ci95[1]
+        covered += found.ci95[0] < true < found.ci95[1]
     # Of 300 with 95 %, 3 standard deviations below 285 are 273.7.
     assert covered >= 274
 
 
-def _true_difference():
-    x = np.random.default_rng(1).normal(0, np.sqrt(1 + 0.25 + 0.25), 400_000)
+def _true_difference(variance):
+    x = np.random.default_rng(1).normal(0, np.sqrt(variance), 400_000)
     return float(np.mean(1 / (1 + np.exp(-(x + 0.5)))) - np.mean(1 / (1 + np.exp(-x))))
-
-
-TRUE_DIFFERENCE = _true_difference()
 
 
 def test_holms_adjustment():
