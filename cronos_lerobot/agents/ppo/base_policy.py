@@ -26,13 +26,23 @@ class BasePolicy:
         self.parameters = {
             name: param.detach().clone() for name, param in policy.named_parameters() if id(param) in wanted
         }
+        names = {id(param): name for name, param in policy.named_parameters() if id(param) in wanted}
+        # Each attribute of each module once: what stands twice, as a policy within two adapters, or a weight in two
+        # of its layers, is put in and taken out again as often as it is an attribute.
+        self._attributes = {
+            f"policy.{module_name}.{name}" if module_name else f"policy.{name}": names[id(param)]
+            for module_name, module in policy.named_modules()
+            for name, param in module.named_parameters(recurse=False, remove_duplicate=False)
+            if id(param) in wanted
+        }
         self._evaluate = _Evaluate(policy)
 
     @torch.no_grad()
     def log_prob(self, batch: Any, trace: Tensor, temperature: float) -> Tensor:
         """Log-probability of decisions, (B,) or (B, L) [nats]."""
-        parameters = {f"policy.{name}": param for name, param in self.parameters.items()}
-        return functional_call(self._evaluate, parameters, (batch, trace, temperature))
+        parameters = {attribute: self.parameters[name] for attribute, name in self._attributes.items()}
+        arguments = (batch, trace, temperature)
+        return functional_call(self._evaluate, parameters, arguments, tie_weights=False)
 
     def load(self, parameters: dict[str, Tensor]) -> None:
         """Go on with the parameters of a checkpoint.
