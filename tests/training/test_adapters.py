@@ -126,11 +126,23 @@ def test_diffusion_learns_by_its_chain_saves_resumes_and_is_a_lerobot_policy(tmp
     assert actions_alone(last) == actions_here(DiffusionPolicy.from_pretrained(last))
 
 
-def test_noise_at_some_steps_is_for_flows(tmp_path, monkeypatch):
-    with pytest.raises(
-        SystemExit, match=r"noise_steps=1 is for flow policies; --policy\.type=act has no such steps"
-    ):
-        cronos_train(monkeypatch, *FLAGS, "--algorithm.noise_steps=1", f"--output_dir={tmp_path / 'run'}")
+@pytest.mark.parametrize(
+    ("policy", "flag", "message"),
+    [
+        ("act", "noise_steps=1", r"noise_steps=1 is not for --policy\.type=act, which reads noise_std"),
+        ("act", "noise_level=0.2", r"noise_level=0\.2 is not for --policy\.type=act, which reads noise_std"),
+        ("diffusion", "noise_steps=1", r"noise_steps=1 is not for .*, which reads noise_level and noise_std"),
+        (
+            "diffusion",
+            "entropy_coef=0.1",
+            r"entropy_coef=0\.1: no entropy .*type=diffusion decides; give 0",
+        ),
+    ],
+)
+def test_what_a_policy_does_not_follow_is_refused_before_it_begins(policy, flag, message, tmp_path, monkeypatch):
+    flags = FLAGS if policy == "act" else (*DIFFUSION, "--policy.noise_scheduler_type=DDIM")
+    with pytest.raises(SystemExit, match=message):
+        cronos_train(monkeypatch, *flags, f"--algorithm.{flag}", f"--output_dir={tmp_path / 'run'}")
 
 
 def test_chunks_that_reach_beyond_a_switch_are_refused(tmp_path, monkeypatch):

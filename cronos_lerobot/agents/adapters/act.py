@@ -34,6 +34,8 @@ class ACTAdapter(Adapter):
         ValueError: the policy ensembles its chunks over time.
     """
 
+    options_read = frozenset({"noise_std"})
+
     def __init__(self, policy: Any, options: AdapterOptions) -> None:
         super().__init__(policy)
         config = policy.config

@@ -31,6 +31,9 @@ class DenoisingAdapter(Adapter):
         feature_width: F, of what the critic reads; None if the subclass has values of its own.
     """
 
+    has_entropy = False
+    """A Gaussian step's deviation is no parameter."""
+
     def __init__(
         self, policy: Any, *, shape: tuple[int, int], num_steps: int, feature_width: int | None, first: int = 0
     ) -> None:

@@ -33,6 +33,8 @@ class DiffusionAdapter(DenoisingAdapter):
         ValueError: the policy denoises by DDPM, or eta is above 1.
     """
 
+    options_read = frozenset({"noise_std", "noise_level"})
+
     def __init__(self, policy: Any, options: AdapterOptions) -> None:
         config, model = policy.config, policy.diffusion
         if config.noise_scheduler_type != "DDIM":

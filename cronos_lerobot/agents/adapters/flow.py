@@ -39,6 +39,8 @@ class FlowAdapter(DenoisingAdapter):
         ValueError: noise at more steps than there are.
     """
 
+    options_read = frozenset({"noise_level", "noise_steps"})
+
     def __init__(
         self,
         policy: Any,

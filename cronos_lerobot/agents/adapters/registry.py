@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -36,10 +36,14 @@ class Adapter(nn.Module):
         policy: the same.
         decision_steps: how many actions it decides on at once.
         observation_steps: how many observations it looks at.
+        options_read: names of the AdapterOptions that it follows; the others are refused where they are given.
+        has_entropy: whether its decisions have an entropy that depends on the policy.
     """
 
     decision_steps: int = 1
     observation_steps: int = 1
+    options_read: frozenset[str] = frozenset(field.name for field in fields(AdapterOptions))
+    has_entropy: bool = True
 
     def __init__(self, policy: Any) -> None:
         super().__init__()

@@ -27,8 +27,8 @@ class BasePolicy:
             name: param.detach().clone() for name, param in policy.named_parameters() if id(param) in wanted
         }
         names = {id(param): name for name, param in policy.named_parameters() if id(param) in wanted}
-        # Each attribute of each module once: what stands twice, as a policy within two adapters, or a weight in two
-        # of its layers, is put in and taken out again as often as it is an attribute.
+        # Each attribute of each module once, whatever names it has: a policy may stand twice within its adapters,
+        # and swapping it twice would put the copies back in the end.
         self._attributes = {
             f"policy.{module_name}.{name}" if module_name else f"policy.{name}": names[id(param)]
             for module_name, module in policy.named_modules()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 from cronos_lerobot.agents.adapters import builtin as _builtin  # noqa: F401 -- registers them
@@ -22,16 +23,12 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
 
     Raises:
         ValueError: the policy does not say how likely its decisions were, or decides beyond a task switch, or
-            cannot be cloned though the config asks for it.
+            cannot be cloned though the config asks for it; or the config has what this policy does not follow.
     """
     config = context.config
     options = AdapterOptions(config.noise_std, config.noise_level, config.noise_steps)
     policy = make_trainable(context.policy, options)
-    if config.noise_steps is not None and not hasattr(policy, "noise_steps"):
-        raise ValueError(
-            f"--algorithm.noise_steps={config.noise_steps} is for flow policies; "
-            f"--policy.type={policy.config.type} has no such steps."
-        )
+    _check_followed(policy, config, options)
     if config.critic_observation == "environment_state":
         policy = _with_privileged_critic(policy, context)
     if isinstance(policy, Adapter):
@@ -43,6 +40,21 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
     steps = decision_steps(policy, context.task_switch_interval)
     buffer = RolloutBuffer(context.update_interval // steps, mine.stop - mine.start)
     return PPOAgent(ppo, buffer, context.torch_rng("actions"), context.stopwatch, mine)
+
+
+def _check_followed(policy: Any, config: Any, options: AdapterOptions) -> None:
+    read = policy.options_read if isinstance(policy, Adapter) else frozenset()
+    for name, default in asdict(AdapterOptions()).items():
+        if name not in read and (given := getattr(options, name)) != default:
+            raise ValueError(
+                f"--algorithm.{name}={given} is not for --policy.type={policy.config.type}, which "
+                + (f"reads {' and '.join(sorted(read))}." if read else "has no adapter that would read it.")
+            )
+    if config.entropy_coef and not getattr(policy, "has_entropy", True):
+        raise ValueError(
+            f"--algorithm.entropy_coef={config.entropy_coef}: no entropy is known of what "
+            f"--policy.type={policy.config.type} decides; give 0."
+        )
 
 
 def _self_imitation(context: AgentContext) -> SelfImitation | None:
