@@ -68,6 +68,10 @@ class Processes:
         """All processes' values, in the order of the ranks."""
         return [value]
 
+    def gather_to_main(self, value: Any) -> list[Any]:
+        """All processes' values, in the order of the ranks, in the first process; its own in every other."""
+        return [value]
+
     def broadcast(self, value: Any, source: int = 0) -> Any:
         """The value of process `source`."""
         return value
@@ -121,6 +125,12 @@ class LaunchedProcesses(Processes):
         values: list[Any] = [None] * self.count
         dist.all_gather_object(values, value, group=self._control)
         return values
+
+    def gather_to_main(self, value: Any) -> list[Any]:
+        """All processes' values, in the order of the ranks, in the first process; its own in every other."""
+        values: list[Any] | None = [None] * self.count if self.is_main else None
+        dist.gather_object(value, values, dst=0, group=self._control)
+        return [value] if values is None else values
 
     def broadcast(self, value: Any, source: int = 0) -> Any:
         """The value of process `source`."""

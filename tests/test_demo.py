@@ -55,6 +55,15 @@ def test_changed_command_runs_anew_and_so_do_all_after_it(folder):
     assert contents(folder) == {"a": "touched", "b": "new", "c": "x"}
 
 
+def test_steps_of_other_versions_run_anew(folder, monkeypatch):
+    run_steps([append_step(folder, "a")], folder)
+    monkeypatch.setattr(pipeline, "package_versions", lambda: {"lerobot": "0.0.0"})
+    (folder / "a.txt").write_text("touched")
+    run_steps([append_step(folder, "a")], folder)
+    run_steps([append_step(folder, "a")], folder)
+    assert contents(folder) == {"a": "x"}
+
+
 def test_lost_output_is_made_again(folder):
     steps = [append_step(folder, "a"), append_step(folder, "b")]
     run_steps(steps, folder)

@@ -37,6 +37,8 @@ class NoiseConfig:
         """Check the numbers."""
         if not 0 <= self.share <= 1 or not 0 <= self.rate <= 1:
             raise ValueError(f"noise.share and noise.rate must be from 0 to 1, got {self.share}, {self.rate}")
+        if self.scale < 0:
+            raise ValueError(f"noise.scale must be at least 0, got {self.scale}")
         if not 1 <= self.min_steps <= self.max_steps:
             raise ValueError(f"need 1 <= noise.min_steps <= noise.max_steps: {self.min_steps}, {self.max_steps}")
 

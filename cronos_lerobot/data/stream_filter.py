@@ -118,13 +118,19 @@ def filter_streams(
 
     Raises:
         FileExistsError: `root` exists.
-        ValueError: no segment is wanted, or `source` is on the Hub.
+        ValueError: no segment is wanted, or a stream or task that is not there; or `source` is on the Hub.
     """
     root = Path(root)
     if root.exists():
         raise FileExistsError(f"{root} exists; choose another folder for the filtered dataset")
     if not (source.meta.root / "data").is_dir():
         raise ValueError(f"{source.repo_id} is streamed from the Hub; open it with streaming=False to filter it")
+    for name, given, there in (
+        ("streams", wanted.streams, source.streams),
+        ("tasks", wanted.tasks, sorted({segment.task for segment in source.segments})),
+    ):
+        if unknown := [one for one in given or [] if one not in there]:
+            raise ValueError(f"unknown {name} {unknown}; {source.repo_id} has {there}")
     segments = sorted((s for s in source.segments if wanted(s)), key=lambda s: s.episode)
     if not segments:
         raise ValueError(f"none of the {len(source.segments)} segments fits {wanted}")

@@ -118,6 +118,8 @@ class CronosEvalConfig:
             raise ValueError(f"cronos-eval evaluates --env.type=cronos, got {self.env.type!r}")
         if self.seed < 0:
             raise ValueError(f"seed must be at least 0, got {self.seed}")
+        if self.torch_threads is not None and self.torch_threads < 1:
+            raise ValueError(f"torch_threads must be at least 1, or null, got {self.torch_threads}")
         self._check_comparison()
         self._check_repetitions()
         self._check_chains()

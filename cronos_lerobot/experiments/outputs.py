@@ -60,6 +60,8 @@ def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options,
         f"{name}_sequential": tables.sequential_rows(result),
     }
     for file, table in data.items():
+        # What is there is of other rows or seeds, if it is not of these.
+        (folder / f"{file}.csv").unlink(missing_ok=True)
         if table:
             write_csv(folder / f"{file}.csv", table)
     first = interventions_figure if experiment.by_base else plots.curves_figure
@@ -71,6 +73,7 @@ def write_outputs(experiment: Experiment, rows: Iterable[Row], options: Options,
     }
     drawn = []
     for file, figure in drawings.items():
+        (folder / f"{file}.png").unlink(missing_ok=True)
         if figure is not None:
             png = to_png(figure, DPI_BY_TASK if experiment.by_task else DPI)
             (folder / f"{file}.png").write_bytes(png)

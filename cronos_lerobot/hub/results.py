@@ -156,6 +156,8 @@ def _caveat(suite: str, split: str, n: int, size: int, results: dict[str, Any]) 
     if n != size:
         whole = "chains" if suite == "sequential" else "episodes"
         caveats.append(f"{n} of the {size} {whole} of {split} were evaluated")
+    if suite != "sequential" and (repetitions := results.get("repetitions", 1)) != 1:
+        caveats.append(f"every configuration was run {repetitions} times, the benchmark has each once")
     if renderer := (results.get("identity") or {}).get("renderer"):
         caveats.append(f"the policy saw pictures of the renderer {renderer}, the benchmark's are classic")
     other = {name: results[name] for name, value in STANDARD.items() if results[name] != value}

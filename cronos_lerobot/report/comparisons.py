@@ -100,8 +100,9 @@ def compare_evaluations(before: list[EvaluationRun], after: list[EvaluationRun])
 
 
 def _pool(tables: list[dict[str, Rate]]) -> dict[str, Rate]:
-    pooled: dict[str, Rate] = {}
+    """Each task of all folders: one is of one training, so that several vary as trainings do."""
+    rates: dict[str, list[Rate]] = {}
     for table in tables:
         for task, rate in table.items():
-            pooled[task] = pooled.get(task, Rate(0, 0)) + rate
-    return pooled
+            rates.setdefault(task, []).append(rate)
+    return {task: found[0] if len(found) == 1 else SeedRate.of(found) for task, found in rates.items()}

@@ -20,6 +20,7 @@ from cronos_lerobot.report.suites import SuiteRun
 
 PAGE = "index.html"
 DPI = 150
+SEQUENTIAL = "sequential.png"
 
 FIGURES: tuple[tuple[str, str, str, Callable[[list[Group]], Figure | None]], ...] = (
     (
@@ -92,6 +93,9 @@ def write_report(report: Report, output: Path) -> Path:
         "resets": tables.reset_rows(groups),
         "speed": tables.speed_rows(groups),
     }
+    # What another report left there is not of this one.
+    for file in (*(f"{name}.csv" for name in rows), *(f"{name}.png" for name, *_ in FIGURES), SEQUENTIAL):
+        (output / file).unlink(missing_ok=True)
     for name, table in rows.items():
         if table:
             tables.write_csv(output / f"{name}.csv", table)
@@ -139,7 +143,7 @@ def _draw_figures(groups: list[Group], output: Path) -> list[dict[str, str]]:
 
 def _draw_suites(suites: list[SuiteRun], output: Path) -> list[str]:
     figure = suite_views.sequential_figure(suites)
-    return [] if figure is None else [_write_png(figure, output / "sequential.png")]
+    return [] if figure is None else [_write_png(figure, output / SEQUENTIAL)]
 
 
 def _write_png(figure: Figure, path: Path) -> str:

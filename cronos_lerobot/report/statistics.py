@@ -54,9 +54,10 @@ class SeedRate(Rate):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % t-interval of the mean over the seeds, within 0 and 1; Wilson's of one alone."""
+        """95 % t-interval of the mean over the seeds, within 0 and 1; Wilson's of one, or of some all alike."""
         summary = summarise([rate.value for rate in self.seeds])
-        return super().interval if summary is None else summary.within(0.0, 1.0).ci95 or super().interval
+        over_seeds = summary.within(0.0, 1.0).ci95 if summary and summary.std else None
+        return over_seeds or super().interval
 
     def __add__(self, other: Rate) -> Rate:
         """Both sets of episodes together, seed by seed if they are of as many."""

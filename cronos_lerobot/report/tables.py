@@ -70,7 +70,8 @@ def seed_rows(groups: Iterable[Group]) -> list[Row]:
         rates = [success_at(x, y, end) for x, y in zip(steps, success, strict=True)]
         row |= _summary_columns("success", summarise_rates(rates))
         last = [curve[-1] for curve in curves]
-        row |= {name: sum(e.get(name, 0) for e in last) for name in APART}
+        are_there = all(e["interaction_steps"] == end for e in last)
+        row |= {name: sum(e.get(name, 0) for e in last) if are_there else None for name in APART}
         row |= _summary_columns("interventions", summarise(at_end))
         are_whole = all(run.begins_alike for run in runs)
         row |= _summary_columns("D / steps", summarise(by_steps) if are_whole else None)

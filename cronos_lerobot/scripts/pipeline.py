@@ -15,6 +15,7 @@ from pathlib import Path
 
 from cronos_lerobot.experiments.arithmetic import portable_arithmetic
 from cronos_lerobot.locks import FolderLock
+from cronos_lerobot.provenance import package_versions
 from cronos_lerobot.training.stopping import SAME_S
 
 ECHO_S = 1.0
@@ -49,7 +50,7 @@ def run_steps(steps: Sequence[Step], folder: Path) -> None:
 
     Args:
         steps: in their order; each may use the outputs of those before it.
-        folder: holds their outputs and a note of what was done with which command.
+        folder: holds their outputs and a note of what was done with which command and versions.
 
     Raises:
         FileExistsError: the folder holds something else.
@@ -61,12 +62,13 @@ def run_steps(steps: Sequence[Step], folder: Path) -> None:
 
 
 def _run_steps(steps: Sequence[Step], folder: Path) -> None:
-    state = _read_state(folder)
+    state, versions = _read_state(folder), package_versions()
     stale = False
     for number, step in enumerate(steps, start=1):
         heading = f"[{number}/{len(steps)}] {step.title}"
         note = state.get(step.name, {})
-        same = note.get("command") == step.command
+        made = {"command": step.command, "versions": versions}
+        same = all(note.get(name) == value for name, value in made.items())
         if same and note.get("done") and step.output.exists() and not stale and not step.always:
             print(f"\n{heading}: done before ({step.output})", flush=True)
             continue
@@ -76,7 +78,7 @@ def _run_steps(steps: Sequence[Step], folder: Path) -> None:
             _remove(step.output)
         for later in steps[number - 1 :]:
             state.get(later.name, {}).pop("done", None)
-        state[step.name] = {"command": step.command}
+        state[step.name] = made
         _write_state(folder, state)
         print(f"\n{heading}", flush=True)
         start = time.perf_counter()

@@ -72,7 +72,7 @@ def make_report(
 
     Raises:
         FileNotFoundError: a folder holds no run, or a video is missing.
-        ValueError: there is no such scene.
+        ValueError: there is no such scene, or nothing of lerobot-eval in `before` or `after`.
     """
     from lerobot_env_cronos import get_scene
 
@@ -84,6 +84,12 @@ def make_report(
     found, old, new = (
         find_runs(folders, scene) if folders else FoundRuns([], [], [], []) for folders in (runs, before, after)
     )
+    for flag, folders, read in (("--before", before, old), ("--after", after, new)):
+        if folders and not read.evaluations:
+            raise ValueError(
+                f"{flag}={folders[0]}: nothing of lerobot-eval there, and no other evaluation is paired by task; "
+                "cronos-report compare pairs those of cronos-eval and cronos-train episode by episode"
+            )
     paired = {run.folder.resolve() for run in old.evaluations + new.evaluations}
     rest = [run for run in found.evaluations if run.folder.resolve() not in paired]
     for video in videos or []:

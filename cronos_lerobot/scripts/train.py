@@ -36,6 +36,7 @@ def train(config: CronosTrainConfig) -> None:
             # Nobody gets past this before all have seen that the output folder does not exist yet.
             processes = join_processes(config.policy.device)
             mine = processes.share_of(config.num_envs)
+            config.record.check_filmed(mine.stop - mine.start)
             assert config.output_dir is not None
             if processes.is_main:
                 stack.enter_context(FolderLock(config.output_dir))

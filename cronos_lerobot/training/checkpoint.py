@@ -104,9 +104,9 @@ def save_checkpoint(
     assert config.output_dir is not None
     folder = Path(config.output_dir) / CHECKPOINTS_DIR
     final = folder / get_step_identifier(run.loop.n, config.total_steps)
-    generators = _merge(run.processes.gather(run.generators.state_dict()))
+    generators = _merge(run.processes.gather_to_main(run.generators.state_dict()))
     agent = run.agent.state_dict()
-    other_rngs = run.processes.gather(serialize_rng_state())[1:]
+    other_rngs = run.processes.gather_to_main(serialize_rng_state())[1:]
     if not run.processes.is_main:
         return final
     folder.mkdir(parents=True, exist_ok=True)

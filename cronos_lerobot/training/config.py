@@ -78,6 +78,18 @@ class RecordConfig:
             return "all" if self.streams == "all" else int(self.streams)
         raise ValueError(f"record.streams must be a number or 'all', got {self.streams!r}.")
 
+    def check_filmed(self, num_own: int) -> None:
+        """Check that the streams to be filmed are the first process's, which has `num_own`.
+
+        Raises:
+            ValueError: there are more of them.
+        """
+        if self.repo_id is not None and self.filmed_streams > num_own:
+            raise ValueError(
+                f"record.filmed_streams must be at most {num_own}, the streams of the first process, which films, "
+                f"got {self.filmed_streams}."
+            )
+
     def root_in(self, output_dir: Path) -> Path:
         """The folder of the dataset of a run in `output_dir`."""
         return Path(self.root or output_dir / "streams")

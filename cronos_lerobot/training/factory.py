@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import ACTION
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, SequentialVectorEnv, get_scene
 from lerobot_env_cronos.hub_config import is_of_this_package
+from lerobot_env_cronos.simulation.simulation import num_cores
 from safetensors import SafetensorError
 
 from cronos_lerobot.agents.imitation.config import DemosConfig
@@ -76,7 +76,7 @@ def _cronos(config: CronosTrainConfig) -> CronosEnvConfig:
 def _env_options(env_config: CronosEnvConfig, local_processes: int) -> dict[str, Any]:
     options = env_config.gym_kwargs
     if options["num_threads"] == 0 and local_processes > 1:
-        options["num_threads"] = max(1, (os.cpu_count() or 1) // local_processes)
+        options["num_threads"] = max(1, num_cores() // local_processes)
     return options
 
 

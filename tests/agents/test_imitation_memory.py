@@ -213,6 +213,15 @@ def test_a_dataset_of_another_shape_is_refused(dataset_root):
     Demonstrations(DemosConfig("me/demos", dataset_root), config)
 
 
+def test_pictures_that_cannot_be_in_one_batch_with_the_runs_are_refused(dataset_root):
+    config, options = policy_config("act"), DemosConfig("me/demos", dataset_root)
+    height, width, _ = LeRobotDataset("me/demos", dataset_root).meta.shapes["observation.images.front"]
+    Demonstrations(options, config, {"observation.images.front": (height, width, 3)})
+    message = rf"front of {height} x {width} pixels, the run of 128 x 96, .*--env\.observation_height={height} "
+    with pytest.raises(ValueError, match=message):
+        Demonstrations(options, config, {"observation.images.front": (128, 96, 3)})
+
+
 def test_a_dataset_that_is_not_there_is_named(dataset_root, monkeypatch):
     def unreachable(*args, **kwargs):
         raise httpx.ConnectError("[Errno -2] Name or service not known")

@@ -304,6 +304,7 @@ def test_one_task_only(env, tmp_path):
             "start.num_configurations=1 is of start.layouts=train, got start.layouts=reach",
         ),
         (lambda: NoiseConfig(share=2), "noise.share"),
+        (lambda: NoiseConfig(share=0.5, scale=-1), "noise.scale must be at least 0, got -1"),
         (lambda: MissConfig(min_offset_m=0.1), "misses.min_offset_m"),
         (lambda: RecordDemosConfig(), "--dataset.repo_id is required"),
     ],

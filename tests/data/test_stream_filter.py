@@ -49,6 +49,18 @@ def test_what_is_kept(source, options, expected):
     assert {(s.stream, s.index) for s in source.segments if wanted(s)} == expected
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"streams": [0, 99]}, r"unknown streams \[99\]; me/stream has \[0, 1"),
+        ({"tasks": ["fly"]}, r"unknown tasks \['fly'\]; me/stream has \['"),
+    ],
+)
+def test_streams_and_tasks_that_are_not_there_are_named(source, tmp_path, options, message):
+    with pytest.raises(ValueError, match=message):
+        filter_streams(source, SegmentFilter(**options), "me/kept", tmp_path / "kept")
+
+
 def test_unknown_interventions_are_refused():
     with pytest.raises(
         ValueError, match=r"unknown interventions \['reset'\]; valid ones: \['task_switch', 'end_eff"
@@ -130,7 +142,7 @@ def test_files_that_would_grow_too_long_are_split(source, tmp_path, monkeypatch)
 
 def test_mistakes_leave_nothing_behind(source, tmp_path):
     with pytest.raises(ValueError, match="none of the 24 segments fits"):
-        filter_streams(source, SegmentFilter(streams=[5]), "me/none", tmp_path / "d")
+        filter_streams(source, SegmentFilter(min_policy_version=99), "me/none", tmp_path / "d")
     assert not list(tmp_path.iterdir())
     with pytest.raises(FileExistsError, match="exists; choose another folder"):
         filter_streams(source, SegmentFilter(), "me/all", tmp_path)

@@ -243,6 +243,7 @@ def test_observations_and_scene_follow_from_the_policy(tmp_path, monkeypatch):
         ),
         (("--expert=true", "--eval.batch_size=0"), "batch_size must be at least 1, got 0"),
         (("--expert=true", "--seed=-1"), "seed must be at least 0"),
+        (("--expert=true", "--torch_threads=0"), "torch_threads must be at least 1, or null, got 0"),
         (("--expert=true", "--env.scene=garage"), "garage.*kitchen_2x2"),
         (("--policy.path=outputs/no/where",), "outputs/no/where is neither a folder nor"),
     ],

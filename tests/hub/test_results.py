@@ -63,6 +63,14 @@ def test_a_part_of_the_benchmark_is_refused_or_called_so():
     assert entry.notes.startswith("PARTIAL: 5 of the 8 episodes")
 
 
+def test_as_many_episodes_of_fewer_configurations_are_a_part():
+    results = make_results(repetitions=4)
+    with pytest.raises(ValueError, match="independent_train: every configuration was run 4 times"):
+        make_entries(results, BENCHMARK, ResultsConfig())
+    # Chains are not repeated.
+    assert len(make_entries(results, BENCHMARK, ResultsConfig(suites="sequential"))) == 1
+
+
 @pytest.mark.parametrize("change", [{"advance": "on_success"}, {"end_effector_reset": True}])
 def test_other_chains_than_the_benchmarks_are_refused(change):
     with pytest.raises(ValueError, match=f"sequential_train: evaluated with {{'{next(iter(change))}'"):

@@ -25,6 +25,11 @@ def test_gain_of_nothing_covers_zero():
     assert gain.interval[0] == pytest.approx(-gain.interval[1])
 
 
+def test_seeds_that_are_all_alike_do_not_say_that_every_training_is():
+    # Wilson's of 18 of 20, (.9 + z^2 / 40 -+ z sqrt(.09 / 20 + z^2 / 1600)) / (1 + z^2 / 20).
+    assert SeedRate.of([Rate(9, 10)] * 2).interval == pytest.approx((0.6990, 0.9721), abs=1e-4)
+
+
 def test_intervals_over_seeds_end_where_rates_and_gains_do():
     """t with two degrees of freedom is 4.3027."""
     # Mean .9, standard deviation .1: .9 +- 4.3027 * .1 / sqrt(3) = .9 +- .2484.

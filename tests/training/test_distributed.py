@@ -344,7 +344,9 @@ def test_streams_that_cannot_be_shared_out_are_refused():
 
 @pytest.mark.parametrize(("num_threads", "local_processes", "expected"), [(0, 3, 2), (0, 12, 1), (4, 3, 4)])
 def test_processes_share_the_cores_of_their_node(num_threads, local_processes, expected, monkeypatch):
-    monkeypatch.setattr(os, "cpu_count", lambda: 6)
+    # Of those that it may use, on a node of more.
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(6)))
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
     scene = CronosEnvConfig(obs_type="environment_state_agent_pos", num_threads=num_threads)
     env = make_env(CronosTrainConfig(env=scene), 8, local_processes)
     assert env.simulation._batch.nthread == expected

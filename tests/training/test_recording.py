@@ -220,6 +220,13 @@ def test_filmed_streams_are_a_dataset_of_their_own(tmp_path):
         assert nearest == [0, 1, 2, 3, 4]
 
 
+def test_the_first_process_films_its_own_streams():
+    config = RecordConfig("me/stream", filmed_streams=3)
+    config.check_filmed(3)
+    with pytest.raises(ValueError, match=r"filmed_streams must be at most 2, the streams of the first process"):
+        config.check_filmed(2)
+
+
 def test_killed_runs_lose_nothing_that_was_flushed(tmp_path):
     """A real run from pixels, killed at random moments; `studies.kill_test` does it twenty times."""
     tally = KillTest(tmp_path / "killed", seed=1, report=lambda line: None).run(2)

@@ -72,7 +72,8 @@ class ImitationAgent(LearningAgent):
         self._is_warm = False
         self._demos = None
         if self.config.demos_share:
-            self._demos = Demonstrations(self.config.demos, policy_config)
+            beside = context.observation_shapes if self.config.demos_share < 1 else None
+            self._demos = Demonstrations(self.config.demos, policy_config, beside)
 
     @torch.no_grad()
     def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
@@ -137,13 +138,13 @@ class ImitationAgent(LearningAgent):
         return [*super().shared_tensors(), *self.policy.buffers()]
 
     def state_dict(self) -> dict[str, Any]:
-        """The segments that each process remembers, and what an average is of; see `LearningAgent`."""
+        """The segments that each process remembers, in the first one, and what an average is of."""
         learner = {}
         if self.config.ema_decay:
             params = self.policy.named_parameters(remove_duplicate=False)
             frozen = {name for name, param in params if not param.requires_grad}
             learner = {name: value for name, value in self._learner.state_dict().items() if name not in frozen}
-        memory = to_tensors(self._processes.gather(self.memory.state_dict()))
+        memory = to_tensors(self._processes.gather_to_main(self.memory.state_dict()))
         return {"memory": memory, "learner": learner, "is_warm": self._is_warm}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import httpx
@@ -60,15 +60,19 @@ class Demonstrations:
     Args:
         config: which one.
         policy: config of the policy that learns from it.
+        beside: shapes of what the run observes, if batches will have both.
 
     Raises:
         ValueError: the dataset lacks a column that the policy reads, has it in another shape, or cannot be read.
         FileNotFoundError: there is no such dataset.
     """
 
-    def __init__(self, config: DemosConfig, policy: PreTrainedConfig) -> None:
+    def __init__(
+        self, config: DemosConfig, policy: PreTrainedConfig, beside: Mapping[str, tuple[int, ...]] | None = None
+    ) -> None:
         meta = _open_metadata(config)
         wanted = _check_columns(config, policy, meta.features)
+        _check_pictures(config, meta.features, wanted, beside or {})
         deltas = resolve_delta_timestamps(policy, meta)
         self._dataset = LeRobotDataset(meta.repo_id, root=config.root, delta_timestamps=deltas)
         drop_last = getattr(policy, "drop_n_last_frames", 0) or 0
@@ -114,7 +118,7 @@ def _open_metadata(config: DemosConfig) -> LeRobotDatasetMetadata:
 def _check_columns(config: DemosConfig, policy: PreTrainedConfig, features: Mapping[str, Any]) -> set[str]:
     """The columns that the policy learns from; a ValueError if one is not there, or does not fit.
 
-    Images may have another size: policies scale them.
+    Images may have another size than the policy's own: policies scale them.
     """
     taken = policy.input_features or {}
     wanted = {*taken, ACTION}
@@ -136,6 +140,25 @@ def _check_columns(config: DemosConfig, policy: PreTrainedConfig, features: Mapp
                 "--env.task_observation."
             )
     return wanted
+
+
+def _check_pictures(
+    config: DemosConfig, features: Mapping[str, Any], names: Iterable[str], beside: Mapping[str, tuple[int, ...]]
+) -> None:
+    """A ValueError if pictures that will be in one batch with those of the run have another size."""
+    for name in sorted(name for name in names if name in beside and name.startswith(OBS_IMAGES)):
+        theirs, own = _height_and_width(features[name]["shape"]), _height_and_width(beside[name])
+        if theirs != own:
+            raise ValueError(
+                f"--algorithm.demos.repo_id={config.repo_id} has {name} of {theirs[0]} x {theirs[1]} pixels, the "
+                f"run of {own[0]} x {own[1]}, and batches have both: give --env.observation_height={theirs[0]} "
+                f"--env.observation_width={theirs[1]}, or record the demonstrations as the run sees them."
+            )
+
+
+def _height_and_width(shape: Sequence[int]) -> tuple[int, ...]:
+    """Of pictures with the channels last, as in the datasets of this package, or first."""
+    return tuple(shape[:2] if shape[2] in (1, 3) else shape[1:])
 
 
 def _read_episodes(dataset: LeRobotDataset, names: list[str], bounds: list[tuple[int, int]]) -> list[Segment]:

@@ -62,7 +62,10 @@ def _self_imitation(context: AgentContext) -> SelfImitation | None:
         return None
     num_streams = context.streams.stop - context.streams.start
     rng = context.rng("self_imitation")
-    return SelfImitation(context.policy, context.processors, context.config, num_streams, rng, context.processes)
+    return SelfImitation(
+        context.policy, context.processors, context.config, num_streams, rng, context.processes,
+        context.observation_shapes,
+    )  # fmt: skip
 
 
 def _with_privileged_critic(policy: Any, context: AgentContext) -> PrivilegedCritic:

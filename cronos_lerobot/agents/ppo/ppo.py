@@ -101,6 +101,11 @@ class PPO:
                 f"PPO has no critic to train: all that {type(policy).__name__} estimates values with is frozen, as"
                 " adapters of --peft.* leave what they do not name."
             )
+        if not self._params["policy"]:
+            raise ValueError(
+                f"PPO has nothing to train: all of {type(policy).__name__} that decides is frozen, as adapters of"
+                " --peft.* leave what they do not name."
+            )
         _freeze_all_but(self._params["policy"] + self._params["value"], policy)
         self.self_imitation = self_imitation
         if self_imitation is not None:

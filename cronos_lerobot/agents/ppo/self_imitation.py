@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,7 @@ class SelfImitation:
         num_streams: N of this process.
         rng: draws what is cloned.
         processes: each clones the successes of its own streams.
+        shapes: of what the run observes.
 
     Raises:
         ValueError: the policy has no loss that `lerobot-train` trains it with, or the demonstrations lack what it
@@ -49,6 +50,7 @@ class SelfImitation:
         num_streams: int,
         rng: np.random.Generator,
         processes: Processes | None = None,
+        shapes: Mapping[str, tuple[int, ...]] | None = None,
     ) -> None:
         self._policy, self._processors, self._rng = policy, processors, rng
         self._processes = processes or Processes()
@@ -59,7 +61,9 @@ class SelfImitation:
         drop_last = getattr(policy.config, "drop_n_last_frames", 0) or 0
         self.memory = SegmentMemory(int(self.config.memory_gib * 2**30), drop_last)
         self._weights: np.ndarray | None = None
-        self._demos = Demonstrations(config.demos, policy.config) if config.demos_share else None
+        self._demos = None
+        if config.demos_share:
+            self._demos = Demonstrations(config.demos, policy.config, shapes if config.demos_share < 1 else None)
 
     def check(self, trained: Sequence[Tensor]) -> None:
         """Check that cloning trains any of the parameters that PPO trains.
@@ -126,8 +130,8 @@ class SelfImitation:
         return {"clone_loss": loss.item(), "clone_grad_norm": norm.item()}
 
     def state_dict(self) -> list[Any]:
-        """The segments that each process remembers; all call it between two segments."""
-        return self._processes.gather(self.memory.state_dict())
+        """The segments that each process remembers, in the first one; all call it between two segments."""
+        return self._processes.gather_to_main(self.memory.state_dict())
 
     def load_state_dict(self, state: list[Any]) -> None:
         """Go on with the segments of this process, or its share if there are more or fewer processes now."""

@@ -41,7 +41,7 @@ SETTLE_MAX_CHUNKS, SETTLE_SPEED = 10, 0.02
 """After an arm teleport bodies fall for at most 1 s, checked every 0.1 s, until slower than 0.02 m/s."""
 
 
-def _num_cores() -> int:
+def num_cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -58,7 +58,7 @@ class Simulation:
             raise ValueError(f"num_threads must be 0 (all cores) or more, got {num_threads}")
         self.scene, self.physics = scene, physics
         self.num_sims = num_sims
-        self.num_threads = num_threads or _num_cores()
+        self.num_threads = num_threads or num_cores()
         self.model = build_model(scene, looks=False, physics=physics)
         self._batch = Batch(self.model, num_sims, num_threads, persistent=True)
         self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
