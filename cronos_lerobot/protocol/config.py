@@ -147,6 +147,12 @@ class ProtocolConfig:
             if getattr(self, name) not in valid:
                 raise ValueError(f"protocol.{name} must be one of {valid}, got {getattr(self, name)!r}.")
         if self.scene_reset == "periodic":
+            longest = max(T or 0 for T in (self.scene_reset_interval, *(T for _, T in self.curriculum)))
+            if self.reset_phase == "staggered" and longest <= self.task_switch_interval:
+                raise ValueError(
+                    "protocol.reset_phase=staggered puts resets at other task switches, and there is none between "
+                    f"them with protocol.scene_reset_interval={self.scene_reset_interval}: leave it out."
+                )
             return
         if self.reset_budget is None:
             raise ValueError("protocol.scene_reset=critic spends a budget: give protocol.reset_budget, as 1000.")

@@ -10,6 +10,8 @@ from cronos_lerobot.protocol.config import CriticConfig
     ("options", "message"),
     [
         ({"reset_phase": "scattered"}, "reset_phase must be one of"),
+        ({"reset_phase": "staggered", "scene_reset_interval": 2}, "there is none between them with .*=2: leave"),
+        ({"reset_phase": "staggered", "scene_reset_interval": None}, "between them with .*=None: leave it out"),
         ({"scene_reset": "never"}, "scene_reset must be one of"),
         ({"scene_reset": "critic"}, "give protocol.reset_budget"),
         ({"scene_reset": "critic", "reset_budget": 5, "reset_phase": "staggered"}, "leave them out"),

@@ -179,10 +179,20 @@ class SteeringAgent(LearningAgent):
             "new": self._new * self._processes.count,
             "sac": self.sac.state_dict(),
             "memory": to_tensors(memory),
+            "gamma": self.config.gamma,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from `state_dict`, with this process's share of the memory."""
+        """Go on from `state_dict`, with this process's share of the memory.
+
+        Raises:
+            ValueError: what is remembered was discounted otherwise.
+        """
+        if (gamma := state.get("gamma", self.config.gamma)) != self.config.gamma:
+            raise ValueError(
+                f"--algorithm.gamma={self.config.gamma}: the decisions that the run remembers are discounted by "
+                f"{gamma}; leave it, or begin a new run."
+            )
         self.num_steps = state["num_steps"]
         self._new = state.get("new", 0) // self._processes.count
         self.sac.load_state_dict(state["sac"])
