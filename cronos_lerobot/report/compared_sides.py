@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -66,11 +66,24 @@ def _by_policy(outcomes: Sequence[Outcomes], suite: str, split: str) -> list[Out
         if lengths := one.of(suite, split):
             run, checkpoint = run_and_checkpoint(one)
             _add(found.setdefault(run, {}), checkpoint, replace(one, lengths=lengths))
+    _check_spelled_alike(run for run, checkpoints in found.items() if "" not in checkpoints)
     policies: dict[str, Outcomes] = {}
     for checkpoints in found.values():
         last = checkpoints[max(checkpoints, key=_order)]
         _add(policies, identity(last), last)
     return list(policies.values())
+
+
+def _check_spelled_alike(runs: Iterable[str]) -> None:
+    """A ValueError if one run may be two, as its folder was named from here and from elsewhere."""
+    paths = {Path(run) for run in runs}
+    for short in paths:
+        for path in paths - {short}:
+            if not short.is_absolute() and path.parts[-len(short.parts) :] == short.parts:
+                raise ValueError(
+                    f"{short} and {path} may be one training, which would count twice: name folders of "
+                    "evaluations that call it alike"
+                )
 
 
 def _add(found: dict[str, Outcomes], key: str, one: Outcomes) -> None:

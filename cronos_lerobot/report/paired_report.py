@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cronos_lerobot.evaluation.outcomes import WORTH_SAYING, Outcomes
-from cronos_lerobot.report.compared_sides import Side, identity, paired_episodes, short_name
+from cronos_lerobot.report.compared_sides import Side, identity, paired_episodes, run_and_checkpoint, short_name
 from cronos_lerobot.report.paired import ALPHA, Difference, Pairs, compare_policies, compare_trainings, holm
 
 FORMAT = 1
@@ -76,7 +76,7 @@ class PairedSuite:
     left_out: int
     """Episodes of either side that the other does not have."""
     differs: list[str]
-    """What differs between the sides beside the policies, a phrase for each."""
+    """What differs between the sides beside the policies, or within one, a phrase for each."""
     passed_over: list[str]
     """Evaluations of either side that were not compared, a phrase for each."""
     rows: list[PairedRow]
@@ -173,6 +173,10 @@ def _differs(a: Sequence[Outcomes], b: Sequence[Outcomes]) -> Iterator[str]:
         values = [sorted({str(_value(o.setting.get(name))) for o in side}) for side in (a, b)]
         if values[0] != values[1]:
             yield f"{name}: {', '.join(values[0])} in A, {', '.join(values[1])} in B"
+    for name, side in (("A", a), ("B", b)):
+        steps = sorted({checkpoint for o in side if (checkpoint := run_and_checkpoint(o)[1]).isdigit()}, key=int)
+        if len(steps) > 1:
+            yield f"checkpoints of {name}: {', '.join(steps)}"
 
 
 def _value(setting: Any) -> Any:

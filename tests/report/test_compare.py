@@ -187,6 +187,19 @@ def test_runs_without_a_cronos_eval_are_not_dropped_for_those_that_have_one(tmp_
     assert (suite["rows"][0]["b"], suite["passed_over"]) == (0.75, [])
 
 
+def test_checkpoints_of_several_ages_are_said_and_a_run_of_two_names_is_refused(tmp_path, monkeypatch, capsys):
+    a = write_evaluation(tmp_path / "a", "me/a", tasks=["1100", "0000"])
+    for seed, step in ((1, "0307200"), (2, "0051200")):
+        policy = f"runs/seed{seed}/checkpoints/{step}/pretrained_model"
+        write_evaluation(tmp_path / f"b/{seed}", policy, tasks=["1110", f"000{seed - 1}"])
+    (suite,) = compared(monkeypatch, capsys, a, tmp_path / "b")["comparisons"]
+    assert suite["differs"] == ["checkpoints of B: 0051200, 0307200"]
+    policy = "/elsewhere/runs/seed1/checkpoints/0102400/pretrained_model"
+    write_evaluation(tmp_path / "b/3", policy, tasks=["1110", "1001"])
+    with pytest.raises(SystemExit, match=r"runs/seed1 and /elsewhere/runs/seed1 may be one training"):
+        compare(monkeypatch, a, tmp_path / "b")
+
+
 def test_policies_are_told_apart_by_what_they_are_not_by_their_names(tmp_path, monkeypatch, capsys):
     a = write_evaluation(tmp_path / "a", "me/a", tasks=["1000"])
     last = "out/checkpoints/last/pretrained_model"
