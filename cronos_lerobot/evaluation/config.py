@@ -207,7 +207,7 @@ class CronosEvalConfig:
             derived["obs_type"] = "environment_state_agent_pos"
         else:
             derived = observations_of(self.policy.input_features or {})
-            if env.benchmark is None:
+            if env.benchmark is None and "scene" not in given:
                 derived |= trained_scene(self.policy.pretrained_path)
         for name, value in derived.items():
             if name not in given:

@@ -14,7 +14,7 @@ from lerobot.datasets.utils import INFO_PATH
 from lerobot.utils.constants import HF_LEROBOT_HOME, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from lerobot_env_cronos import CronosEnvConfig
 from lerobot_env_cronos.scene.model import CAMERAS
-from lerobot_env_cronos.scene.scenes import SCENES
+from lerobot_env_cronos.scene.scenes import SCENES, get_scene
 from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS
 
 from cronos_lerobot.data.origin import read_origin
@@ -46,13 +46,16 @@ def trained_scene(path: Path | None) -> dict[str, str]:
     Empty if it does not say, or if its dataset is not on this machine.
 
     Raises:
-        ValueError: its config is damaged.
+        ValueError: its config is damaged, or `cronos-train` had a scene that is not registered here.
     """
     file = Path(path or "") / TRAIN_CONFIG_NAME
     if not file.is_file():
         return {}
     config = json.loads(file.read_text())
-    scene = (config.get("env") or {}).get("scene")
+    env = config.get("env") or {}
+    scene = env.get("scene")
+    if scene is not None and env.get("type") == "cronos":
+        get_scene(scene)
     dataset = config.get("dataset") or {}
     if scene is None and isinstance(repo_id := dataset.get("repo_id"), str):
         scene = scene_of_dataset(repo_id, dataset.get("root"))

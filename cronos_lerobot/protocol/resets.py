@@ -49,12 +49,24 @@ class ResetStrategy(ABC):
 
     def apply_if_due(self, env: Any, loop: LoopState) -> bool:
         """Intervene where it is due and count it; returns whether any stream was touched."""
-        ids = self.due(env, loop)
+        ids = self._checked(self.due(env, loop), loop.num_streams)
         if len(ids) == 0:
             return False
         self.apply(env, ids)
         self.count(loop, ids)
         return True
+
+    def _checked(self, due: Any, num_streams: int) -> np.ndarray:
+        ids = np.asarray(due)
+        if not ids.size:
+            return ids
+        is_sorted = ids.ndim == 1 and np.issubdtype(ids.dtype, np.integer) and (np.diff(ids) > 0).all()
+        if not is_sorted or ids[0] < 0 or ids[-1] >= num_streams:
+            raise ValueError(
+                f"{type(self).__name__}.due must return numbers of streams from 0 to {num_streams - 1}, each once "
+                f"and in order, got {due!r}"
+            )
+        return ids
 
     def count(self, loop: LoopState, ids: np.ndarray) -> None:
         """Count one event for each stream of `ids`."""

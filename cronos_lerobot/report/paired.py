@@ -38,6 +38,8 @@ class Pairs:
     """(episodes,) the configuration, a cluster of episodes."""
     unit: str = "configuration"
     """What a cluster is, in words."""
+    are_chains: bool = False
+    """Whether these are lengths, even if all of them are 0 or 1."""
 
     @classmethod
     def of(cls, a: np.ndarray, b: np.ndarray, episodes: Sequence[Episode]) -> Pairs:
@@ -62,6 +64,11 @@ class Pairs:
     def clusters(self) -> np.ndarray:
         """(episodes,) the number of its configuration, from 0."""
         return np.unique(self.configurations, return_inverse=True)[1]
+
+    @property
+    def is_binary(self) -> bool:
+        """Whether the successes of one policy are compared with those of one other."""
+        return self.is_one_each and not self.are_chains and max(self.a.max(), self.b.max()) <= 1
 
     @property
     def is_one_each(self) -> bool:
@@ -101,8 +108,7 @@ def compare_policies(pairs: Pairs, power: float) -> Difference:
     """
     value, k = float(pairs.differences.mean()), int(pairs.clusters.max()) + 1
     spread = sqrt(k * cluster_variance(pairs.differences, pairs.clusters)) if k > 1 else 0.0
-    is_binary = pairs.is_one_each and max(pairs.a.max(), pairs.b.max()) <= 1
-    if is_binary:
+    if pairs.is_binary:
         interval, name = _newcombe(pairs), f"Newcombe's paired interval by {pairs.unit}"
     else:
         half = float(student_t.ppf(1 - ALPHA / 2, k - 1)) * spread / sqrt(k) if k > 1 else 0.0

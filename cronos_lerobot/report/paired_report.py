@@ -124,6 +124,7 @@ def _suite(side_a: Side, side_b: Side, suite: str, split: str, power: float) -> 
     else:
         parts = {f"SEQ {k}": _beyond(pairs, k) for k in range(max(o.chain_tasks for o in (*a, *b)))}
         first = "chain length"
+        pairs = replace(pairs, are_chains=True)
     rows = [_row(what, part, power) for what, part in parts.items()]
     adjusted = holm([1.0 if row.most_general.p is None else row.most_general.p for row in rows])
     rows = [replace(row, p_holm=p) for row, p in zip(rows, adjusted, strict=True)]
@@ -152,7 +153,7 @@ def _beyond(pairs: Pairs, position: int) -> Pairs:
 
 def _row(what: str, pairs: Pairs, power: float) -> PairedRow:
     only_a = only_b = None
-    if pairs.is_one_each and max(pairs.a.max(), pairs.b.max()) <= 1:
+    if pairs.is_binary:
         only_a, only_b = int((pairs.a > pairs.b).sum()), int((pairs.b > pairs.a).sum())
     return PairedRow(
         what,

@@ -97,6 +97,11 @@ class RunLogger:
             "time": time.time(),
         } | values
         self.metrics.write(record)
+        if kind == "evaluation":
+            self._say(
+                "evaluation, {split}: {success:.3f} [{ci95[0]:.3f}, {ci95[1]:.3f}], n = {n}, after "
+                "{interaction_steps:,} steps and {interventions:,} interventions".format(**record)
+            )
         scalars = _scalars(values | {"interventions": self.loop.b})
         mode = "eval" if kind == "evaluation" else "train"
         if self._tensorboard is not None:
@@ -104,6 +109,12 @@ class RunLogger:
                 self._tensorboard.add_scalar(f"{mode}/{name}", value, self.loop.n)
         if self._wandb is not None:
             self._wandb.log_dict(scalars, step=self.loop.n, mode=mode)
+
+    def _say(self, line: str) -> None:
+        """Print a line above the bar, or among the lines that are in its place."""
+        # A run whose terminal or pipe is gone goes on, and saves.
+        with suppress(OSError):
+            self._bar.write(line)
 
     def progress(self, values: dict[str, Any]) -> None:
         """Move the bar, or print a line; `values` has `steps_per_s` and rates, None where unknown."""

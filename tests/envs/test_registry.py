@@ -1,6 +1,7 @@
 """Scenes from outside the package."""
 
 import json
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -109,6 +110,12 @@ def test_registering_again_changes_nothing():
         (SCENE, [BLOCK, Body("blue coaster", (0.1, 0.1, 0.01), 1, "ring")], "unknown shape 'ring'.*box"),
         (SCENE, [BLOCK, Body("blue coaster", (0.1, 0.0, 0.01), 1, "disc")], "must be positive"),
         (Scene("study", ("red block",), ()), [BLOCK], "objects and receptacles"),
+        (SCENE, [replace(BLOCK, size=(0.06, 0.05, 0.05)), COASTER], "red block is an object, 50 mm wide .* 44 mm"),
+        (
+            SCENE,
+            [replace(BLOCK, colour=(255, 0, 0)), COASTER],
+            r"colour of the red block must be .* \(255, ",
+        ),
     ],
 )
 def test_what_is_wrong_is_named_and_nothing_registered(scene, bodies, message):

@@ -294,6 +294,22 @@ def test_a_stream_that_an_own_strategy_has_reset_is_not_reset_and_counted_again(
     assert loop.interventions[:, Intervention.SCENE_RESET].tolist() == [6, 3]
 
 
+@pytest.mark.parametrize("due", [[1, 0], [1, 1], [2], [-1], [0.0], [[0]], np.array([True, False])])
+def test_streams_that_a_strategy_cannot_mean_are_told(due, monkeypatch):
+    class Own(ResetStrategy):
+        kind = Intervention.SCENE_RESET
+
+        def due(self, env, loop):
+            return due
+
+        def apply(self, env, ids):
+            raise AssertionError(ids)
+
+    monkeypatch.setitem(EXTRA_RESETS, "own", lambda rng, config: Own())
+    with pytest.raises(ValueError, match=r"Own\.due must return numbers of streams from 0 to 1, each once"):
+        run(protocol(extra_resets=["own"]), steps=8)
+
+
 def test_recent_history_holds_the_last_segments():
     env = DummyEnv(2)
     env.scene_reset = lambda ids, configurations: None

@@ -75,6 +75,14 @@ def test_episodes_of_a_configuration_that_go_together_count_as_one():
     assert found.detectable == pytest.approx((2.2622 + 0.8834) * theirs._standard_error, abs=1e-3)
 
 
+def test_chains_that_all_have_the_same_length_say_nothing_of_others():
+    """As the lengths of chains of which none came to a task, which are no rates."""
+    none = np.zeros((1, 8), int)
+    found = compare_policies(Pairs(none, none, np.arange(8), are_chains=True), power=0.8)
+    assert (found.value, found.ci95) == (0, None)
+    assert compare_policies(Pairs(none, none, np.arange(8)), power=0.8).ci95 is not None
+
+
 def test_chains_are_compared_by_their_lengths():
     a, b = np.array([[4, 1, 0, 2, 3, 1]]), np.array([[4, 2, 1, 4, 2, 4]])
     found = compare_policies(Pairs(a, b, np.arange(6)), power=0.9)

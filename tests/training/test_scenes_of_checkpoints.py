@@ -46,6 +46,10 @@ def test_the_scene_is_the_runs_or_that_of_the_cloned_demonstrations(demos, tmp_p
     assert trained_scene(checkpoint(tmp_path, env=None, dataset=dataset | {"root": str(tmp_path)})) == {}
     assert trained_scene(checkpoint(tmp_path, env=None, dataset=None)) == {}
     assert trained_scene(tmp_path / "none") == {}
+    # In the default scene the policy would be another task's; what is not of this package is not its business.
+    with pytest.raises(ValueError, match=r"unknown scene 'study'.* --env\.discover_packages_path=<package>"):
+        trained_scene(checkpoint(tmp_path, env={"type": "cronos", "scene": "study"}, dataset=None))
+    assert trained_scene(checkpoint(tmp_path, env={"type": "libero", "scene": "study"}, dataset=None)) == {}
 
 
 def test_a_policy_of_another_scene_is_told(tmp_path, caplog):

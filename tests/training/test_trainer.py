@@ -187,6 +187,13 @@ def test_a_second_signal_ends_at_once_but_not_an_echo_of_the_first(after_s, ends
     assert (stop.number, ended) == (signal.SIGTERM, ends)
 
 
+def test_evaluations_are_printed(tmp_path, capsys):
+    train(config(tmp_path / "run", steps=STEPS_PER_UPDATE), env=DummyEnv(STREAMS))
+    first = next(line for line in metrics(tmp_path / "run") if line["kind"] == "evaluation")
+    said = f"evaluation, train: {first['success']:.3f} [{first['ci95'][0]:.3f}, {first['ci95'][1]:.3f}], n = "
+    assert f"{said}{first['n']}, after 0 steps and 0 interventions" in capsys.readouterr().out
+
+
 def test_evaluations_at_so_many_interventions(tmp_path):
     """Four streams, reset every 16 steps, updates every 8: 4 counted interventions at every second update."""
     options = {"eval_freq": 0, "eval_at_interventions": [1, 4, 5], "steps": 6 * STEPS_PER_UPDATE}

@@ -135,7 +135,8 @@ def make_trainable(policy: Any, options: AdapterOptions) -> Any:
         check_trainable(policy)
     except TypeError as error:
         raise ValueError(
-            f"{error} There are adapters for --policy.type={', '.join(sorted(ADAPTERS))}. "
+            f"{error} There are adapters for --policy.type={', '.join(sorted(ADAPTERS))}; one of your own is "
+            "registered by a package that --discover_packages_path=<package> imports. "
             "--algorithm.type=imitation learns with any policy that lerobot-train trains."
         ) from error
     return policy

@@ -14,6 +14,9 @@ from lerobot_env_cronos.scene.visuals.objects import LOOKS
 
 # Part of Gymnasium's environment ids and of file names.
 NAME_PATTERN = re.compile(r"[a-z0-9_]+")
+PLAIN_SHAPES = ("box", "disc")
+MAX_WIDTH_M = 0.044
+"""What the gripper takes between its fingers."""
 
 
 def register_scene(scene: Scene, bodies: Sequence[Body] = (), configurations: Path | str | None = None) -> None:
@@ -55,11 +58,22 @@ def _check(scene: Scene, new_bodies: dict[str, Body]) -> None:
             raise ValueError(f"unknown shape {body.shape!r} of the {name}; valid shapes: {valid_shapes}")
         if min(body.size) <= 0 or body.density <= 0:
             raise ValueError(f"size and density of the {name} must be positive, got {body.size}, {body.density}")
+        if body.colour is not None and not all(0 <= channel <= 1 for channel in body.colour):
+            raise ValueError(f"colour of the {name} must be (R, G, B) in 0 to 1, got {body.colour}")
     if not scene.objects or not scene.receptacles or len(set(scene.bodies)) < len(scene.bodies):
         raise ValueError(f"a scene needs objects and receptacles, each once; {scene.name} has {scene.bodies}")
     for name in scene.bodies:
         if name not in BODIES and name not in new_bodies:
             raise ValueError(f"unknown body {name!r}; valid bodies: {sorted(BODIES | new_bodies)}")
+    for name in scene.objects:
+        body = (BODIES | new_bodies)[name]
+        # Other shapes may be held where they are narrower, as a shovel is by its handle.
+        width = min(body.size[:2])
+        if body.shape in PLAIN_SHAPES and width >= MAX_WIDTH_M:
+            raise ValueError(
+                f"the {name} is an object, {1000 * width:.0f} mm wide where it is narrowest; the gripper takes "
+                f"less than {1000 * MAX_WIDTH_M:.0f} mm"
+            )
 
 
 def register_gymnasium() -> None:

@@ -110,5 +110,8 @@ SCENES: dict[str, Scene] = {
 def get_scene(name: str) -> Scene:
     """Look a scene up by name; a ValueError names the valid ones."""
     if name not in SCENES:
-        raise ValueError(f"unknown scene {name!r}; valid scenes: {sorted(SCENES)}")
+        raise ValueError(
+            f"unknown scene {name!r}; valid scenes: {sorted(SCENES)}. One of your own is registered by its "
+            "package: install it as lerobot_env_<name>, or give --env.discover_packages_path=<package>"
+        )
     return SCENES[name]
