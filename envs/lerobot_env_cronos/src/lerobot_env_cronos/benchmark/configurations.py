@@ -133,8 +133,14 @@ def sample_place(
     Raises:
         RuntimeError: no free place was found.
     """
+    centres = np.array([other.mean(axis=0) for other in others]).reshape(-1, 2)
+    # As far as the circles within them reach: where those are too near, so are the footprints.
+    inner = np.array([np.linalg.norm(other[:2] - other[1:3], axis=1).min() / 2 for other in others])
+    nearest = inner + min(BODIES[body].size[:2]) / 2 + CLEARANCE_M - 1e-9
     for _ in range(MAX_ATTEMPTS):
         xy, yaw = draw(body, rng) if draw else draw_spawn_place(scene, body, rng)
+        if (((centres - xy) ** 2).sum(axis=1) < nearest**2).any():
+            continue
         corners = footprint_corners(body, xy, yaw)
         if all(footprint_gap(corners, other) > CLEARANCE_M for other in others):
             pose = [*xy, BODIES[body].size[2] / 2, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
