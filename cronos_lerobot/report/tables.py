@@ -234,8 +234,10 @@ def comparison_text(comparisons: Iterable[Comparison]) -> str:
     """The before/after table for a terminal, all tasks and each, with n, 95 % intervals and the gain."""
     header = ("", "before", "after", "gain")
     lines: list[tuple[str, ...]] = [header]
-    for comparison in comparisons:
-        lines.append((comparison.suite, "", "", ""))
+    shown = list(comparisons)
+    several = len({comparison.label for comparison in shown}) > 1
+    for comparison in shown:
+        lines.append((f"{comparison.label}: {comparison.suite}" if several else comparison.suite, "", "", ""))
         for task, gain in {ALL: comparison.overall, **comparison.tasks}.items():
             lines.append((f"  {task}", str(gain.before), str(gain.after), str(gain)))
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]

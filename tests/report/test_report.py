@@ -119,6 +119,8 @@ def test_groups_differ_in_more_than_the_seed_and_are_called_so(tmp_path):
     groups = group_runs(find_runs([tmp_path]).training)
     assert [group.label for group in groups] == ["T = 160", "T = 320"]
     assert [[run.seed for run in group.runs] for group in groups] == [[0, 1], [0, 1]]
+    text = comparison_text(compare_training(groups))
+    assert all(f"{group.label}: periodic evaluation, train" in text for group in groups)
 
 
 def test_curve_of_seeds_is_their_mean_and_standard_deviation(tmp_path):
