@@ -55,7 +55,10 @@ def trained_scene(path: Path | None) -> dict[str, str]:
     env = config.get("env") or {}
     scene = env.get("scene")
     if scene is not None and env.get("type") == "cronos":
-        get_scene(scene)
+        try:
+            get_scene(scene)
+        except ValueError as error:
+            raise ValueError(f"the policy in {path} was trained in a scene that is not here: {error}") from error
     dataset = config.get("dataset") or {}
     if scene is None and isinstance(repo_id := dataset.get("repo_id"), str):
         scene = scene_of_dataset(repo_id, dataset.get("root"))

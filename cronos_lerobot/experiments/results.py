@@ -50,14 +50,12 @@ class Point:
 def summarise_points(points: Sequence[Point]) -> Summary | None:
     """Success over the seeds, a point for each; None of none.
 
-    One alone has the interval of its evaluation, and so have several that are all alike: that a few trainings came
-    to the same number does not say that all do.
+    One alone has the interval of its evaluation, and so have several that are all alike.
     """
     summary = summarise([point.success for point in points])
     if summary is None:
         return None
-    over_seeds = summary.ci95 if summary.std else None
-    return replace(summary, ci95=over_seeds or points[0].ci95).within(0.0, 1.0)
+    return replace(summary, ci95=summary.varied_ci95 or points[0].ci95).within(0.0, 1.0)
 
 
 @dataclass(frozen=True)

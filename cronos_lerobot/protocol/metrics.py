@@ -124,6 +124,11 @@ class Summary:
     n: int
     """Seeds."""
 
+    @property
+    def varied_ci95(self) -> tuple[float, float] | None:
+        """`ci95` of numbers that vary: that a few trainings came to the same success does not say that all do."""
+        return self.ci95 if self.std else None
+
     def within(self, low: float, high: float) -> Summary:
         """The same with an interval that ends where the number does: that of two or three seeds can be wider."""
         if self.ci95 is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from cronos_lerobot.report.runs import EvaluationRun, Group, TrainingRun, evaluation_rates
@@ -22,6 +22,13 @@ class Comparison:
         """All tasks together."""
         gains = self.tasks.values()
         return Gain(sum_rates(gain.before for gain in gains), sum_rates(gain.after for gain in gains))
+
+
+def titled(comparisons: Iterable[Comparison]) -> list[tuple[str, Comparison]]:
+    """Each with its suite, and what was compared where that is several."""
+    shown = list(comparisons)
+    several = len({comparison.label for comparison in shown}) > 1
+    return [(f"{one.label}: {one.suite}" if several else one.suite, one) for one in shown]
 
 
 def compare_training(groups: list[Group]) -> list[Comparison]:
@@ -105,4 +112,4 @@ def _pool(tables: list[dict[str, Rate]]) -> dict[str, Rate]:
     for table in tables:
         for task, rate in table.items():
             rates.setdefault(task, []).append(rate)
-    return {task: found[0] if len(found) == 1 else SeedRate.of(found) for task, found in rates.items()}
+    return {task: SeedRate.of(found) for task, found in rates.items()}

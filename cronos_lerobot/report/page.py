@@ -13,7 +13,7 @@ import jinja2
 from matplotlib.figure import Figure
 
 from cronos_lerobot.report import clips, figures, suite_views, tables
-from cronos_lerobot.report.comparisons import Comparison, compare_evaluations, compare_training
+from cronos_lerobot.report.comparisons import Comparison, compare_evaluations, compare_training, titled
 from cronos_lerobot.report.png import to_png
 from cronos_lerobot.report.runs import EvaluationRun, Group, TrainingRun, group_runs
 from cronos_lerobot.report.suites import SuiteRun
@@ -104,6 +104,7 @@ def write_report(report: Report, output: Path) -> Path:
     )
     environment.filters |= {
         "cell": _cell,
+        "titled": titled,
         "percent": lambda x: f"{100 * x:.1f}",
         "merged": tables.merge_statistics,
         "columns": tables.column_names,

@@ -10,7 +10,7 @@ from operator import add
 
 from lerobot_env_cronos.statistics import wilson_interval
 
-from cronos_lerobot.protocol.metrics import summarise
+from cronos_lerobot.protocol.metrics import summarise, summarise_rates
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ class SeedRate(Rate):
     @property
     def interval(self) -> tuple[float, float]:
         """95 % t-interval of the mean over the seeds, within 0 and 1; Wilson's of one, or of some all alike."""
-        summary = summarise([rate.value for rate in self.seeds])
-        over_seeds = summary.within(0.0, 1.0).ci95 if summary and summary.std else None
+        summary = summarise_rates([rate.value for rate in self.seeds])
+        over_seeds = summary.varied_ci95 if summary else None
         return over_seeds or super().interval
 
     def __add__(self, other: Rate) -> Rate:
@@ -96,10 +96,8 @@ class Gain:
         before, after = (getattr(rate, "seeds", ()) for rate in (self.before, self.after))
         if len(before) == len(after) > 1:
             summary = summarise([new.value - old.value for old, new in zip(before, after, strict=True)])
-            assert summary is not None
-            ends = summary.within(-1.0, 1.0).ci95
-            assert ends is not None
-            return ends
+            if summary and (ends := summary.within(-1.0, 1.0).varied_ci95):
+                return ends
         return newcombe_interval(self.before, self.after)
 
     def __str__(self) -> str:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from cronos_lerobot.protocol.metrics import Summary, performance_gap, success_at, summarise, summarise_rates
-from cronos_lerobot.report.comparisons import Comparison
+from cronos_lerobot.report.comparisons import Comparison, titled
 from cronos_lerobot.report.runs import EvaluationRun, Group, TrainingRun, agent_metrics, evaluation_rates
 from cronos_lerobot.report.statistics import Gain, Rate
 
@@ -68,7 +69,8 @@ def seed_rows(groups: Iterable[Group]) -> list[Row]:
         row: Row = {"runs": group.label, "seeds": len(curves), "split": curves[0][-1]["split"]}
         row |= {"n": curves[0][-1]["n"], "interaction_steps": end}
         rates = [success_at(x, y, end) for x, y in zip(steps, success, strict=True)]
-        row |= _summary_columns("success", summarise_rates(rates))
+        summary = summarise_rates(rates)
+        row |= _summary_columns("success", summary and replace(summary, ci95=summary.varied_ci95))
         last = [curve[-1] for curve in curves]
         are_there = all(e["interaction_steps"] == end for e in last)
         row |= {name: sum(e.get(name, 0) for e in last) if are_there else None for name in APART}
@@ -234,10 +236,8 @@ def comparison_text(comparisons: Iterable[Comparison]) -> str:
     """The before/after table for a terminal, all tasks and each, with n, 95 % intervals and the gain."""
     header = ("", "before", "after", "gain")
     lines: list[tuple[str, ...]] = [header]
-    shown = list(comparisons)
-    several = len({comparison.label for comparison in shown}) > 1
-    for comparison in shown:
-        lines.append((f"{comparison.label}: {comparison.suite}" if several else comparison.suite, "", "", ""))
+    for title, comparison in titled(comparisons):
+        lines.append((title, "", "", ""))
         for task, gain in {ALL: comparison.overall, **comparison.tasks}.items():
             lines.append((f"  {task}", str(gain.before), str(gain.after), str(gain)))
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]

@@ -111,10 +111,10 @@ class RunLogger:
             self._wandb.log_dict(scalars, step=self.loop.n, mode=mode)
 
     def _say(self, line: str) -> None:
-        """Print a line above the bar, or among the lines that are in its place."""
+        """Print a line, above the bar where there is one."""
         # A run whose terminal or pipe is gone goes on, and saves.
-        with suppress(OSError):
-            self._bar.write(line)
+        with suppress(OSError), self._bar.external_write_mode():
+            print(line, flush=True)
 
     def progress(self, values: dict[str, Any]) -> None:
         """Move the bar, or print a line; `values` has `steps_per_s` and rates, None where unknown."""
@@ -125,9 +125,7 @@ class RunLogger:
         }
         if self._bar.disable:
             line = ", ".join(f"{name} {value}" for name, value in text.items())
-            # A run whose terminal or pipe is gone goes on, and saves.
-            with suppress(OSError):
-                print(f"{self.loop.n}/{self.config.total_steps} steps: {line}", flush=True)
+            self._say(f"{self.loop.n}/{self.config.total_steps} steps: {line}")
             return
         self._bar.set_postfix(text, refresh=False)
         self._bar.update(self.loop.n - self._bar.n)

@@ -9,10 +9,12 @@ import pytest
 from lerobot_env_cronos import SCENES, CronosVectorEnv, get_scene
 from lerobot_env_cronos.benchmark.configurations import (
     CLEARANCE_M,
+    SEED,
     SPLITS,
     footprint_corners,
     footprint_gap,
     load_configurations,
+    sample_configuration,
 )
 
 # A change of these is a new version of the environment id.
@@ -27,6 +29,15 @@ GOLDEN_SHA256 = {
 def test_data_is_frozen(scene):
     data = resources.files("lerobot_env_cronos").joinpath(f"data/{scene}.json").read_bytes()
     assert hashlib.sha256(data).hexdigest() == GOLDEN_SHA256[scene]
+
+
+def test_a_seed_draws_what_is_frozen():
+    """Poses are rounded in the file, as they are drawn."""
+    scene = get_scene("playroom_2x2")
+    drawn = np.random.default_rng(SEED)
+    frozen = np.concatenate([load_configurations(scene.name, split) for split in SPLITS])
+    again = [sample_configuration(scene, drawn).round(6) for _ in range(len(frozen))]
+    np.testing.assert_array_equal(again, frozen)
 
 
 @pytest.mark.parametrize("scene", SCENES)

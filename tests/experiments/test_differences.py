@@ -35,6 +35,9 @@ def test_rows_are_compared_as_the_report_compares_them(options, tmp_path):
     assert {pair: d["of_trainings"] for pair, d in found.items()} == {
         ("t1280", "t80"): "False", ("t1280_eer", "t80"): "True", ("t1280_eer", "t1280"): "False",
     }  # fmt: skip
+    # Nothing of them stays beside a page of one row.
+    write_outputs(EXPERIMENTS["table1"], EXPERIMENTS["table1"].rows[:1], options, tmp_path / "out")
+    assert not (tmp_path / "out/table1_differences.csv").exists()
 
 
 def test_rows_are_compared_on_the_seeds_that_both_have(options):

@@ -195,24 +195,6 @@ def report_folder(tmp_path):
     return tmp_path / "report", report
 
 
-def test_nothing_of_another_report_stays_in_its_folder(tmp_path):
-    write_training_run(tmp_path / "run")
-    out = tmp_path / "out"
-    write_report(make_report([tmp_path / "run"]), out)
-    assert {"seeds.csv", "updates.csv"} <= (first := {path.name for path in out.iterdir()})
-    write_evaluation(tmp_path / "eval")
-    write_report(make_report([tmp_path / "eval"]), out)
-    assert {path.name for path in out.iterdir()} == {"index.html", "lerobot_eval.csv"}
-    assert [name for name in first if name.endswith(".png")]
-
-
-def test_what_is_paired_by_task_is_of_lerobot_eval(tmp_path):
-    write_training_run(tmp_path / "run")
-    write_evaluation(tmp_path / "eval")
-    with pytest.raises(ValueError, match=r"--after=.*run: nothing of lerobot-eval there.* cronos-report compare"):
-        make_report([], before=[tmp_path / "eval"], after=[tmp_path / "run"])
-
-
 def test_page_shows_the_inputs_numbers(report_folder):
     folder, _ = report_folder
     page = (folder / "index.html").read_text()

@@ -30,6 +30,11 @@ def test_seeds_that_are_all_alike_do_not_say_that_every_training_is():
     assert SeedRate.of([Rate(9, 10)] * 2).interval == pytest.approx((0.6990, 0.9721), abs=1e-4)
 
 
+def test_gains_that_are_all_alike_have_an_interval_of_their_evaluations():
+    before, after = SeedRate.of([Rate(3, 10)] * 2), SeedRate.of([Rate(8, 10)] * 2)
+    assert Gain(before, after).interval == newcombe_interval(Rate(6, 20), Rate(16, 20))
+
+
 def test_intervals_over_seeds_end_where_rates_and_gains_do():
     """t with two degrees of freedom is 4.3027."""
     # Mean .9, standard deviation .1: .9 +- 4.3027 * .1 / sqrt(3) = .9 +- .2484.

@@ -94,6 +94,11 @@ def test_two_processes_are_one_run(tmp_path, algorithm):
         np.testing.assert_allclose(second[name], column, rtol=1e-3, atol=1e-5, err_msg=name)
 
 
+def test_what_a_checkpoint_needs_goes_to_the_first_process_alone():
+    answers = together(lambda processes: processes.gather_to_main([processes.rank] * (processes.rank + 1)))
+    assert answers == [[[0], [1, 1]], [[1, 1]]]
+
+
 def test_the_runs_compared_have_everything_that_is_counted(tmp_path):
     trainer_loop, _ = train(Processes(), settings(tmp_path / "run", 32))
     counts = np.array(trainer_loop["interventions"])

@@ -23,19 +23,18 @@ class BasePolicy:
 
     def __init__(self, policy: nn.Module, params: Sequence[Tensor]) -> None:
         wanted = {id(param) for param in params}
-        self.parameters = {
-            name: param.detach().clone() for name, param in policy.named_parameters() if id(param) in wanted
-        }
-        names = {id(param): name for name, param in policy.named_parameters() if id(param) in wanted}
+        own = {name: param for name, param in policy.named_parameters() if id(param) in wanted}
+        self.parameters = {name: param.detach().clone() for name, param in own.items()}
+        names = {id(param): name for name, param in own.items()}
+        self._evaluate = _Evaluate(policy)
         # Each attribute of each module once, whatever names it has: a policy may stand twice within its adapters,
         # and swapping it twice would put the copies back in the end.
         self._attributes = {
-            f"policy.{module_name}.{name}" if module_name else f"policy.{name}": names[id(param)]
-            for module_name, module in policy.named_modules()
+            f"{module_name}.{name}": names[id(param)]
+            for module_name, module in self._evaluate.named_modules()
             for name, param in module.named_parameters(recurse=False, remove_duplicate=False)
             if id(param) in wanted
         }
-        self._evaluate = _Evaluate(policy)
 
     @torch.no_grad()
     def log_prob(self, batch: Any, trace: Tensor, temperature: float) -> Tensor:
