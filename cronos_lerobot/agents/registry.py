@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any, Self
 
 import numpy as np
@@ -54,6 +55,12 @@ class AgentContext:
 class AgentConfig(RLAlgorithmConfig):
     """What `--algorithm.*` sets, to be derived from: a dataclass with a default for every flag."""
 
+    @property
+    def unread(self) -> dict[str, str]:
+        """Settings without effect beside the others, `name` or `group.name`, each with what it needs: cronos-train
+        refuses them."""
+        return {}
+
     @classmethod
     def from_policy_config(cls, policy_cfg: Any) -> Self:
         """Return the defaults: what depends on the policy is asked of it when the agent is made."""
@@ -98,6 +105,21 @@ def check_agent(name: str) -> None:
             f"--algorithm.type must be one of {agent_names()}, got {name!r}. Register your own with "
             "cronos_lerobot.agents.registry.register_agent, in a module named by --discover_packages_path."
         )
+
+
+def check_settings_are_read(config: RLAlgorithmConfig, given: Iterable[str]) -> None:
+    """Raise a ValueError, if a setting of the command line has no effect beside the others.
+
+    Args:
+        config: of the agent; an `unread` of its own names such settings, with what each needs.
+        given: names of the command line's settings, `name` or `group.name`. Defaults and null may be given
+            everywhere.
+    """
+    unread = getattr(config, "unread", {})
+    for name in sorted(unread.keys() & set(given)):
+        value, default = map(attrgetter(name), (config, type(config)()))
+        if value is not None and value != default:
+            raise ValueError(f"--algorithm.{name}={value} has no effect here: it needs {unread[name]}.")
 
 
 def make_agent(context: AgentContext) -> LearningAgent:

@@ -213,6 +213,7 @@ WOULD_NOT_BEGIN = {
     "--protocol.takeover_price=3": "protocol.takeover_price=3 is for takeovers",
     "--protocol.extra_resets=[stock]": "protocol.extra_resets has ['stock']",
     "--algorithm.type=nobody": "got 'nobody'",
+    "--algorithm.self_imitation.max_age=3": "max_age=3 has no effect here: it needs an --algorithm.self_imitation",
 }
 
 

@@ -86,6 +86,10 @@ def test_steps_are_rounded_up_to_whole_updates():
         (["--resume=true", "--config_path=/nowhere/train_config.json"], "--config_path=/nowhere/.*: no such file"),
         (["--env.type=cronos", "--policy.path=/nowhere"], "--policy.path=/nowhere: no such folder"),
         (["--policy.path=/nowhere", "--policy.type=act"], "Cannot specify both --policy.path and --policy.type"),
+        (
+            ["--env.type=cronos", "--algorithm.value_loss=mse", "--algorithm.huber_delta", "3"],
+            "--algorithm.huber_delta=3.0 has no effect here: it needs --algorithm.value_loss=huber",
+        ),
         (["--env.type=cronos", "--algorithm.type=sac"], r"one of \[.*'ppo', 'ppo_paper'.*\], got 'sac'"),
         (["--env.type=cronos", "--algorithm.type=nobody"], r"one of \[.*'ppo', 'ppo_paper'.*\], got 'nobody'"),
     ],

@@ -96,6 +96,16 @@ class ImitationConfig(RLAlgorithmConfig):
                 raise ValueError(f"algorithm.{name} must be >= 0 and <= 1, got {getattr(self, name)}.")
         self.demos.check(self.demos_share)
 
+    @property
+    def unread(self) -> dict[str, str]:
+        """Settings without effect beside the others, each with what it needs."""
+        needs: dict[str, str] = {}
+        if self.weighting == "none":
+            needs |= dict.fromkeys(("weighting_beta", "gamma"), "an --algorithm.weighting of return or advantage")
+        if self.weighting != "advantage":
+            needs["max_weight"] = "--algorithm.weighting=advantage"
+        return needs
+
     @classmethod
     def from_policy_config(cls, policy_cfg: Any) -> ImitationConfig:
         """Return the defaults: what depends on the policy is asked of it when the agent is made."""

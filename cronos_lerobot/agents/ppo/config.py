@@ -252,6 +252,24 @@ class PPOConfig(RLAlgorithmConfig):
                 "--algorithm.self_imitation.coef above 0."
             )
 
+    @property
+    def unread(self) -> dict[str, str]:
+        """Settings without effect beside the others, each with what it needs."""
+        needs: dict[str, str] = {}
+        if self.value_loss != "huber":
+            needs["huber_delta"] = "--algorithm.value_loss=huber"
+        if self.lr_schedule == "fixed":
+            names = ("lr_factor", "policy_lr_min", "policy_lr_max")
+            needs |= dict.fromkeys(names, "an --algorithm.lr_schedule of kl_step or kl_update")
+            if self.kl_stop_factor is None:
+                needs["target_kl"] = "an adaptive --algorithm.lr_schedule, or --algorithm.kl_stop_factor"
+        if self.target_kl is None:
+            needs["kl_stop_factor"] = "--algorithm.target_kl"
+        if not self.self_imitation.coef:
+            names = (f"self_imitation.{name}" for name in SELF_IMITATION_RANGES if name != "coef")
+            needs |= dict.fromkeys(names, "an --algorithm.self_imitation.coef above 0")
+        return needs
+
     @classmethod
     def from_policy_config(cls, policy_cfg: Any) -> PPOConfig:
         """Return the defaults: nothing of PPO depends on the policy's config."""
