@@ -164,11 +164,12 @@ def _ours(claim: dict[str, Any], digits: int) -> str:
     return "~" * claim["interpolated"] + _number(claim["ours"], digits)
 
 
-def sequential_columns(rows: list[dict[str, Any]]) -> Columns:
+def sequential_columns(result: ExperimentResult, rows: list[dict[str, Any]]) -> Columns:
     """SEQ 0-3 and chain length, by split and orderings."""
+    labels = {row.row.name: row.row.label for row in result.rows}
     if not rows:
         return {}
-    columns: Columns = {"": [row["row"] for row in rows], "split": [row["split"] for row in rows]}
+    columns: Columns = {"": [labels[row["row"]] for row in rows], "split": [row["split"] for row in rows]}
     columns["orderings"] = [row["orderings"] for row in rows]
     measures = [key.removesuffix("_mean") for key in rows[0] if key.endswith("_mean")]
     for measure in measures:

@@ -137,7 +137,7 @@ def markdown(
     lines += _section("What the text says", claim_columns(tables.claim_rows(result)))
     if orders:
         lines += [*_section("What the text says of two rows", order_columns(orders)), "", ORDER_NOTES]
-    lines += _section("Sequences of tasks", sequential_columns(tables.sequential_rows(result)))
+    lines += _section("Sequences of tasks", sequential_columns(result, tables.sequential_rows(result)))
     lines += _section("Success while training, by segment since the last scene reset", segment_columns(result))
     lines += _section("Success while training, by quarter of the run", quarter_columns(result))
     for file in figures:

@@ -90,6 +90,7 @@ def test_sequences(options, tmp_path):
     assert row["SEQ 0_std"] == pytest.approx(0.5 / 2**0.5)
     assert row["chain_length_mean"] == 1.25
     text = write_outputs(EXPERIMENTS["figure5"], EXPERIMENTS["figure5"].rows, options, tmp_path / "out")
+    assert "| T = 320, EER | held_out | all |" in text
     assert (
         "| 0.500 ± 0.354 | 0.500 ± 0.000 | 0.250 ± 0.000 | 0.000 ± 0.000 | 1.250 ± 0.354 | 640 | 8 | 16 | 2 |"
         in text
