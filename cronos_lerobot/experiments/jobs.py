@@ -22,6 +22,8 @@ PLUGIN_FLAG = "discover_packages_path"
 """Of LeRobot's commands: imports a module that registers policies or environments."""
 PLUGIN = "the module "
 """In a note, before the name of a module that the command imports."""
+POLICY = "the policy "
+"""In a note, before a policy of one's own that the command begins with."""
 
 
 @dataclass(frozen=True)
@@ -244,8 +246,10 @@ def changed_versions(job: Job) -> list[str]:
     if "made_by" not in record:
         return ["its note does not say which versions made it, as those of version 0"]
     old, new = record["made_by"], made_by(job)
-    # A report needs no plugin, and notes have not always named them.
-    known = [name for name in (*old, *new) if not name.startswith(PLUGIN) or (name in old and name in new)]
+    # A report needs neither, and notes have not always named them.
+    known = [
+        name for name in (*old, *new) if not name.startswith((PLUGIN, POLICY)) or (name in old and name in new)
+    ]
     return [
         f"{name} {old.get(name, 'none')} there, {new.get(name, 'none')} here"
         for name in dict.fromkeys(known)
@@ -256,13 +260,32 @@ def changed_versions(job: Job) -> list[str]:
 def made_by(job: Job) -> dict[str, str]:
     """What decides a job's output besides its command.
 
-    Versions of packages, the id of the environment, and hashes of the modules that its flags import: a reset
-    strategy of a user's has no version.
+    Versions of packages, the id of the environment, and hashes of what has no version: the modules that its flags
+    import, as a reset strategy of a user's, and a policy of the user's in a folder. One below the root is a job's
+    output, after which those that use it are made anew.
     """
-    flags = (flag.partition("=") for flag in job.command)
-    plugins = {value for name, _, value in flags if name.endswith(PLUGIN_FLAG)}
-    hashes = {f"{PLUGIN}{name}": found for name in sorted(plugins) if (found := _source_hash(name))}
-    return this_version() | {"environment": job.environment} | hashes
+    hashes = {}
+    for flag in job.command:
+        name, _, value = flag.partition("=")
+        if name.endswith(PLUGIN_FLAG) and (found := _source_hash(value)):
+            hashes[f"{PLUGIN}{value}"] = found
+        elif name == "--policy.path" and Path(value).is_dir() and not _is_output(job, Path(value)):
+            stamp = tuple(sorted((file.name, file.stat().st_mtime_ns) for file in Path(value).iterdir()))
+            hashes[f"{POLICY}{value}"] = _policy_hash(value, stamp)
+    return this_version() | {"environment": job.environment} | dict(sorted(hashes.items()))
+
+
+def _is_output(job: Job, folder: Path) -> bool:
+    return job.root is not None and folder.absolute().is_relative_to(job.root.absolute())
+
+
+@cache
+def _policy_hash(folder: str, _stamp: tuple[tuple[str, int], ...]) -> str:
+    """A short hash of a checkpoint, computed once while its files stay as they are."""
+    # With PyTorch, which commands that only explain do without.
+    from cronos_lerobot.evaluation.policy_source import files_fingerprint
+
+    return files_fingerprint(Path(folder))
 
 
 def _source_hash(module: str) -> str | None:

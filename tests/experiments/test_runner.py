@@ -271,6 +271,31 @@ def test_runs_of_an_edited_plugin_are_not_taken_for_those_of_todays(tmp_path, mo
     assert is_done(job)
 
 
+def test_runs_of_a_policy_that_was_made_anew_in_its_folder_are_not_taken_for_todays(tmp_path):
+    policy, root = tmp_path / "my_policy", tmp_path / "root"
+    policy.mkdir()
+    (policy / "model.safetensors").write_bytes(b"first")
+    job = replace(count_job(root, "a"), root=root)
+    job = replace(job, command=(*job.command, f"--policy.path={policy}"))
+    run([job])
+    assert is_done(job)
+    (policy / "train_config.json").write_text("{}")  # says how it was made, not how it acts
+    assert is_done(job)
+    (policy / "model.safetensors").write_bytes(b"second")
+    (change,) = changes(job)
+    assert re.fullmatch(rf"the policy {policy} [0-9a-f]{{16}} there, [0-9a-f]{{16}} here", change)
+    assert not is_done(job)
+    # A report elsewhere does without it.
+    shutil.rmtree(policy)
+    assert is_done(job)
+    # What is below the root is another job's output, which has a note of its own.
+    inside = root / "base"
+    inside.mkdir()
+    assert not [
+        name for name in made_by(replace(job, command=(f"--policy.path={inside}",))) if str(inside) in name
+    ]
+
+
 def test_another_commit_alone_is_only_noted(tmp_path, monkeypatch):
     monkeypatch.setattr("cronos_lerobot.experiments.runner.this_commit", lambda: "0123abc")
     job = count_job(tmp_path, "a")
