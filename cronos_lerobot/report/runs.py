@@ -32,7 +32,7 @@ DESCRIBED = tuple(
     for name in (
         "scene_reset_interval", "curriculum", "end_effector_reset", "learned_reset", "heuristic_reset",
         "extra_resets", "task_order", "num_configurations", "reset_phase", "scene_reset",
-        "takeover_after", "takeover_price",
+        "takeover_after", "takeover_price", "reset_budget", "takeover_budget",
     )
 )  # fmt: skip
 """Fields that `describe_protocol` puts into words."""
@@ -351,8 +351,9 @@ def describe_protocol(protocol: dict[str, Any]) -> str:
     interval = protocol.get("scene_reset_interval")
     words = ["no scene resets" if interval is None else f"T = {interval}"]
     ticks = {"EER": "end_effector_reset", "CL": "curriculum", "LSR": "learned_reset", "HSR": "heuristic_reset"}
-    if protocol.get("scene_reset", "periodic") == "critic":
-        interval, words = None, [f"{protocol.get('reset_budget')} resets asked for by the critic"]
+    budget, asked = protocol.get("reset_budget"), protocol.get("scene_reset", "periodic") == "critic"
+    if asked:
+        interval, words = None, [f"{budget} resets asked for by the critic"]
     is_episodic = interval == protocol.get("task_switch_interval") and not protocol.get("curriculum")
     if interval and is_episodic:
         # A scene reset at every task switch sends the arm home anyway.
@@ -368,6 +369,10 @@ def describe_protocol(protocol: dict[str, Any]) -> str:
     if protocol.get("takeover_after") is not None:
         price = f" at {protocol['takeover_price']} each" if protocol["takeover_price"] != 1 else ""
         words.append(f"takeovers after {protocol['takeover_after']}{price}")
+        if (limit := protocol.get("takeover_budget")) is not None:
+            words.append(f"at most {limit} for takeovers")
+    if budget is not None and not asked:
+        words.append(f"at most {budget} interventions")
     return ", ".join(words)
 
 

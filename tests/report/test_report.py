@@ -297,6 +297,11 @@ def test_many_differences_of_the_protocol_are_put_as_the_paper_does(tmp_path):
              "scene_reset": "critic", "reset_budget": 254},
             "254 resets asked for by the critic, EER",
         ),
+        (
+            {"scene_reset_interval": 1280, "task_switch_interval": 80, "reset_budget": 300, "takeover_after": 2,
+             "takeover_price": 3, "takeover_budget": 90},
+            "T = 1280, takeovers after 2 at 3 each, at most 90 for takeovers, at most 300 interventions",
+        ),
     ],
 )  # fmt: skip
 def test_a_protocol_is_called_as_in_table_1(protocol, name):
