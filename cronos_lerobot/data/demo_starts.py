@@ -1,7 +1,9 @@
 """Where demonstrations begin."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
+from lerobot_env_cronos import Scene, Task
 from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS, sample_configuration
 from lerobot_env_cronos.expert.reach import sample_reach_configuration
 
@@ -79,3 +81,44 @@ class StartConfig:
         """Whether demonstrations begin where another task ended."""
         after_task = self.arm_pose in ("after_task", "either")
         return self.occupied_receptacles or self.misplaced_objects or after_task or bool(self.policy)
+
+
+def check_starts(start: StartConfig, scene: Scene, tasks: Iterable[Task]) -> None:
+    """Check that a scene has what `start` wants done before each task.
+
+    Raises:
+        ValueError: it has not.
+    """
+    for task in tasks:
+        if (task.receptacle is None or start.is_after_another) and not tasks_before(task, scene, start):
+            raise ValueError(
+                f"nothing can be done before {task.instruction!r} in {scene.name}, which has {len(scene.objects)} "
+                f"object(s) and {len(scene.receptacles)} receptacle(s), as --start.arm_pose={start.arm_pose}, "
+                f"--start.occupied_receptacles={str(start.occupied_receptacles).lower()} and "
+                f"--start.misplaced_objects={str(start.misplaced_objects).lower()} ask"
+            )
+
+
+def tasks_before(task: Task, scene: Scene, start: StartConfig) -> list[Task]:
+    """What may be done before: another object onto the target receptacle, or the task's own onto another one.
+
+    With neither asked for, another object onto another receptacle; before a reset task, its object onto any. A
+    policy does any other task.
+    """
+    if task.receptacle is None:
+        return [other for other in scene.tasks if other.object == task.object]
+    if start.policy is not None:
+        return other_tasks(task, scene)
+    # Whether the task before had the same object, and the same receptacle.
+    wanted = {(False, True)} if start.occupied_receptacles else set()
+    wanted |= {(True, False)} if start.misplaced_objects else set()
+    return [
+        other
+        for other in scene.tasks
+        if (other.object == task.object, other.receptacle == task.receptacle) in (wanted or {(False, False)})
+    ]
+
+
+def other_tasks(task: Task, scene: Scene) -> list[Task]:
+    """The scene's tasks but one."""
+    return [other for other in scene.tasks if other != task]

@@ -6,11 +6,11 @@ from typing import Protocol
 
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, REWARD
-from lerobot_env_cronos import CronosVectorEnv, Task
+from lerobot_env_cronos import CronosVectorEnv, Scene, Task
 from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW
 
 from cronos_lerobot.agents.processing import observation_columns
-from cronos_lerobot.data.demo_starts import FREE_LAYOUTS, StartConfig
+from cronos_lerobot.data.demo_starts import FREE_LAYOUTS, StartConfig, check_starts, other_tasks, tasks_before
 from cronos_lerobot.data.perturbations import (
     ActionNoise,
     GraspMisses,
@@ -92,6 +92,11 @@ class _Episode:
     frames: dict[str, list] = field(default_factory=dict)
 
 
+def tasks_of(config: DemoConfig, scene: Scene) -> Sequence[Task]:
+    """What is demonstrated in a scene, unless the tasks are chosen."""
+    return scene.tasks + (scene.reset_tasks if config.reset_tasks else ())
+
+
 class DemoCollector:
     """Lets the expert act in all streams at once and writes each finished episode.
 
@@ -130,16 +135,15 @@ class DemoCollector:
         self.finished, self.successes = 0, 0
         self._started = 0
         self._seed = (seed, writer.num_episodes)
-        everything = env.scene.tasks + (env.scene.reset_tasks if config.reset_tasks else ())
-        self._kept = {task: writer.episodes_before[task.instruction] for task in tasks or everything}
+        tasks = tasks or tasks_of(config, env.scene)
+        self._kept = {task: writer.episodes_before[task.instruction] for task in tasks}
         # A dataset that is gone on with goes on with the next configuration, as far as the attempts succeeded.
         self._tried = dict(self._kept)
         self._episodes: list[_Episode | None] = [None] * env.num_envs
         self._noise = ActionNoise(config.noise, env.num_envs)
         self._misses = GraspMisses(config.misses, env)
         self._failures_in_a_row = 0
-        for task in self._kept:
-            self._check_starts(task)
+        check_starts(config.start, env.scene, tasks)
 
     def collect(self, num_episodes: int, on_episode: Callable[[int], object] = lambda frames: None) -> None:
         """Write `num_episodes` more episodes: in the end each task has the same number, as far as that divides.
@@ -309,51 +313,13 @@ class DemoCollector:
         most = self.config.start.earlier_tasks
         if most <= 1:
             return []
-        count, others = int(rng.integers(most)), self._others(task)
+        count, others = int(rng.integers(most)), other_tasks(task, self.env.scene)
         return [others[i] for i in rng.integers(len(others), size=count)]
-
-    def _check_starts(self, task: Task) -> None:
-        """Check that the scene has what `config.start` wants done before a task.
-
-        Raises:
-            ValueError: it has not.
-        """
-        start, scene = self.config.start, self.env.scene
-        if (task.receptacle is None or start.is_after_another) and not self._choices(task):
-            raise ValueError(
-                f"nothing can be done before {task.instruction!r} in {scene.name}, which has {len(scene.objects)} "
-                f"object(s) and {len(scene.receptacles)} receptacle(s), as --start.arm_pose={start.arm_pose}, "
-                f"--start.occupied_receptacles={str(start.occupied_receptacles).lower()} and "
-                f"--start.misplaced_objects={str(start.misplaced_objects).lower()} ask"
-            )
-
-    def _others(self, task: Task) -> list[Task]:
-        return [other for other in self.env.scene.tasks if other != task]
 
     def _prelude(self, task: Task, rng: np.random.Generator) -> Task:
         """What was done before."""
-        choices = self._choices(task)
+        choices = tasks_before(task, self.env.scene, self.config.start)
         return choices[rng.integers(len(choices))]
-
-    def _choices(self, task: Task) -> list[Task]:
-        """What may be done before: another object onto the target receptacle, or the task's own onto another one.
-
-        With neither asked for, another object onto another receptacle; before a reset task, its object onto any. A
-        policy does any other task.
-        """
-        start = self.config.start
-        if task.receptacle is None:
-            return [other for other in self.env.scene.tasks if other.object == task.object]
-        if self.policy is not None:
-            return self._others(task)
-        # Whether the task before had the same object, and the same receptacle.
-        wanted = {(False, True)} if start.occupied_receptacles else set()
-        wanted |= {(True, False)} if start.misplaced_objects else set()
-        return [
-            other
-            for other in self.env.scene.tasks
-            if (other.object == task.object, other.receptacle == task.receptacle) in (wanted or {(False, False)})
-        ]
 
     def _begin_prelude(self, ids: np.ndarray, episode: _Episode) -> None:
         self.env.set_task(ids, episode.preludes[:1])

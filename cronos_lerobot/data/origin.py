@@ -26,7 +26,7 @@ KINDS = (DEMONSTRATIONS, STREAMS)
 NO_FLAGS = ("root", "discover_packages_path", "features", "features_map")
 """Fields that are left out: folders of whoever made the dataset, and what follows from the flags."""
 
-MAYBE_FOLDERS = ("benchmark", "policy")
+MAYBE_FOLDERS = ("benchmark", "policy", "pretrained_path", "checkpoint", "adapter")
 """Fields that name a folder or something on the Hub; of a folder only that it was one. A hash says which."""
 
 

@@ -1,6 +1,6 @@
 """Mp4 files that hold many episodes back to back: encoded from memory, copied from other files, and read."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -18,6 +18,13 @@ steps are wider than that, so a longer file has frames that LeRobot cannot find.
 def fast_encoder() -> RGBEncoderConfig:
     """h264 at its fastest preset, a keyframe every second frame as in LeRobot's default, yuv420p."""
     return RGBEncoderConfig(vcodec="h264", preset="ultrafast", g=2, crf=18)
+
+
+def check_video_size(flag: str, size: Sequence[int]) -> None:
+    """Raise a ValueError, unless pictures of a `size`, (height, width) [px], can be a video's: it halves both."""
+    height, width = size
+    if height % 2 or width % 2:
+        raise ValueError(f"{flag} are {height} and {width}: a video's height and width must be even")
 
 
 class VideoFile:

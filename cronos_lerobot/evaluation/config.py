@@ -18,6 +18,7 @@ from lerobot_env_cronos.benchmark.benchmark import SUITES
 from lerobot_env_cronos.benchmark.configurations import SPLITS
 from lerobot_env_cronos.hub_config import is_of_this_package
 
+from cronos_lerobot.data.video import check_video_size
 from cronos_lerobot.evaluation.plan import Part, make_parts
 from cronos_lerobot.evaluation.policy_env import check_observations, observations_of, trained_scene
 from cronos_lerobot.evaluation.policy_source import PolicySource, files_fingerprint, find_policy, fingerprint
@@ -134,6 +135,8 @@ class CronosEvalConfig:
         self._derive_env({name.removeprefix("--") for name in given})
         self.env.advance, self.env.end_effector_reset = self.advance, self.end_effector_reset
         self.env.__post_init__()
+        if self.eval.videos:
+            check_video_size("--env.render_size", self.env.render_size)
         if self.policy is not None and not self.rename_map:
             check_observations(self.policy, self.env)
         most = self._most_configurations()

@@ -80,9 +80,15 @@ def files_fingerprint(folder: Path) -> str:
 
 
 def _weights_and_processors(folder: Path) -> Iterator[Path]:
-    """Not config.json, of which flags may have another mind, nor train_config.json, which says how it was made."""
+    """Not config.json, of which flags may have another mind, nor train_config.json, which says how it was made.
+
+    Of PEFT's adapters those of the policy in a folder that they go onto, too; one of the Hub is named there.
+    """
     for pattern in ("*.safetensors", "policy_*.json", "adapter_config.json"):
         yield from sorted(folder.glob(pattern))
+    if (adapters := folder / "adapter_config.json").is_file():
+        base = Path(json.loads(adapters.read_text()).get("base_model_name_or_path") or "")
+        yield from sorted(base.glob("*.safetensors")) if base.parts and base.is_dir() else ()
 
 
 def _hash(file: Path) -> bytes:

@@ -109,10 +109,14 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
     episodes = min(wanted, spec.row.num_configurations)
     # From few configurations as many episodes as from all.
     repetitions = wanted // episodes if options.temperature else 1
+    flags = ALGORITHM_FLAGS[options.obs_type]
+    if options.policy_path:
+        # Those of a policy are PocketVLA's.
+        flags = [flag for flag in flags if not flag.startswith("--policy.")]
     command = [
         "cronos-train",
         f"--policy.path={base_policy(spec.base, options)}",
-        *ALGORITHM_FLAGS[options.obs_type],
+        *flags,
         "--env.type=cronos",
         f"--env.scene={spec.scene}",
         f"--env.obs_type={options.obs_type}",

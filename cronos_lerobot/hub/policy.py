@@ -136,7 +136,9 @@ def _card(
     trained = json.loads(train_config_path(checkpoint.model).read_text()) if _has_config(checkpoint) else {}
     base = (run.config.get("policy") or {}).get("pretrained_path") if run else None
     recorded = (trained.get("record") or trained.get("dataset") or {}).get("repo_id")
-    base_model = config.base_policy or (str(base) if is_repository(base) else None) or adapters_of
+    # A folder may be none where the card is made; a run that began with one has noted its fingerprint.
+    is_on_hub = run is not None and run.base is None and is_repository(base)
+    base_model = config.base_policy or (str(base) if is_on_hub else None) or adapters_of
     env = trained.get("env") or {}
     if config.scene and env.get("scene") and config.scene != env["scene"]:
         raise ValueError(f"--scene={config.scene}, but the policy was trained in {env['scene']}")

@@ -13,7 +13,7 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETR
 from cronos_lerobot.hub.cards import command_line
 from cronos_lerobot.protocol.config import COUNTED_INTERVENTIONS
 from cronos_lerobot.protocol.interventions import Intervention
-from cronos_lerobot.report.runs import TrainingRun, describe_protocol, read_training_run
+from cronos_lerobot.report.runs import TrainingRun, config_of, describe_protocol, read_training_run
 from cronos_lerobot.training.logging import MANIFEST, METRICS
 
 LEARNED = {
@@ -71,6 +71,9 @@ def read_run(folder: Path, step: int | None = None) -> TrainingRun:
     if step is not None:
         run.evaluations = [record for record in run.evaluations if record["interaction_steps"] <= step]
         run.updates = [record for record in run.updates if record["interaction_steps"] <= step]
+        # Of before it was noted, all may have come to it.
+        run.starts = run.starts[:1] + [one for one in run.starts[1:] if one.get("interaction_steps", 0) < step]
+        run.config = config_of(folder, run.starts)
     return run
 
 

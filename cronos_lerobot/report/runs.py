@@ -53,7 +53,7 @@ class TrainingRun:
     folder: Path
     config: dict[str, Any]
     starts: list[dict[str, Any]]
-    """One for each time the run was started, from manifest.json."""
+    """One for each time the run was started, from manifest.json, whose steps are still the run's."""
     evaluations: list[Evaluation]
     updates: list[Update]
 
@@ -242,7 +242,7 @@ def read_training_run(folder: Path) -> TrainingRun:
         raise ValueError(f"{folder / METRICS} has no record yet: the run has not come to its first evaluation.")
     manifest = folder / MANIFEST
     try:
-        starts = json.loads(manifest.read_text())["starts"] if manifest.is_file() else []
+        starts = _that_remain(json.loads(manifest.read_text())["starts"]) if manifest.is_file() else []
     except ValueError as error:
         raise ValueError(f"{manifest} is damaged: {error}") from error
     # Null is an environment of another kind.
@@ -251,14 +251,22 @@ def read_training_run(folder: Path) -> TrainingRun:
 
     return TrainingRun(
         folder,
-        _read_config(folder, starts),
+        config_of(folder, starts),
         starts,
         [record for record in records if record["kind"] == "evaluation"],
         [record for record in records if record["kind"] == "update"],
     )
 
 
-def _read_config(folder: Path, starts: list[dict[str, Any]]) -> dict[str, Any]:
+def _that_remain(starts: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The first, and those whose steps no later one has taken anew, from an earlier checkpoint."""
+    began = [start.get("interaction_steps") for start in starts]
+    least = [min((n for n in began[i + 1 :] if n is not None), default=None) for i in range(len(began))]
+    return [s for s, n, low in zip(starts, began, least, strict=True) if not n or low is None or low > n]
+
+
+def config_of(folder: Path, starts: list[dict[str, Any]]) -> dict[str, Any]:
+    """The config of a run in `folder` after these starts."""
     if starts:
         config = starts[-1]["config"]
         # A resumed run names its own checkpoint; what it began with is the experiment.

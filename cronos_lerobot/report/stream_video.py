@@ -39,7 +39,7 @@ from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import SegmentEnd, Step
 from cronos_lerobot.protocol.resets import make_resets
 from cronos_lerobot.protocol.rf_mtrl import rf_mtrl
-from cronos_lerobot.protocol.task_orders import TaskSet, make_task_order
+from cronos_lerobot.protocol.task_orders import TaskSet, check_task_order, make_task_order
 from cronos_lerobot.training.seeding import NamedGenerators
 
 EXPERT = "expert"
@@ -245,17 +245,25 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main() -> None:
     """Film a stream as the command line says."""
-    args = make_parser().parse_args()
+    parser = make_parser()
+    args = parser.parse_args()
     register_third_party_plugins()
-    protocol = ProtocolConfig(
-        scene_reset_interval=args.scene_reset_interval,
-        end_effector_reset=not args.no_end_effector_reset,
-        task_order=args.task_order,
-    )
+    for name in ("segments", "gif_segments", "fps"):
+        if getattr(args, name) < 1:
+            parser.error(f"--{name} must be at least 1, got {getattr(args, name)}")
     scene = {"scene": args.scene} if args.scene else {}
-    config, agent = CronosEnvConfig(obs_type="environment_state_agent_pos", **scene), None
-    if args.policy_path:
-        config, agent = make_spectator(args.policy_path, args.device, args.scene)
+    try:
+        check_task_order(args.task_order)
+        protocol = ProtocolConfig(
+            scene_reset_interval=args.scene_reset_interval,
+            end_effector_reset=not args.no_end_effector_reset,
+            task_order=args.task_order,
+        )
+        config, agent = CronosEnvConfig(obs_type="environment_state_agent_pos", **scene), None
+        if args.policy_path:
+            config, agent = make_spectator(args.policy_path, args.device, args.scene)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
     env = CronosVectorEnv(1, config.scene, **config.gym_kwargs)
     try:
         stream = film_stream(env, agent or ExpertSpectator(env), protocol, args.segments, args.seed)

@@ -70,9 +70,9 @@ def read_suite_runs(files: Iterable[Path]) -> list[SuiteRun]:
         run.settings.update(settings)
     runs = list(merged.values())
     names = [run.name for run in runs]
-    for run in runs:
-        if names.count(run.name) > 1:
-            run.name += f" ({_what_differs(run, runs)})"
+    told = [f" ({_what_differs(run, runs)})" if names.count(run.name) > 1 else "" for run in runs]
+    for run, what in zip(runs, told, strict=True):
+        run.name += what
     return runs
 
 

@@ -9,6 +9,7 @@ cronos-record-demos --env.type=cronos --env.scene=kitchen_2x2 \\
 import logging
 import shutil
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,13 +18,14 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
-from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos import CronosVectorEnv, Task, get_scene
 from lerobot_env_cronos.config import CronosEnvConfig
 from lerobot_env_cronos.episodic import find_task
 from lerobot_env_cronos.hub_config import is_of_this_package
 from tqdm import tqdm
 
-from cronos_lerobot.data.demos import DemoCollector, DemoConfig, ExpertError
+from cronos_lerobot.data.demo_starts import check_starts
+from cronos_lerobot.data.demos import DemoCollector, DemoConfig, ExpertError, tasks_of
 from cronos_lerobot.data.origin import DEMONSTRATIONS, flags_of, origin_of
 from cronos_lerobot.data.schema import demonstration_features, feature_names
 from cronos_lerobot.data.writer import RecordingError, SegmentWriter
@@ -114,29 +116,37 @@ def record_demos(cfg: RecordDemosConfig) -> None:
     _collect(cfg, *_open(cfg))
 
 
-def _open(cfg: RecordDemosConfig) -> tuple[CronosVectorEnv, SegmentWriter, PolicySpectator | None]:
-    """Streams, the dataset, and the policy that does the earlier tasks."""
+def _open(
+    cfg: RecordDemosConfig,
+) -> tuple[CronosVectorEnv, SegmentWriter, PolicySpectator | None, Sequence[Task]]:
+    """Streams, the dataset, the policy that does the earlier tasks, and the tasks to demonstrate."""
     assert isinstance(cfg.env, CronosEnvConfig)
+    scene = get_scene(cfg.env.scene)
+    task = find_task(scene.name, cfg.env.task)
+    tasks = tasks_of(cfg, scene) if task is None else [task]
+    check_starts(cfg.start, scene, tasks)
     policy = None if cfg.start.policy is None else load_spectator(cfg.start.policy, cfg.env)
     env = CronosVectorEnv(cfg.num_envs, cfg.env.scene, **cfg.env.gym_kwargs)
     writer = open_writer(cfg, env)
     if policy is not None:
         policy.seed(cfg.seed + writer.num_episodes)
-    return env, writer, policy
+    return env, writer, policy, tasks
 
 
 def _collect(
-    cfg: RecordDemosConfig, env: CronosVectorEnv, writer: SegmentWriter, policy: PolicySpectator | None
+    cfg: RecordDemosConfig,
+    env: CronosVectorEnv,
+    writer: SegmentWriter,
+    policy: PolicySpectator | None,
+    tasks: Sequence[Task],
 ) -> None:
     from lerobot_env_cronos.expert.expert import ScriptedExpert
 
-    task = find_task(env.scene.name, cfg.env.task)
     start = time.perf_counter()
     try:
         with writer:
             before = writer.num_episodes
             expert = ScriptedExpert(env, seed=cfg.seed)
-            tasks = None if task is None else [task]
             collector = DemoCollector(env, expert, writer, cfg, seed=cfg.seed, tasks=tasks, policy=policy)
             with tqdm(total=cfg.dataset.num_episodes, initial=before, unit="episode") as bar:
                 frames = 0
@@ -182,6 +192,8 @@ def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv) -> SegmentWriter:
                 f" --dataset.num_episodes={cfg.dataset.num_episodes}"
             )
         return writer
+    # Before anything is deleted: they refuse what cannot be recorded.
+    features = demonstration_features(env.single_observation_space, video=cfg.dataset.video, **feature_names(env))
     if root.exists():
         if not cfg.dataset.overwrite:
             raise FileExistsError(
@@ -191,8 +203,6 @@ def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv) -> SegmentWriter:
             raise FileExistsError(f"{root} exists and is not a LeRobotDataset: not overwriting it")
         with FolderLock(root):
             shutil.rmtree(root)
-    names = feature_names(env)
-    features = demonstration_features(env.single_observation_space, video=cfg.dataset.video, **names)
     fps = int(env.metadata["render_fps"])
     return SegmentWriter(cfg.dataset.repo_id, root, features, fps, robot_type="widowx", origin=origin)
 

@@ -36,6 +36,7 @@ import json
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -61,18 +62,27 @@ class SourceConfig:
     """Its folder; null looks where LeRobot keeps its datasets, then on the Hub."""
     revision: str | None = None
     """Branch, tag or commit on the Hub."""
+    discover_packages_path: str | None = None
+    """Module to import first, one that registers the scene of the streams."""
 
     def open(self, *, streaming: bool) -> StreamDataset:
         """Open it.
 
         Raises:
-            ValueError: no name is given, or it has no recorded streams.
+            ValueError: no name is given, it has no recorded streams, or the module cannot be imported.
             FileNotFoundError: there is no dataset in `root`.
         """
         if self.repo_id is None:
             raise ValueError(
                 "choose a dataset: --dataset.repo_id=<user/name>, and --dataset.root=<folder> if local"
             )
+        if self.discover_packages_path is not None:
+            try:
+                import_module(self.discover_packages_path)
+            except ImportError as error:
+                raise ValueError(
+                    f"--dataset.discover_packages_path={self.discover_packages_path} cannot be imported ({error})"
+                ) from error
         if self.root is not None and not (self.root / "meta/info.json").is_file():
             raise FileNotFoundError(f"no LeRobotDataset in {self.root}")
         return StreamDataset(self.repo_id, self.root, self.revision, streaming=streaming)

@@ -21,6 +21,7 @@ from lerobot_env_cronos.statistics import wilson_interval
 from tqdm import trange
 
 from cronos_lerobot.report.stream_video import Spectator, make_spectator
+from cronos_lerobot.scripts.errors import error_line
 
 CONDITIONS = tuple((bodies, arm) for bodies in ("new", "left") for arm in ("home", "left"))
 """How the second task is given: (bodies, arm)."""
@@ -136,7 +137,8 @@ def main() -> None:
     if args.seeds < 1:
         parser.error(f"--seeds={args.seeds}: give 1 or more")
     register_third_party_plugins()
-    env_config, agent = make_spectator(args.policy_path, args.device, args.scene)
+    with error_line():
+        env_config, agent = make_spectator(args.policy_path, args.device, args.scene)
     benchmark = load_benchmark(env_config.benchmark, env_config.scene)
     num_envs = len(benchmark.scene.tasks) * len(benchmark.configurations[args.split])
     env = CronosVectorEnv(num_envs, env_config.scene, **env_config.gym_kwargs)

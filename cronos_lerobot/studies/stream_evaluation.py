@@ -32,6 +32,7 @@ from cronos_lerobot.protocol.resets import make_resets
 from cronos_lerobot.protocol.rf_mtrl import rf_mtrl
 from cronos_lerobot.protocol.task_orders import TaskSet, make_task_order
 from cronos_lerobot.report.stream_video import Spectator, make_spectator
+from cronos_lerobot.scripts.errors import error_line
 from cronos_lerobot.training.seeding import NamedGenerators
 
 PICTURED_STREAMS, PICTURED_SEGMENTS = 4, 4
@@ -215,7 +216,8 @@ def main() -> None:
     """Print a row per segment and one per kind of start, and write them to a CSV."""
     args = _parse_args()
     register_third_party_plugins()
-    env_config, agent = make_spectator(args.policy_path, args.device, args.scene)
+    with error_line():
+        env_config, agent = make_spectator(args.policy_path, args.device, args.scene)
     env = CronosVectorEnv(args.num_streams, env_config.scene, **env_config.gym_kwargs)
     protocol = ProtocolConfig(
         scene_reset_interval=None,

@@ -27,6 +27,7 @@ from lerobot_env_cronos.hub_config import is_of_this_package
 from cronos_lerobot.agents import builtin  # noqa: F401  (registers the agents)
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.registry import check_agent, check_settings_are_read
+from cronos_lerobot.data.video import check_video_size
 from cronos_lerobot.data.writer import FLUSH_INTERVAL_S
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.experts import check_expert
@@ -100,11 +101,12 @@ class RecordConfig:
         height, width = render_size
         return f"_{width}x{height}"
 
-    def check(self, output_dir: Path, num_envs: int, render_size: Sequence[int], *, resume: bool) -> None:
+    def check(self, output_dir: Path, num_envs: int, env: CronosEnvConfig, *, resume: bool) -> None:
         """Tell now what recording would stumble over later.
 
         Raises:
-            ValueError: more streams are to be recorded than there are, or none; or how is said, but not what.
+            ValueError: more streams are to be recorded than there are, or none; pictures that no video has; or how
+                is said, but not what.
             OSError: a dataset cannot be made: it exists, or its folder cannot be written to; or it is not
                 there to be resumed.
         """
@@ -125,7 +127,12 @@ class RecordConfig:
             if not (root / INFO_PATH).is_file():
                 raise FileNotFoundError(f"no recording to resume in {root}.")
             return
-        film = root.with_name(root.name + self.film_suffix(render_size))
+        if env.obs_type == "pixels_agent_pos":
+            size = (env.observation_height, env.observation_width)
+            check_video_size("--env.observation_height and --env.observation_width", size)
+        if self.filmed_streams:
+            check_video_size("--env.render_size", env.render_size)
+        film = root.with_name(root.name + self.film_suffix(env.render_size))
         for folder in (root, film) if self.filmed_streams else (root,):
             if folder.exists():
                 raise FileExistsError(f"{folder} exists; choose another --record.root.")
@@ -289,7 +296,7 @@ class CronosTrainConfig:
             raise FileExistsError(f"{self.output_dir} exists; choose another --output_dir or --resume=true.")
         if self.checkpoint_path is not None:
             check_resumed(self, self.checkpoint_path)
-        self.record.check(Path(self.output_dir), self.num_envs, self.env.render_size, resume=self.resume)
+        self.record.check(Path(self.output_dir), self.num_envs, self.env, resume=self.resume)
 
     @staticmethod
     def _check_env(env: CronosEnvConfig) -> None:

@@ -184,10 +184,11 @@ class SilentLogger:
         """Nothing is open."""
 
 
-def write_manifest(config: CronosTrainConfig, num_processes: int = 1) -> None:
+def write_manifest(config: CronosTrainConfig, num_processes: int = 1, interaction_steps: int = 0) -> None:
     """Write what is needed to tell this run from another, once for each start, into manifest.json.
 
-    A resumed run appends to `starts`, so that a change of machine or version in between is on record.
+    A resumed run appends to `starts`, so that a change of machine or version in between is on record, and the
+    interaction steps that it goes on from.
     """
     assert config.output_dir is not None
     path = Path(config.output_dir) / MANIFEST
@@ -195,6 +196,7 @@ def write_manifest(config: CronosTrainConfig, num_processes: int = 1) -> None:
     starts = read_starts(path) if path.exists() else []
     start = {
         "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "interaction_steps": interaction_steps,
         "seed": config.seed,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "versions": {"python": platform.python_version()} | package_versions(),

@@ -173,7 +173,7 @@ class Trainer:
         self.recorder = StreamObserver(None)
         if self.processes.is_main:
             self.logger = RunLogger(self.config, self.loop, states.get("logger", {}).get("offset"))
-            write_manifest(self.config, self.processes.count)
+            write_manifest(self.config, self.processes.count, self.loop.n)
             self.recorder = StreamObserver.open(
                 self.config, self.env, states.get("recorder"), lambda why: self.logger.log("recording", why)
             )

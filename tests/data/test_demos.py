@@ -9,7 +9,7 @@ import pytest
 from collected_demos import Spy, collect, command, episodes_of, home_position
 from forked_commands import run_forked
 from lerobot.datasets import LeRobotDataset
-from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, get_scene
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.expert.reach import find_reach
 
@@ -314,7 +314,7 @@ def test_wrong_options_are_named(make, message):
         make()
 
 
-def test_the_command_records_resumes_and_overwrites(tmp_path, caplog):
+def test_the_command_records_resumes_and_overwrites(tmp_path, caplog, monkeypatch):
     root = tmp_path / "d"
     record_demos(command(root, 2))
     with pytest.raises(FileExistsError, match="--resume=true goes on with it"):
@@ -326,6 +326,18 @@ def test_the_command_records_resumes_and_overwrites(tmp_path, caplog):
     assert dataset.num_episodes == 3
     assert dataset[0]["observation.images.front"].shape == (3, 64, 64)
     assert dataset.meta.fps == 5
+    # What cannot be recorded deletes nothing.
+    odd = command(root, 1, overwrite=True)
+    odd.env = CronosEnvConfig(observation_height=65, observation_width=64)
+    small = command(root, 1, overwrite=True, start=StartConfig(arm_pose="after_task", share=1.0))
+    with monkeypatch.context() as patched:
+        scene = get_scene("kitchen_2x2")
+        scene = replace(scene, receptacles=scene.receptacles[:1])
+        patched.setattr("cronos_lerobot.scripts.record_demos.get_scene", lambda name: scene)
+        for config, message in ((odd, "even height and width"), (small, "nothing can be done before")):
+            with pytest.raises(ValueError, match=message):
+                record_demos(config)
+    assert LeRobotDataset("me/demos", root=root).num_episodes == 3
     record_demos(command(root, 1, overwrite=True))
     assert LeRobotDataset("me/demos", root=root).num_episodes == 1
     # What was made in the place of another may be gone on with all the same.

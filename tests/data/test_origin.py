@@ -6,11 +6,12 @@ from dataclasses import replace
 import pytest
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
+from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.config import CronosEnvConfig
 from synthetic_streams import ORIGIN, record
 
-from cronos_lerobot.data.origin import check_same, read_origin
+from cronos_lerobot.data.origin import check_same, flags_of, read_origin
 from cronos_lerobot.data.perturbations import NoiseConfig
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.stream_filter import SegmentFilter, filter_streams
@@ -50,6 +51,13 @@ def test_demonstrations_say_how_they_were_made(demos):
     flags = {"noise.share": 0.5, "noise.scale": 0.6, "misses.share": 0, "seed": 7, "start.layouts": "train"}
     assert flags.items() <= origin.flags.items()
     assert str(demos.parent) not in json.dumps(origin.flags), "a dataset is published: no folders of its maker"
+
+
+def test_a_dataset_names_no_folder_of_its_makers_policy(tmp_path):
+    config = ACTConfig(device="cpu", pretrained_path=tmp_path)
+    assert flags_of(config)["pretrained_path"] == "a folder"
+    config.pretrained_path = "me/on_the_hub"
+    assert flags_of(config)["pretrained_path"] == "me/on_the_hub"
 
 
 @pytest.mark.parametrize(

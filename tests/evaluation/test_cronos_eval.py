@@ -23,7 +23,7 @@ from cronos_lerobot.evaluation.chains import Chain, ChainRunner, chain_noise
 from cronos_lerobot.evaluation.config import CronosEvalConfig, SuitesConfig
 from cronos_lerobot.evaluation.outcomes import read_outcomes
 from cronos_lerobot.evaluation.plan import Part
-from cronos_lerobot.evaluation.policy_source import fingerprint
+from cronos_lerobot.evaluation.policy_source import files_fingerprint, fingerprint
 from cronos_lerobot.evaluation.runner import Evaluation
 from cronos_lerobot.evaluation.store import RESULTS
 from cronos_lerobot.scripts import eval as script
@@ -363,6 +363,15 @@ def test_a_policy_is_known_by_its_files_and_not_by_its_folder(pocketvla, tmp_pat
         file.write_bytes(changed[:-1] + bytes([changed[-1] ^ 1]))
         seen.add(fingerprint_of(copy))
     assert len(seen) == 3
+    # Adapters are loaded onto what lies in their base's folder then.
+    (copy / "adapter_config.json").write_text(json.dumps({"base_model_name_or_path": str(tmp_path / "base")}))
+    base = tmp_path / "base"
+    base.mkdir()
+    both = set()
+    for weights in (b"first", b"second"):
+        (base / "model.safetensors").write_bytes(weights)
+        both.add((fingerprint_of(copy), files_fingerprint(copy)))
+    assert len({one for one, _ in both}) == len({other for _, other in both}) == 2
 
 
 @pytest.mark.parametrize(
@@ -370,6 +379,10 @@ def test_a_policy_is_known_by_its_files_and_not_by_its_folder(pocketvla, tmp_pat
     [
         ("--env.obs_type=pixels_agent_pos", "environment_state.*--env.obs_type=environment_state_agent_pos"),
         ("--env.scene=kitchen_3x3", "of 48 numbers, kitchen_3x3 gives 72.*--env.scene=kitchen_2x2"),
+        (
+            "--env.render_size=[241,320]",
+            "render_size are 241 and 320: a video's height and width must be even",
+        ),
     ],
 )
 def test_an_environment_that_does_not_fit_the_policy_is_refused_with_the_flag_that_would(

@@ -247,6 +247,9 @@ def test_pixels():
         "--algorithm.policy_lr=1e-4",
         "--env.obs_type=pixels_agent_pos",
     } <= set(trains[0].command)
+    # Of a policy of one's own, ACT say, nothing is known.
+    trains = jobs_of("figure7", rows=["t320_eer"], scale="small", obs_type=PIXELS, policy_path="me/act").values()
+    assert not [flag for job in trains for flag in job.command if flag.startswith("--policy.freeze")]
 
 
 def test_evaluations_of_checkpoints():

@@ -188,6 +188,25 @@ def test_a_card_says_what_a_resume_changed(tmp_path, monkeypatch):
     manifest.write_text(json.dumps({"starts": [start, again, again]}))
     changed = "protocol.scene_reset_interval=1280, then 320"
     assert f"| flags that a resume changed | {changed} |" in dry_run(checkpoint, tmp_path / "out")
+    # A checkpoint of before has nothing of it.
+    step = int(checkpoint.name)
+    for began, told in ((step - 1, changed), (step, "none")):
+        manifest.write_text(json.dumps({"starts": [start, again | {"interaction_steps": began}]}))
+        card = dry_run(checkpoint, tmp_path / f"out_{began}")
+        assert f"| flags that a resume changed | {told} |" in card
+
+
+def test_a_card_of_a_run_that_began_with_a_folder_names_no_repository(tmp_path, monkeypatch):
+    """Which looks like one, `<folder>/<folder>`, and is not there where the card is made."""
+    monkeypatch.setattr(hub_policy, "FIGURES", {})
+    checkpoint = write_checkpoint(tmp_path, "pocketvla", CronosEnvConfig(**STATE), PPOConfig())
+    manifest = tmp_path / "run/manifest.json"
+    (start,) = json.loads(manifest.read_text())["starts"]
+    start["config"]["policy"] = {"pretrained_path": "outputs/clone"}
+    for fingerprint, named in ((None, True), ("0123456789abcdef", False)):
+        manifest.write_text(json.dumps({"starts": [start | {"policy_fingerprint": fingerprint}]}))
+        card = dry_run(checkpoint, tmp_path / f"out_{named}")
+        assert ("base_model: outputs/clone" in card, "/outputs/clone)" in card) == (named, named)
 
 
 def test_adapters_of_a_policy_that_nobody_else_has_are_refused(tmp_path, monkeypatch):

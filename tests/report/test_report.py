@@ -328,6 +328,24 @@ def test_resumed_run_stays_in_its_group(tmp_path):
     assert len(group_runs(find_runs([tmp_path]).training)) == 1
 
 
+def test_a_resume_that_was_undone_leaves_nothing(tmp_path):
+    """Of a run that went on with another T, and then once more from an earlier checkpoint with its own."""
+    for name in "ab":
+        manifest = write_training_run(tmp_path / name, seed=ord(name), interval=320) / "manifest.json"
+        content = json.loads(manifest.read_text())
+        starts = [json.loads(json.dumps(content["starts"][0])) for _ in range(3)]
+        for start, steps, interval in zip(starts, (0, 5120, 2560), (320, 1280, 320), strict=True):
+            start["interaction_steps"] = steps
+            start["config"]["protocol"]["scene_reset_interval"] = interval
+        content["starts"] = starts[:1] if name == "a" else starts
+        manifest.write_text(json.dumps(content))
+    runs = find_runs([tmp_path]).training
+    assert [(run.changed, [start["interaction_steps"] for start in run.starts]) for run in runs] == [
+        ({}, [0]), ({}, [0, 2560])
+    ]  # fmt: skip
+    assert len(group_runs(runs)) == 1
+
+
 def test_seeds_below_other_roots_are_of_one_experiment(tmp_path):
     """As `cronos-reproduce` has it: a root may be moved. Another base policy is another experiment, and the demo's
     in two folders may be two."""

@@ -32,6 +32,14 @@ def chains(successes):
     return {"n": 640, "positions": [rate(s, 640) for s in successes], "average_chain_length": length}
 
 
+def test_policies_of_one_short_name_are_each_told_by_what_differs(tmp_path):
+    for seed in (1, 2, 3):
+        content = {"independent": {"train": rate(0.5) | {"per_task": {}}}}
+        write_results(tmp_path / str(seed), f"outputs/seed{seed}/eer/checkpoints/0102400", content)
+    names = [run.name for run in find_runs([tmp_path]).suites]
+    assert names == [f"eer 0102400 (policy=outputs/seed{seed}/eer/checkpoints/0102400)" for seed in (1, 2, 3)]
+
+
 def test_two_policies_of_one_path_stay_apart(tmp_path):
     """The last checkpoint of a run that went on."""
     for name, fingerprint, success in (("a", "f1", 0.5), ("b", "f2", 0.75)):

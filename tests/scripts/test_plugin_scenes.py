@@ -6,6 +6,8 @@ import sys
 import pytest
 from forked_commands import run_forked
 
+from cronos_lerobot.scripts import streams
+
 PLUGIN = """
 from lerobot_env_cronos import Body, Scene, register_scene
 
@@ -24,6 +26,27 @@ except SystemExit:
     pass
 print("scenes:", *SCENES)
 """
+
+
+@pytest.mark.parametrize(
+    ("command", "output"),
+    [
+        ("check", ()),
+        ("statistics", ()),
+        ("filter", ("--output.repo_id=me/y",)),
+        ("weights", ("--output=x.parquet",)),
+    ],
+)
+def test_a_module_with_the_scene_of_streams_is_imported(tmp_path, monkeypatch, command, output):
+    (tmp_path / f"my_scene_to_{command}.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    flags = ["--dataset.repo_id=me/x", f"--dataset.root={tmp_path}", *output]
+    for module, said in ((f"my_scene_to_{command}", "no LeRobotDataset in"), ("nobody", "cannot be imported")):
+        argv = ["cronos-streams", command, *flags, f"--dataset.discover_packages_path={module}"]
+        monkeypatch.setattr(sys, "argv", argv)
+        with pytest.raises(SystemExit, match=f"^error: .*{said}"):
+            streams.main()
+    assert f"my_scene_to_{command}" in sys.modules
 
 
 @pytest.mark.parametrize("module", ["streams", "publish"])
