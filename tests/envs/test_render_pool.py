@@ -1,14 +1,17 @@
 """Drawing in processes of their own: the same frames, and nothing left behind."""
 
 import contextlib
+import errno
 import os
 import signal
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos.simulation import render_pool
 from lerobot_env_cronos.simulation.render_pool import MIN_FRAMES, RenderPool
 from lerobot_env_cronos.simulation.rendering import ClassicRenderer
 
@@ -17,7 +20,7 @@ SIZE = (48, 64)
 
 @pytest.fixture(scope="module")
 def simulation():
-    env = CronosVectorEnv(5, obs_type="environment_state_agent_pos")
+    env = CronosVectorEnv(2 * MIN_FRAMES, obs_type="environment_state_agent_pos")
     env.reset(seed=0)
     return env.simulation
 
@@ -25,7 +28,7 @@ def simulation():
 @pytest.fixture
 def pool(simulation):
     model = simulation.render_model
-    pool = RenderPool(model, *SIZE, model.camera("front").id, processes=2, capacity=5)
+    pool = RenderPool(model, *SIZE, model.camera("front").id, processes=2, capacity=2 * MIN_FRAMES)
     yield pool
     pool.close()
 
@@ -53,14 +56,74 @@ def test_a_renderer_hands_over_what_is_worth_it(simulation):
     if renderer._processes == 1:
         pytest.skip("drawn by a GPU, which needs no processes")
     before = children()
-    few = renderer.render(simulation.qpos)
+    few = renderer.render(simulation.qpos[:5])
     assert children() == before
-    many = np.tile(simulation.qpos, (2 * MIN_FRAMES, 1))
+    many = np.tile(simulation.qpos[:5], (2 * MIN_FRAMES, 1))
     frames = renderer.render(many)
     assert len(children() - before) == 2
     assert np.array_equal(frames, np.tile(few, (2 * MIN_FRAMES, 1, 1, 1)))
     renderer.close()
     assert children() == before
+
+
+@pytest.mark.parametrize(("frames", "drawing"), [(16, 2), (23, 2), (24, 3), (64, 3)])
+def test_as_many_processes_draw_as_have_frames_enough(simulation, frames, drawing):
+    """On many cores, too: with 64 frames not one, and not all of 16."""
+    renderer = ClassicRenderer(simulation.render_model, *SIZE, "front", processes=3)
+    if renderer._processes == 1:
+        pytest.skip("drawn by a GPU, which needs no processes")
+    before = children()
+    many = simulation.qpos[np.arange(frames) % 2]
+    expected = ClassicRenderer(simulation.render_model, *SIZE, "front").render(many[:2])
+    assert np.array_equal(renderer.render(many), expected[np.arange(frames) % 2])
+    assert len(children() - before) == drawing
+    renderer.close()
+
+
+def test_what_is_broken_off_is_not_taken_for_what_comes_next(simulation, monkeypatch):
+    """Ctrl-C between the request and the answer."""
+    renderer = ClassicRenderer(simulation.render_model, *SIZE, "front", processes=2)
+    if renderer._processes == 1:
+        pytest.skip("drawn by a GPU, which needs no processes")
+    states = [np.tile(simulation.qpos[i], (2 * MIN_FRAMES, 1)) for i in (0, 1)]
+    expected = [renderer.render(qpos) for qpos in states]
+
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(RenderPool, "_wait", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            renderer.render(states[0])
+    for _ in range(2):
+        for qpos, frames in zip(states, expected, strict=True):
+            assert np.array_equal(renderer.render(qpos), frames)
+    renderer.close()
+
+
+def test_frames_that_find_no_room_in_memory_lie_on_disk(simulation, pool, monkeypatch, tmp_path):
+    """A file with holes would kill who draws into it, without a word."""
+    full, disk = tmp_path / "full", tmp_path / "disk"
+    full.mkdir()
+    disk.mkdir()
+    allocate = os.posix_fallocate
+
+    def no_room_in_memory(descriptor, *where):
+        if str(full) in os.readlink(f"/proc/self/fd/{descriptor}"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        allocate(descriptor, *where)
+
+    monkeypatch.setattr(render_pool, "_memory_folder", lambda: full)
+    monkeypatch.setattr(tempfile, "tempdir", str(disk))
+    monkeypatch.setattr(os, "posix_fallocate", no_room_in_memory)
+    model = simulation.render_model
+    other = RenderPool(model, *SIZE, model.camera("front").id, processes=2, capacity=2 * MIN_FRAMES)
+    assert np.array_equal(other.render(simulation.qpos), pool.render(simulation.qpos))
+    other.close()
+    monkeypatch.setattr(tempfile, "tempdir", str(full))
+    with pytest.raises(OSError, match=r"no room for \d+ MB of frames in .*full"):
+        RenderPool(model, *SIZE, model.camera("front").id, processes=1, capacity=4000)
+    assert not list(full.iterdir())
 
 
 def test_two_threads_that_ask_get_their_own_frames(simulation):

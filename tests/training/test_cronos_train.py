@@ -47,12 +47,12 @@ def optimizer_state(checkpoint):
 STOPPED = """
 import os, signal, sys, threading, time
 from pathlib import Path
-from lerobot_env_cronos.simulation import rendering
+from lerobot_env_cronos.simulation import render_pool, rendering
 
 from cronos_lerobot.scripts import train
 
 # Two frames are drawn by two processes.
-rendering.MIN_FRAMES = 1
+rendering.MIN_FRAMES = render_pool.MIN_FRAMES = 1
 folder = Path(sys.argv.pop(1))
 # As a cluster does: to all processes, those that draw among them.
 os.setsid()

@@ -31,10 +31,11 @@ class RenderPool:
         model: what to draw.
         height, width: of a frame [px].
         camera: number of the camera.
-        processes: how many.
+        processes: how many at most.
         capacity: the most frames at a time.
 
     Raises:
+        OSError: there is no place for so many frames.
         RuntimeError: a process does not start; says what it said.
     """
 
@@ -44,16 +45,14 @@ class RenderPool:
         self._processes: list[subprocess.Popen] = []
         self._finalizer = weakref.finalize(self, _stop, self._processes, self._errors, os.getpid())
         # The folder is gone once all have opened what is in it: nothing is left behind when they are killed.
-        with tempfile.TemporaryDirectory(prefix="cronos-frames-", dir=_memory_folder()) as folder:
+        with _folder_with("shared", capacity * (model.nq * 8 + height * width * 3)) as folder:
             model_path, shared = f"{folder}/model.mjb", f"{folder}/shared"
             mujoco.mj_saveModel(model, model_path)
-            with open(shared, "wb") as file:
-                file.truncate(capacity * (model.nq * 8 + height * width * 3))
             self._states, self._frames = canvas.shared_arrays(shared, capacity, model.nq, height, width)
             command = [sys.executable, "-P", canvas.__file__, model_path, shared]
             command += map(str, (height, width, camera, capacity))
-            self._processes += [self._start(command) for _ in range(processes)]
-            self._wait()
+            self._processes += [self._start(command) for _ in range(_num_for(capacity, processes))]
+            self._wait(self._processes)
 
     def _start(self, command: list[str]) -> subprocess.Popen:
         # A core each; what OpenGL says at its start is of interest only if it fails.
@@ -67,21 +66,30 @@ class RenderPool:
         Raises:
             RuntimeError: a process has died.
         """
+        try:
+            return self._render(qpos)
+        except BaseException:
+            # Answers that nobody has read, of what Ctrl-C broke off, would be taken for those of what comes next.
+            self.close()
+            raise
+
+    def _render(self, qpos: np.ndarray) -> np.ndarray:
         n = len(qpos)
         self._states[:n] = qpos
-        bounds = np.linspace(0, n, len(self._processes) + 1).astype(int).tolist()
-        for process, first, end in zip(self._processes, bounds[:-1], bounds[1:], strict=True):
+        drawing = self._processes[: _num_for(n, len(self._processes))]
+        bounds = np.linspace(0, n, len(drawing) + 1).astype(int).tolist()
+        for process, first, end in zip(drawing, bounds[:-1], bounds[1:], strict=True):
             assert process.stdin is not None
             try:
                 process.stdin.write(canvas.REQUEST.pack(first, end - first))
                 process.stdin.flush()
             except BrokenPipeError:
                 continue  # Noticed below, with what it said.
-        self._wait()
+        self._wait(drawing)
         return self._frames[:n].copy()
 
-    def _wait(self) -> None:
-        for process in self._processes:
+    def _wait(self, processes: list[subprocess.Popen]) -> None:
+        for process in processes:
             assert process.stdout is not None
             if process.stdout.read(1) != canvas.ANSWER:
                 self._errors.seek(0)
@@ -91,6 +99,36 @@ class RenderPool:
     def close(self) -> None:
         """End the processes; also done when the pool is garbage-collected."""
         self._finalizer()
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether it draws no more."""
+        return not self._finalizer.alive
+
+
+def _num_for(frames: int, processes: int) -> int:
+    """How many of the processes share so many frames."""
+    return max(1, min(processes, frames // MIN_FRAMES))
+
+
+def _folder_with(name: str, size: int) -> tempfile.TemporaryDirectory:
+    """A new folder with a file of `size` [bytes], in memory where there is room (Docker's default has 64 MB).
+
+    Raises:
+        OSError: there is room nowhere.
+    """
+    for place in filter(None, (_memory_folder(), tempfile.gettempdir())):
+        folder = tempfile.TemporaryDirectory(prefix="cronos-frames-", dir=place)
+        try:
+            with open(Path(folder.name) / name, "wb") as file:
+                # A file with holes would be found too large only by who writes to it, and killed for that.
+                os.posix_fallocate(file.fileno(), 0, size)
+        except OSError as error:
+            folder.cleanup()
+            full = error
+        else:
+            return folder
+    raise OSError(f"no room for {size / 1e6:.0f} MB of frames in {place}: {full}")
 
 
 def _memory_folder() -> Path | None:

@@ -95,7 +95,7 @@ class ClassicRenderer:
     def render(self, qpos: np.ndarray) -> np.ndarray:
         """Render states `qpos` (n, nq) to uint8 frames (n, height, width, 3)."""
         gl.claim_process()
-        if self._processes > 1 and len(qpos) >= MIN_FRAMES * self._processes:
+        if self._processes > 1 and len(qpos) >= 2 * MIN_FRAMES:
             # The processes draw into one shared memory: one batch at a time.
             with self._pool_lock:
                 return self._pool_for(len(qpos)).render(qpos)
@@ -104,7 +104,7 @@ class ClassicRenderer:
         return frames
 
     def _pool_for(self, count: int) -> RenderPool:
-        if self._pool is None or count > self._pool.capacity:
+        if self._pool is None or self._pool.is_closed or count > self._pool.capacity:
             if self._pool is not None:
                 self._pool.close()
             self._pool = RenderPool(self.model, self.height, self.width, self.camera, self._processes, count)
