@@ -109,6 +109,7 @@ def test_registering_again_changes_nothing():
         (SCENE, [Body("cloth", (0.1, 0.1, 0.01), 1, "box")], "another body 'cloth'"),
         (SCENE, [BLOCK, Body("blue coaster", (0.1, 0.1, 0.01), 1, "ring")], "unknown shape 'ring'.*box"),
         (SCENE, [BLOCK, Body("blue coaster", (0.1, 0.0, 0.01), 1, "disc")], "must be positive"),
+        (SCENE, [BLOCK, replace(COASTER, size=(0.09, 0.08, 0.005))], r"a disc is round: .* got \(0.09, 0.08\)"),
         (Scene("study", ("red block",), ()), [BLOCK], "objects and receptacles"),
         (SCENE, [replace(BLOCK, size=(0.06, 0.05, 0.05)), COASTER], "red block is an object, 50 mm wide .* 44 mm"),
         (

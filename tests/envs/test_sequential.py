@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from dataclasses import replace
 from importlib import resources
 
 import numpy as np
@@ -234,3 +235,14 @@ def test_every_scene_has_its_chains(scene):
 def test_errors_name_the_bad_value_and_the_valid_ones(field, value, valid):
     with pytest.raises(ValueError, match=rf"{value}.*{valid}"):
         CronosEnvConfig(**({"suite": "sequential"} | {field: value}))
+
+
+def test_a_step_says_what_was_grasped_of_the_task_that_was_acted_on(monkeypatch):
+    """Not of the next one, which a switch has judged meanwhile."""
+    env = SequentialVectorEnv(1, "kitchen_2x2", ordering=TASKS, obs_type=STATE)
+    env.reset(seed=0)
+    what = env.apply(STILL[None])
+    assert not what.is_grasped.any()
+    monkeypatch.setattr(env, "apply", lambda actions: replace(what, is_grasped=~what.is_grasped))
+    assert env.step(STILL[None])[-1]["is_grasped"].all()
+    env.close()

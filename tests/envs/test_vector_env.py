@@ -268,6 +268,16 @@ def test_errors_name_the_bad_value_and_the_valid_ones(kwargs, message):
         make(1).set_task([0], [Task("banana", PLATE)])
 
 
+def test_no_stream_gets_its_task_where_one_is_unknown():
+    env = make(2)
+    env.reset(seed=0)
+    before = list(env.tasks)
+    other = next(task for task in env.scene.tasks if task != before[0])
+    with pytest.raises(ValueError, match="a Task, not its instruction, is needed; valid tasks: .*Task"):
+        env.set_task([0, 1], [other, other.instruction])
+    assert env.tasks == before
+
+
 def test_environments_render_from_many_threads_at_once():
     """Mesa's software rasteriser crashes when two threads draw at once; LeRobot may evaluate in threads."""
     from concurrent.futures import ThreadPoolExecutor

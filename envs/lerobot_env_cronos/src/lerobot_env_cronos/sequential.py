@@ -140,6 +140,8 @@ class SequentialVectorEnv(EpisodicVectorEnv):
         what = self.apply(actions)
         observation = self.observe_running(self._all[what.running])
         info = self._chain_info(what.success, what.task_success, what.position) | {"diverged": what.diverged}
+        # Of the task that was acted on, not of the one that comes next.
+        info["is_grasped"] = what.is_grasped
         return observation, what.task_success.astype(np.float32), what.success.copy(), what.failure, info
 
     def apply(self, actions: np.ndarray) -> ChainStep:

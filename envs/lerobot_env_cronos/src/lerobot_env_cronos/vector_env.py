@@ -238,12 +238,17 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         self._judge(ids)
 
     def set_task(self, ids: Iterable[int], tasks: Sequence[Task]) -> None:
-        """Give streams `ids` their tasks; the reward's level starts from the state as it is."""
+        """Give streams `ids` their tasks; the reward's level starts from the state as it is.
+
+        Raises:
+            ValueError: one is none of `scene.tasks` and `scene.reset_tasks`; all streams keep theirs.
+        """
         valid = self.scene.tasks + self.scene.reset_tasks
         ids = np.asarray(ids)
+        if unknown := [task for task in tasks if task not in valid]:
+            by_name = "a Task, not its instruction, is needed; " if isinstance(unknown[0], str) else ""
+            raise ValueError(f"unknown task {unknown[0]!r}: {by_name}valid tasks: {list(valid)}")
         for i, task in zip(ids, tasks, strict=True):
-            if task not in valid:
-                raise ValueError(f"unknown task {task}; valid tasks: {[t.instruction for t in valid]}")
             self.tasks[i] = task
         self._judge(ids)
 

@@ -15,6 +15,7 @@ from lerobot_env_cronos.scene.visuals.objects import LOOKS
 # Part of Gymnasium's environment ids and of file names.
 NAME_PATTERN = re.compile(r"[a-z0-9_]+")
 PLAIN_SHAPES = ("box", "disc")
+ROUND_SHAPES = ("disc", "plate")
 MAX_WIDTH_M = 0.044
 """What the gripper takes between its fingers."""
 
@@ -58,6 +59,8 @@ def _check(scene: Scene, new_bodies: dict[str, Body]) -> None:
             raise ValueError(f"unknown shape {body.shape!r} of the {name}; valid shapes: {valid_shapes}")
         if min(body.size) <= 0 or body.density <= 0:
             raise ValueError(f"size and density of the {name} must be positive, got {body.size}, {body.density}")
+        if body.shape in ROUND_SHAPES and body.size[0] != body.size[1]:
+            raise ValueError(f"a {body.shape} is round: the {name} needs two equal sides, got {body.size[:2]}")
         if body.colour is not None and not all(0 <= channel <= 1 for channel in body.colour):
             raise ValueError(f"colour of the {name} must be (R, G, B) in 0 to 1, got {body.colour}")
     if not scene.objects or not scene.receptacles or len(set(scene.bodies)) < len(scene.bodies):
