@@ -273,7 +273,7 @@ def test_no_stream_gets_its_task_where_one_is_unknown():
     env.reset(seed=0)
     before = list(env.tasks)
     other = next(task for task in env.scene.tasks if task != before[0])
-    with pytest.raises(ValueError, match="a Task, not its instruction, is needed; valid tasks: .*Task"):
+    with pytest.raises(ValueError, match=r"a Task, not its instruction, is needed; valid tasks: .*Task"):
         env.set_task([0, 1], [other, other.instruction])
     assert env.tasks == before
 
