@@ -10,6 +10,7 @@ from contextlib import ExitStack, nullcontext
 from typing import Any
 
 import torch
+from lerobot.utils.hub import HubMixin
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import init_logging
@@ -58,6 +59,7 @@ def train(config: CronosTrainConfig) -> None:
 
             trainer = Trainer(config, env, make_own_eval_env, policy, preprocessor, postprocessor, processes)
             trainer.load()
+            trainer.open()
         # What keeps nothing ends at once.
         stop = StopRequest()
         with stop if config.save_checkpoint else nullcontext():
@@ -75,12 +77,14 @@ def push_to_hub(config: CronosTrainConfig, agent: LearningAgent, preprocessor: A
     """Push what the agent trained to `--policy.repo_id`, if it is given and pushing is on."""
     assert config.policy is not None
     if config.policy.push_to_hub and config.policy.repo_id:
-        # PEFT pushes its adapters only.
-        more = [agent.policy.config] if is_wrapped(agent.policy) else []
-        if agent.acting is not agent.policy:
-            more.append(agent.acting)
-        for part in (agent.policy, *more, preprocessor, postprocessor):
-            part.push_to_hub(config.policy.repo_id, private=config.policy.private)
+        repository, private = config.policy.repo_id, config.policy.private
+        agent.policy.push_to_hub(repository, private=private)
+        if is_wrapped(agent.policy):
+            # PEFT pushes its adapters only. A flag of the policy's config has the name of the method.
+            HubMixin.push_to_hub(agent.policy.config, repository, private=private)
+        more = [] if agent.acting is agent.policy else [agent.acting]
+        for part in (*more, preprocessor, postprocessor):
+            part.push_to_hub(repository, private=private)
 
 
 def main() -> None:

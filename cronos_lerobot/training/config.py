@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import datetime as dt
+import io
 import json
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import redirect_stderr
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -385,16 +387,22 @@ def load_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
     folder = Path(path)
     if folder.is_dir() and not (folder / CONFIG_NAME).is_file():
         raise ValueError(f"--policy.path={path} has no {CONFIG_NAME}: give a checkpoint's pretrained_model.")
+    said = io.StringIO()
     try:
-        config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+        # What argparse says of a flag that the policy does not have is its whole usage.
+        with redirect_stderr(said):
+            config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    except SystemExit as error:
+        why = said.getvalue().strip().rpartition("error: ")[2].replace("--", "--policy.")
+        raise ValueError(f"--policy.path={path}: {why}") from error
     except (json.JSONDecodeError, draccus.ParsingError) as error:
         # draccus keeps what a policy's config says of its values in the cause.
         why = error.__cause__ or error
         raise ValueError(f"{folder / CONFIG_NAME} is damaged, or --policy.* does not fit it: {why}") from error
     except (OSError, ValueError) as error:
-        raise ValueError(
-            f"--policy.path={path}: no such folder, and no such policy on the Hub ({type(error).__name__})."
-        ) from error
+        nowhere = f"no such folder, and no such policy on the Hub ({type(error).__name__})."
+        raise ValueError(f"--policy.path={path}: {error if folder.is_dir() else nowhere}") from error
+    sys.stderr.write(said.getvalue())
     config.pretrained_path = folder
     return config
 

@@ -22,7 +22,7 @@ from safetensors import SafetensorError
 
 from cronos_lerobot.agents.imitation.config import DemosConfig
 from cronos_lerobot.agents.steering.steered import STEERING
-from cronos_lerobot.agents.weights import wrap
+from cronos_lerobot.agents.weights import is_wrapped, wrap
 from cronos_lerobot.evaluation.policy_env import (
     EMPTY_CAMERA,
     check_task_observation,
@@ -102,7 +102,10 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
     if not (path or getattr(policy_config, "checkpoint", None)):
         logging.warning("Training a policy from scratch: its states are not normalised, its success starts at 0.")
     try:
-        policy = wrap(make_policy(policy_config, env_cfg=env_config), config.peft)
+        loaded = make_policy(policy_config, env_cfg=env_config)
+        if config.peft is not None and not config.resume:
+            check_adapters(loaded, policy_config)
+        policy = wrap(loaded, config.peft)
         if path is None:
             return policy, *make_pre_post_processors(policy_config)
         if not config.resume:
@@ -115,6 +118,24 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
         raise ValueError(f"{path}/{SAFETENSORS_SINGLE_FILE} or a processor's file is damaged: {error}") from error
     except json.JSONDecodeError as error:
         raise ValueError(f"a configuration of a processor in {path} is damaged: {error}") from error
+
+
+def check_adapters(loaded: Any, policy: PreTrainedConfig) -> None:
+    """Check that a policy can get the adapters of `--peft.*`, and that they can go where they are to be pushed.
+
+    Raises:
+        ValueError: it has some already; or who downloads them would look for its base in a folder here.
+    """
+    if is_wrapped(loaded):
+        raise ValueError(
+            f"--policy.path={policy.pretrained_path} has adapters, which go on being trained: leave --peft.* out."
+        )
+    if policy.push_to_hub and policy.repo_id and Path(str(policy.pretrained_path)).is_dir():
+        raise ValueError(
+            f"--policy.repo_id={policy.repo_id}: adapters name the policy that they go onto, which is the folder "
+            f"{policy.pretrained_path}. Give --policy.push_to_hub=false; `cronos-publish policy --base_policy=` "
+            "pushes them with the repository that has it."
+        )
 
 
 def warn_of_actor(policy: PreTrainedConfig, algorithm: str) -> None:
@@ -190,6 +211,11 @@ def check_features(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
         size, own = feature.shape, shown[name].shape
         # A picture is (channels, height, width) to LeRobot's policies, (height, width, channels) to environments.
         if feature.type is FeatureType.VISUAL and tuple(size[1:]) != (pixels := tuple(own[:2])):
+            if name in getattr(policy, "unscaled_images", ()):
+                raise ValueError(
+                    f"the policy was made for {name} of {size[1]} x {size[2]} pixels, and scales none: give "
+                    f"--env.observation_height={size[1]} --env.observation_width={size[2]}."
+                )
             logging.warning(
                 "The policy was made for %s of %d x %d pixels and learns here from %d x %d: not every policy "
                 "scales pictures. --env.observation_height=%d --env.observation_width=%d shows it its own, as "

@@ -94,6 +94,9 @@ class Trainer:
         recorded = config.record.num_streams
         self._num_recorded = config.num_envs if isinstance(recorded, str) else recorded
         self._observers: dict[str, Any] = {}
+        self.logger: RunLogger | SilentLogger = SilentLogger()
+        self.recorder = StreamObserver(None)
+        self._is_open = False
         self.run_state = RunState(
             self.agent, self.loop, self.generators, self.env, preprocessor, postprocessor, self.processes,
             (find_inner(self._task_order), *self._resets.all),
@@ -154,7 +157,8 @@ class Trainer:
         """
         if not self._observers:
             self.load()
-        self._open_observers(self._observers)
+        if not self._is_open:
+            self.open()
         try:
             # A run that was told to stop has left an evaluation to the one that goes on from it; one that a budget
             # ended between two updates has not.
@@ -166,17 +170,25 @@ class Trainer:
         finally:
             self.recorder.close()
             self.logger.close()
+            self._is_open = False
 
-    def _open_observers(self, states: dict[str, Any]) -> None:
-        """Continue the observers from their `states`; those of a run that begins have none."""
-        self.logger: RunLogger | SilentLogger = SilentLogger()
-        self.recorder = StreamObserver(None)
+    def open(self) -> None:
+        """Begin what the run writes, or continue it from a checkpoint: metrics, recordings, manifest.
+
+        `train` does it where nobody has before, to tell errors of files from those of the work.
+
+        Raises:
+            ValueError: a file of the run is shorter than its checkpoint left it, or a recording is of another run.
+            OSError: a file cannot be written, or another process has the recording.
+        """
         if self.processes.is_main:
+            states = self._observers
             self.logger = RunLogger(self.config, self.loop, states.get("logger", {}).get("offset"))
-            write_manifest(self.config, self.processes.count, self.loop.n)
             self.recorder = StreamObserver.open(
                 self.config, self.env, states.get("recorder"), lambda why: self.logger.log("recording", why)
             )
+            write_manifest(self.config, self.processes.count, self.loop.n)
+        self._is_open = True
 
     def _run(self, stop: StopRequest) -> bool:
         last_save = self.loop.n

@@ -1,9 +1,13 @@
 """Policies that PEFT wraps, as `lerobot-train --peft.*` does it."""
 
+import os
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 from dummies import identity_processors
+from huggingface_hub import HfApi
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import PeftConfig
 from lerobot.policies.factory import get_policy_class
@@ -26,6 +30,9 @@ from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.agents.processing import make_processors as around
 from cronos_lerobot.agents.weights import load_weights, save_policy, unwrapped, weights_file, wrap
 from cronos_lerobot.evaluation.actors import SamplingPolicy, make_actor
+from cronos_lerobot.scripts.train import push_to_hub
+from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.factory import check_adapters
 
 
 def load_as_lerobot(kind, base, adapters):
@@ -35,6 +42,45 @@ def load_as_lerobot(kind, base, adapters):
     with tiny_gemma():
         loaded = get_policy_class(kind).from_pretrained(base, config=config)
     return PeftModel.from_pretrained(loaded, adapters, is_trainable=True).eval()
+
+
+def test_adapters_are_pushed_with_the_policys_config(tmp_path, monkeypatch):
+    """`push_to_hub` is a flag of it, too."""
+    policy = make_vla(KINDS[0], tmp_path)
+    policy.config.pretrained_path = "me/base"
+    wrapped = wrap(policy, PeftConfig(r=2))
+    pushed = []
+
+    def push_adapters(self, repo_id, private):
+        pushed.append((repo_id, private, "adapters"))
+
+    def upload(self, folder_path, repo_id, **options):
+        pushed.append((repo_id, *os.listdir(folder_path)))
+
+    def create(self, repo_id, private, **options):
+        return SimpleNamespace(repo_id=repo_id)
+
+    monkeypatch.setattr(PeftModel, "push_to_hub", push_adapters)
+    monkeypatch.setattr(HfApi, "create_repo", create)
+    monkeypatch.setattr(HfApi, "upload_folder", upload)
+    config = CronosTrainConfig(policy=policy.config)
+    config.policy.push_to_hub, config.policy.repo_id, config.policy.private = True, "me/lora", True
+    push_to_hub(config, SimpleNamespace(policy=wrapped, acting=wrapped), *identity_processors())
+    assert pushed[:2] == [("me/lora", True, "adapters"), ("me/lora", "config.json")]
+    assert len(pushed) == 4
+
+
+def test_adapters_are_refused_twice_and_where_they_would_name_a_folder(tmp_path):
+    policy = make_vla(KINDS[0], tmp_path)
+    policy.config.pretrained_path, policy.config.repo_id = tmp_path, "me/lora"
+    check_adapters(policy, policy.config)
+    policy.config.push_to_hub = True
+    with pytest.raises(ValueError, match=rf"repo_id=me/lora: .* folder {tmp_path}\. Give --policy\.push"):
+        check_adapters(policy, policy.config)
+    policy.config.pretrained_path = "me/base"
+    check_adapters(policy, policy.config)
+    with pytest.raises(ValueError, match=r"--policy\.path=me/base has adapters.*: leave --peft"):
+        check_adapters(wrap(policy, PeftConfig(r=2)), policy.config)
 
 
 @pytest.mark.parametrize("kind", KINDS)

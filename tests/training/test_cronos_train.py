@@ -239,6 +239,11 @@ def test_what_cannot_be_is_one_line(tmp_path, monkeypatch):
     refused("--output_dir=.*/elsewhere, but", *resume, f"--output_dir={tmp_path / 'elsewhere'}")
     with FolderLock(run):
         refused("run is being written by process", *resume)
+    metrics = (run / "metrics.jsonl").read_bytes()
+    (run / "metrics.jsonl").write_bytes(b"")
+    refused("metrics.jsonl has 0 bytes, .* when the checkpoint was made", *resume)
+    (run / "metrics.jsonl").write_bytes(metrics)
+    assert len(json.loads((run / "manifest.json").read_text())["starts"]) == 1
 
     begin = (
         f"--policy.path={last}", "--policy.device=cpu", *OBSERVATIONS["state"], "--env.type=cronos",

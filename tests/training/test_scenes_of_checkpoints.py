@@ -103,6 +103,13 @@ def test_pictures_of_another_size_are_told_and_empty_cameras_are_not_asked_for(c
     (record,) = caplog.records
     assert "of 64 x 48 pixels and learns here from 128 x 128" in record.message
     assert "--env.observation_height=64 --env.observation_width=48" in record.message
+    # PocketVLA scales none; one that reads the state may have been cloned from data with pictures.
+    features = pictured("observation.images.front", (3, 64, 48)).input_features
+    policy = PocketVLAConfig(device="cpu", input_features=features, observation="image")
+    with pytest.raises(ValueError, match=r"64 x 48 pixels, and scales none: give --env\.observation_height=64"):
+        check_features(policy, env)
+    policy.observation = "environment_state"
+    check_features(policy, env)
 
 
 def test_a_precision_that_training_would_ignore_is_refused():

@@ -109,6 +109,16 @@ def test_what_a_policys_config_says_of_its_values_is_the_line(tmp_path):
         load_policy_config(str(tmp_path), ["--n_action_steps=16"])
 
 
+def test_a_policy_that_cannot_be_read_is_told_by_what_is_wrong_with_it(tmp_path):
+    ACTConfig(chunk_size=8, n_action_steps=2, device="cpu").save_pretrained(tmp_path)
+    with pytest.raises(ValueError, match=rf"^--policy\.path={tmp_path}: unrecognized arguments: --policy\.foo=1$"):
+        load_policy_config(str(tmp_path), ["--foo=1"])
+    config = tmp_path / "config.json"
+    config.write_text(config.read_text().replace('"type": "act"', '"type": "not_installed"'))
+    with pytest.raises(ValueError, match=rf"^--policy\.path={tmp_path}: .*not_installed"):
+        load_policy_config(str(tmp_path), [])
+
+
 def test_what_is_missing_is_asked_for(tmp_path):
     with pytest.raises(ValueError, match="--env"):
         CronosTrainConfig().validate()

@@ -157,6 +157,11 @@ class ImitationAgent(LearningAgent):
 
     def _make_player(self, generator: torch.Generator) -> Player:
         if not is_trainable(self.policy):
+            if self.config.temperature != 1:
+                raise ValueError(
+                    f"--algorithm.temperature={self.config.temperature} is not for --policy.type="
+                    f"{self.policy.config.type}, which does not sample at a temperature."
+                )
             return make_player(self.policy)
 
         def plan(frames: list[Batch]) -> Tensor:

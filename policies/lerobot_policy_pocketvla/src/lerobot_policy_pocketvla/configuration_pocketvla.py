@@ -216,6 +216,11 @@ class PocketVLAConfig(PreTrainedConfig):
         return key, (shape[0], shape[1], shape[2])
 
     @property
+    def unscaled_images(self) -> tuple[str, ...]:
+        """Keys of the images that must have the size that the policy was made for."""
+        return (self.camera[0],) if self.actor_observation == "image" else ()
+
+    @property
     def state_width(self) -> int:
         """Width of `observation.state`, 0 without it."""
         return self.robot_state_feature.shape[0] if self.robot_state_feature else 0
