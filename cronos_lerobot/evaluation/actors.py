@@ -175,6 +175,11 @@ class ExpertActor:
         return self._expert.act()[ids]
 
 
+def has_temperature(policy: Any) -> bool:
+    """Whether a policy samples at a temperature that an evaluation chooses."""
+    return isinstance(policy, SteeredPolicy) or is_trainable(policy)
+
+
 def make_actor(
     policy: Any, processors: PolicyProcessors, temperature: float, env_processors: tuple[Any, Any] | None = None
 ) -> SamplingPolicy | SelectingPolicy:
@@ -186,7 +191,7 @@ def make_actor(
         temperature: of the sampling, if the policy has one (`sample_actions`).
         env_processors: LeRobot's processors between environment and policy, (before, after), if any.
     """
-    if isinstance(policy, SteeredPolicy) or is_trainable(policy):
+    if has_temperature(policy):
         return SamplingPolicy(policy, processors, temperature)
     return SelectingPolicy(policy, processors, env_processors or (_as_it_is, _as_it_is))
 

@@ -12,7 +12,7 @@ from lerobot.utils.random_utils import get_rng_state, set_rng_state
 from lerobot_env_cronos import SequentialVectorEnv
 
 from cronos_lerobot.agents.processing import PolicyProcessors
-from cronos_lerobot.evaluation.actors import make_actor
+from cronos_lerobot.evaluation.actors import has_temperature, make_actor
 from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
 from cronos_lerobot.evaluation.plan import make_parts
 from cronos_lerobot.evaluation.results import Record, independent_results
@@ -78,26 +78,29 @@ def episode_lists(by_seed: Mapping[int, Sequence[Record]]) -> list[list[int]]:
 
 
 def evaluate_independent(
-    env: SequentialVectorEnv, *args: Any, seed: int, repetitions: int = 1, **options: Any
+    env: SequentialVectorEnv, policy: Any, *args: Any, seed: int, repetitions: int = 1, **options: Any
 ) -> dict[str, Any]:
     """`run_independent` in numbers.
 
     Args:
         env: as there, and so are the others.
+        policy: as there.
         args: as there.
         seed: of the sampling; a repetition has the next one.
         repetitions: episodes of each task and configuration.
         options: as there.
 
     Returns:
-        `split`, `temperature`, `steps` (control steps of all episodes), `episodes` (see `episode_lists`) and
-        `independent_results`.
+        `split`, `temperature` (None of a policy that has none), `steps` (control steps of all episodes),
+        `episodes` (see `episode_lists`) and `independent_results`.
     """
     by_seed = {
-        s: chain_records(run_independent(env, *args, seed=s, **options)) for s in range(seed, seed + repetitions)
+        s: chain_records(run_independent(env, policy, *args, seed=s, **options))
+        for s in range(seed, seed + repetitions)
     }
     records = [record for some in by_seed.values() for record in some]
     groups = env.benchmark.groups("independent", options["split"])
-    header = {"split": options["split"], "temperature": options["temperature"]}
+    temperature = options["temperature"] if has_temperature(policy) else None
+    header = {"split": options["split"], "temperature": temperature}
     header |= {"steps": sum(record["steps"] for record in records), "episodes": episode_lists(by_seed)}
     return header | independent_results(records, [group.tasks[0] for group in groups])

@@ -28,6 +28,7 @@ from cronos_lerobot.agents.imitation.agent import ImitationAgent, copy_trained
 from cronos_lerobot.agents.imitation.config import ImitationConfig
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.evaluation.actors import SelectingPolicy
+from cronos_lerobot.evaluation.independent import evaluate_independent
 from cronos_lerobot.processes import Processes
 from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig, record_demos
 from cronos_lerobot.training.trainer import Trainer
@@ -299,6 +300,10 @@ def test_an_evaluation_keeps_the_environments_apart():
     assert ask(actor, [5], [1]) == [4]
     assert ask(actor, [6, 7], [0, 1]) == [1, 4]
     assert ask(actor, [8, 9], [0, 1]) == [8, 9]
+    # It has no temperature, whatever the flag says.
+    options = {"n_episodes": 1, "split": "train", "temperature": 0.6, "seed": 0}
+    result = evaluate_independent(DummyEnv(4), Planner(), PolicyProcessors(*identity_processors()), **options)
+    assert (result["temperature"], result["n"]) == (None, 4)
 
 
 def test_an_evaluation_clears_one_memory_for_all_whenever_a_task_begins():
