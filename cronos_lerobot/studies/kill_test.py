@@ -74,7 +74,8 @@ def train_config(folder: Path, steps: int) -> Any:
 
     from cronos_lerobot.agents.ppo.config import PPOConfig
     from cronos_lerobot.protocol.config import ProtocolConfig
-    from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
+    from cronos_lerobot.training.config import CronosTrainConfig
+    from cronos_lerobot.training.record_config import RecordConfig
 
     return CronosTrainConfig(
         env=CronosEnvConfig(observation_height=64, observation_width=64, render_size=(64, 96), num_threads=1),

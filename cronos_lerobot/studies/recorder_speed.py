@@ -169,7 +169,8 @@ def train(streams: str, filmed: int, steps: int) -> dict[str, float]:
 
     from cronos_lerobot.agents.ppo.config import PPOConfig
     from cronos_lerobot.scripts.train import train as run
-    from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
+    from cronos_lerobot.training.config import CronosTrainConfig
+    from cronos_lerobot.training.record_config import RecordConfig
 
     policy = make_policy_config(
         "pocketvla", device="cpu", push_to_hub=False, critic_observation="environment_state", freeze_encoder=True

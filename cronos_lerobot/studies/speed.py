@@ -139,7 +139,8 @@ def train_rate(
     from cronos_lerobot.agents.ppo.config import PPOConfig
     from cronos_lerobot.protocol.config import ProtocolConfig
     from cronos_lerobot.scripts.train import train
-    from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
+    from cronos_lerobot.training.config import CronosTrainConfig
+    from cronos_lerobot.training.record_config import RecordConfig
 
     env, options = CronosEnvConfig(scene=scene, obs_type="environment_state_agent_pos"), {}
     if training != "state":

@@ -31,8 +31,9 @@ from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.task_orders import TASK_ORDERS
 from cronos_lerobot.stopwatch import Stopwatch
-from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
+from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.factory import make_env
+from cronos_lerobot.training.record_config import RecordConfig
 from cronos_lerobot.training.sharding import ShardedEnv
 from cronos_lerobot.training.stopping import StopRequest
 from cronos_lerobot.training.trainer import Trainer

@@ -24,7 +24,8 @@ from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.loop_state import Step
 from cronos_lerobot.scripts import train as script
 from cronos_lerobot.studies.kill_test import KillTest
-from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
+from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.record_config import RecordConfig
 from cronos_lerobot.training.recording import FILM, FilmedEnv
 from cronos_lerobot.training.trainer import Trainer
 

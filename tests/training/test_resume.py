@@ -17,8 +17,9 @@ from test_trainer import STEPS_PER_UPDATE, assert_same_run, config, make_trainer
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.training import resume
-from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
+from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.logging import MetricsFile
+from cronos_lerobot.training.record_config import RecordConfig
 from cronos_lerobot.training.seeding import NamedGenerators
 
 DOCS = Path(__file__).parents[2] / "docs/training.md"

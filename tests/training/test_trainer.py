@@ -16,7 +16,8 @@ from safetensors.torch import load_file
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.training.checkpoint import list_checkpoints
-from cronos_lerobot.training.config import CronosTrainConfig, PeriodicEvaluationConfig, RecordConfig
+from cronos_lerobot.training.config import CronosTrainConfig, PeriodicEvaluationConfig
+from cronos_lerobot.training.record_config import RecordConfig
 from cronos_lerobot.training.stopping import StopRequest
 from cronos_lerobot.training.trainer import Trainer
 
