@@ -315,7 +315,7 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
 
     A run that was resumed with other flags of the protocol or the agent is of its own kind, as its label says.
 
-    Of several runs of one seed a group has the longest.
+    Of several runs of one seed from one policy a group has the longest.
     """
     groups: dict[str, Group] = {}
     flat = {}
@@ -324,7 +324,7 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
         key = json.dumps([config, run.changed], sort_keys=True) if config else str(run.folder)
         group = groups.setdefault(key, Group(run.name))
         # A longer run of the same seed begins with the shorter one: counted twice it would narrow the spread.
-        same = next((other for other in group.runs if run.seed is not None and other.seed == run.seed), None)
+        same = next((other for other in group.runs if _are_of_one_seed(run, other)), None)
         if same is None:
             group.runs.append(run)
         elif run.last["interaction_steps"] > same.last["interaction_steps"]:
@@ -344,6 +344,12 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
         if changed := group.runs[0].changed:
             group.label += f" (resumed with {_name_values(changed, list(changed))})"
     return list(groups.values())
+
+
+def _are_of_one_seed(run: TrainingRun, other: TrainingRun) -> bool:
+    """Whether one run may be the beginning of the other. From another machine's clone the same seed is another run."""
+    bases = {run.base, other.base}
+    return run.seed is not None and run.seed == other.seed and (len(bases) == 1 or None in bases)
 
 
 def _name_values(config: dict[str, str], names: list[str]) -> str:

@@ -367,6 +367,14 @@ def test_of_two_runs_of_one_seed_the_longer_counts(tmp_path):
     assert sorted(run.name for run in group.runs) == ["long", "other"]
     (row,) = seed_rows([group])
     assert row["seeds"] == 2
+    # From another machine's clone the same seed is another run, where both say what they began with.
+    for name, fingerprint, count in (("short", "a", 2), ("long", "b", 3), ("short", "b", 2)):
+        manifest = tmp_path / name / "manifest.json"
+        content = json.loads(manifest.read_text())
+        content["starts"][0]["policy_fingerprint"] = fingerprint
+        manifest.write_text(json.dumps(content))
+        (group,) = group_runs(find_runs([tmp_path]).training)
+        assert len(group.runs) == count
 
 
 def test_tasks_of_lerobot_eval_are_those_of_the_scene(tmp_path):
