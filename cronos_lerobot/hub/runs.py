@@ -13,7 +13,8 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETR
 from cronos_lerobot.hub.cards import command_line
 from cronos_lerobot.protocol.config import COUNTED_INTERVENTIONS
 from cronos_lerobot.protocol.interventions import Intervention
-from cronos_lerobot.report.runs import TrainingRun, config_of, describe_protocol, read_training_run
+from cronos_lerobot.report.protocol_names import describe_protocol
+from cronos_lerobot.report.runs import TrainingRun, config_of, read_training_run
 from cronos_lerobot.training.logging import MANIFEST, METRICS
 
 LEARNED = {

@@ -12,7 +12,8 @@ from synthetic_runs import INSTRUCTIONS, read_csv, write_evaluation, write_train
 
 from cronos_lerobot.report.comparisons import compare_training
 from cronos_lerobot.report.page import write_report
-from cronos_lerobot.report.runs import describe_protocol, find_runs, group_runs
+from cronos_lerobot.report.protocol_names import describe_protocol
+from cronos_lerobot.report.runs import find_runs, group_runs
 from cronos_lerobot.report.series import evaluation_curve, segment_history, segment_rates
 from cronos_lerobot.report.statistics import Rate
 from cronos_lerobot.report.tables import comparison_text, merge_statistics, reset_rows, seed_rows, speed_rows

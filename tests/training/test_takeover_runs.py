@@ -26,7 +26,8 @@ from cronos_lerobot.processes import Processes
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.experts import EXPERTS
 from cronos_lerobot.protocol.interventions import Intervention
-from cronos_lerobot.report.runs import Group, describe_protocol, read_training_run
+from cronos_lerobot.report.protocol_names import describe_protocol
+from cronos_lerobot.report.runs import Group, read_training_run
 from cronos_lerobot.report.tables import intervention_rows
 from cronos_lerobot.training.record_config import RecordConfig
 from cronos_lerobot.training.trainer import Trainer
