@@ -93,11 +93,12 @@ def test_pages_are_drawn_anew_by_the_commands_beside_the_archives():
     loop, rest = block.split("  done\n")
     papers, command = re.fullmatch(r"  for paper in (.*); do\n(.*)\n", loop, re.DOTALL).groups()
     lines = [command.replace("$paper", name) for name in papers.split()] + rest.replace("\\\n", " ").splitlines()
-    commands = [line.split() for line in lines if line.strip()]
+    commands = [line.split() for line in lines if line.split()[:1] == ["cronos-reproduce"]]
     results = Path(__file__).parents[2] / "docs/results"
     assert [command[1] for command in commands] == [
         "table1",
-        *(f"figure{number}" for number in (2, 3, 4, 5, 7, 8, 11, 12, 13, 14)),
+        *(f"figure{number}" for number in (2, 3, 4, 5, 7, 8, 11, 13, 14)),
+        "figure12",
         "table1",
         "table1",
         "few_resets",
