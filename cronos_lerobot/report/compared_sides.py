@@ -231,6 +231,13 @@ def paired_episodes(sides: Sequence[Sequence[Outcomes]], suite: str, split: str)
     return sorted(shared)
 
 
-def short_name(outcomes: Outcomes) -> str:
-    """A policy in short."""
-    return policy_name(outcomes.policy)
+def short_names(policies: Sequence[Outcomes]) -> list[str]:
+    """Policies in short; those of one name with the first folder in which they differ."""
+    names = [policy_name(one.policy) for one in policies]
+    paths = [Path(one.policy).parts for one in policies]
+    told = []
+    for i, (name, path) in enumerate(zip(names, paths, strict=True)):
+        others = [other for j, other in enumerate(paths) if names[j] == name and j != i]
+        differing = [part for part, *rest in zip(path, *others, strict=False) if {part} != {*rest}]
+        told.append(f"{name} ({differing[0]})" if others and differing else name)
+    return told

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cronos_lerobot.evaluation.outcomes import WORTH_SAYING, Outcomes
-from cronos_lerobot.report.compared_sides import Side, identity, paired_episodes, run_and_checkpoint, short_name
+from cronos_lerobot.report.compared_sides import Side, identity, paired_episodes, run_and_checkpoint, short_names
 from cronos_lerobot.report.paired import ALPHA, Difference, Pairs, compare_policies, compare_trainings, holm
 
 FORMAT = 1
@@ -132,8 +132,8 @@ def _suite(side_a: Side, side_b: Side, suite: str, split: str, power: float) -> 
     return PairedSuite(
         suite,
         split,
-        [short_name(o) for o in a],
-        [short_name(o) for o in b],
+        short_names(a),
+        short_names(b),
         sorted({episode.seed for episode in episodes}),
         len(everyone) - len(episodes),
         list(_differs(a, b)),

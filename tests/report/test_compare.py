@@ -139,6 +139,17 @@ def test_run_folders_have_their_last_evaluation(tmp_path, monkeypatch, capsys):
         compare(monkeypatch, a, tmp_path / "b")
 
 
+def test_runs_of_one_name_below_several_roots_are_told_apart(tmp_path, monkeypatch, capsys):
+    a = write_run(tmp_path / "a", 1, ["1000", "0000"])
+    runs = [
+        write_run(tmp_path / root / "t80/seed1/train", seed, ["1110", "0001"])
+        for seed, root in ((1, "x"), (2, "y"))
+    ]
+    (suite,) = compared(monkeypatch, capsys, a, "--with", *runs)["comparisons"]
+    assert suite["b"] == ["t80/seed1 0010240 (x)", "t80/seed1 0010240 (y)"]
+    assert suite["a"] == ["a 0010240"]
+
+
 def test_several_trainings_against_one_policy_speak_of_the_several(tmp_path, monkeypatch, capsys):
     write_run(tmp_path / "a", 1, ["10001000"])
     for seed, tasks in ((1, ["11101110"]), (2, ["11111111"]), (3, ["11110111"])):
