@@ -18,6 +18,7 @@ from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS, agent_
 from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 
 from cronos_lerobot.agents.processing import VECTOR_KEYS
+from cronos_lerobot.data.video import check_video_size
 
 SUCCESS = "next.success"
 TRUNCATED = "next.truncated"
@@ -162,8 +163,8 @@ def frame_format(feature: Mapping[str, Any]) -> tuple[tuple[int, ...], np.dtype]
 def _camera_feature(shape: tuple[int, ...], video: bool) -> dict[str, Any]:
     if len(shape) != 3 or shape[2] != 3:
         raise ValueError(f"pixels must have the shape (H, W, 3), got {shape}")
-    if video and (shape[0] % 2 or shape[1] % 2):
-        raise ValueError(f"pixels must have an even height and width to be encoded as yuv420p, got {shape}")
+    if video:
+        check_video_size("the pixels", shape[:2])
     return {
         "dtype": "video" if video else "image",
         "shape": tuple(shape),

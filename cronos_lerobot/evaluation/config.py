@@ -21,7 +21,13 @@ from lerobot_env_cronos.hub_config import is_of_this_package
 from cronos_lerobot.data.video import check_video_size
 from cronos_lerobot.evaluation.plan import Part, make_parts
 from cronos_lerobot.evaluation.policy_env import check_observations, observations_of, trained_scene
-from cronos_lerobot.evaluation.policy_source import PolicySource, files_fingerprint, find_policy, fingerprint
+from cronos_lerobot.evaluation.policy_source import (
+    PolicySource,
+    files_fingerprint,
+    find_policy,
+    fingerprint,
+    load_policy_config,
+)
 
 QUICK_CONFIGURATIONS, QUICK_ORDERINGS = 16, 3
 EXPERT = "scripted expert"
@@ -194,8 +200,7 @@ class CronosEvalConfig:
         if path:
             overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
             self.source = find_policy(path)
-            self.policy = PreTrainedConfig.from_pretrained(self.source.folder, cli_overrides=overrides)
-            self.policy.pretrained_path = self.source.folder
+            self.policy = load_policy_config(str(self.source.folder), overrides)
         if self.policy is None or not self.policy.pretrained_path:
             raise ValueError("choose a policy: --policy.path=<checkpoint or Hub id> (or --expert=true)")
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
+import sys
 from collections.abc import Iterator
+from contextlib import redirect_stderr
 from dataclasses import dataclass
 from pathlib import Path
 
 import draccus
 from huggingface_hub import HfApi, snapshot_download
+from huggingface_hub.constants import CONFIG_NAME
 from huggingface_hub.errors import HFValidationError
 from huggingface_hub.utils import validate_repo_id
 from lerobot.configs import PreTrainedConfig
@@ -54,6 +58,35 @@ def find_policy(name: str) -> PolicySource:
     return PolicySource(name, snapshot, snapshot.name)
 
 
+def load_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
+    """Return the config of the policy that `--policy.path` names.
+
+    Raises:
+        ValueError: there is no such folder or repository, or what it has is damaged.
+    """
+    folder = Path(path)
+    if folder.is_dir() and not (folder / CONFIG_NAME).is_file():
+        raise ValueError(f"--policy.path={path} has no {CONFIG_NAME}: give a checkpoint's pretrained_model.")
+    said = io.StringIO()
+    try:
+        # What argparse says of a flag that the policy does not have is its whole usage.
+        with redirect_stderr(said):
+            config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    except SystemExit as error:
+        why = said.getvalue().strip().rpartition("error: ")[2].replace("--", "--policy.")
+        raise ValueError(f"--policy.path={path}: {why}") from error
+    except (json.JSONDecodeError, draccus.ParsingError) as error:
+        # draccus keeps what a policy's config says of its values in the cause.
+        why = error.__cause__ or error
+        raise ValueError(f"{folder / CONFIG_NAME} is damaged, or --policy.* does not fit it: {why}") from error
+    except (OSError, ValueError) as error:
+        nowhere = f"no such folder, and no such policy on the Hub ({type(error).__name__})."
+        raise ValueError(f"--policy.path={path}: {error if folder.is_dir() else nowhere}") from error
+    sys.stderr.write(said.getvalue())
+    config.pretrained_path = folder
+    return config
+
+
 def fingerprint(policy: PreTrainedConfig) -> str:
     """A short hash of all that decides a policy's actions: its config, its weights and its processors.
 
@@ -88,7 +121,9 @@ def _weights_and_processors(folder: Path) -> Iterator[Path]:
         yield from sorted(folder.glob(pattern))
     if (adapters := folder / "adapter_config.json").is_file():
         base = Path(json.loads(adapters.read_text()).get("base_model_name_or_path") or "")
-        yield from sorted(base.glob("*.safetensors")) if base.parts and base.is_dir() else ()
+        # Without one it is Path("."), which no policy is.
+        if base.parts:
+            yield from sorted(base.glob("*.safetensors"))
 
 
 def _hash(file: Path) -> bytes:

@@ -261,22 +261,17 @@ def made_by(job: Job) -> dict[str, str]:
     """What decides a job's output besides its command.
 
     Versions of packages, the id of the environment, and hashes of what has no version: the modules that its flags
-    import, as a reset strategy of a user's, and a policy of the user's in a folder. One below the root is a job's
-    output, after which those that use it are made anew.
+    import, as a reset strategy of a user's, and a policy in a folder that is no other job's output.
     """
     hashes = {}
     for flag in job.command:
         name, _, value = flag.partition("=")
         if name.endswith(PLUGIN_FLAG) and (found := _source_hash(value)):
             hashes[f"{PLUGIN}{value}"] = found
-        elif name == "--policy.path" and Path(value).is_dir() and not _is_output(job, Path(value)):
+        elif name == "--policy.path" and Path(value).is_dir() and not job.needs:
             stamp = tuple(sorted((file.name, file.stat().st_mtime_ns) for file in Path(value).iterdir()))
             hashes[f"{POLICY}{value}"] = _policy_hash(value, stamp)
     return this_version() | {"environment": job.environment} | dict(sorted(hashes.items()))
-
-
-def _is_output(job: Job, folder: Path) -> bool:
-    return job.root is not None and folder.absolute().is_relative_to(job.root.absolute())
 
 
 @cache

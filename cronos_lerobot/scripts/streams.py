@@ -69,7 +69,8 @@ class SourceConfig:
         """Open it.
 
         Raises:
-            ValueError: no name is given, it has no recorded streams, or the module cannot be imported.
+            ValueError: no name is given, or it has no recorded streams.
+            ImportError: the module cannot be imported.
             FileNotFoundError: there is no dataset in `root`.
         """
         if self.repo_id is None:
@@ -77,12 +78,7 @@ class SourceConfig:
                 "choose a dataset: --dataset.repo_id=<user/name>, and --dataset.root=<folder> if local"
             )
         if self.discover_packages_path is not None:
-            try:
-                import_module(self.discover_packages_path)
-            except ImportError as error:
-                raise ValueError(
-                    f"--dataset.discover_packages_path={self.discover_packages_path} cannot be imported ({error})"
-                ) from error
+            import_module(self.discover_packages_path)
         if self.root is not None and not (self.root / "meta/info.json").is_file():
             raise FileNotFoundError(f"no LeRobotDataset in {self.root}")
         return StreamDataset(self.repo_id, self.root, self.revision, streaming=streaming)
@@ -219,7 +215,7 @@ def main() -> None:
     """Entry point of `cronos-streams`."""
     # Streams may be of a scene that one of them brings.
     register_third_party_plugins()
-    run_subcommand(__doc__ or "", COMMANDS)
+    run_subcommand(__doc__ or "", COMMANDS, (ValueError, OSError, ImportError))
 
 
 if __name__ == "__main__":

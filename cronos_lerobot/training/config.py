@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import datetime as dt
-import io
 import json
 import sys
-from contextlib import redirect_stderr
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import draccus
-from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
@@ -26,6 +23,7 @@ from lerobot_env_cronos.hub_config import is_of_this_package
 from cronos_lerobot.agents import builtin  # noqa: F401  (registers the agents)
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.registry import check_agent, check_settings_are_read
+from cronos_lerobot.evaluation.policy_source import load_policy_config
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.experts import check_expert
 from cronos_lerobot.protocol.resets import check_extra_resets
@@ -267,35 +265,6 @@ class CronosTrainConfig:
     # What lerobot's WandBLogger asks of a training config.
     is_reward_model_training = False
     dataset = None
-
-
-def load_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
-    """Return the config of the policy that `--policy.path` names.
-
-    Raises:
-        ValueError: there is no such folder or repository, or what it has is damaged.
-    """
-    folder = Path(path)
-    if folder.is_dir() and not (folder / CONFIG_NAME).is_file():
-        raise ValueError(f"--policy.path={path} has no {CONFIG_NAME}: give a checkpoint's pretrained_model.")
-    said = io.StringIO()
-    try:
-        # What argparse says of a flag that the policy does not have is its whole usage.
-        with redirect_stderr(said):
-            config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
-    except SystemExit as error:
-        why = said.getvalue().strip().rpartition("error: ")[2].replace("--", "--policy.")
-        raise ValueError(f"--policy.path={path}: {why}") from error
-    except (json.JSONDecodeError, draccus.ParsingError) as error:
-        # draccus keeps what a policy's config says of its values in the cause.
-        why = error.__cause__ or error
-        raise ValueError(f"{folder / CONFIG_NAME} is damaged, or --policy.* does not fit it: {why}") from error
-    except (OSError, ValueError) as error:
-        nowhere = f"no such folder, and no such policy on the Hub ({type(error).__name__})."
-        raise ValueError(f"--policy.path={path}: {error if folder.is_dir() else nowhere}") from error
-    sys.stderr.write(said.getvalue())
-    config.pretrained_path = folder
-    return config
 
 
 def _checkpoint_of(config_path: str | Path) -> Path:

@@ -334,7 +334,7 @@ def test_the_command_records_resumes_and_overwrites(tmp_path, caplog, monkeypatc
         scene = get_scene("kitchen_2x2")
         scene = replace(scene, receptacles=scene.receptacles[:1])
         patched.setattr("cronos_lerobot.scripts.record_demos.get_scene", lambda name: scene)
-        for config, message in ((odd, "even height and width"), (small, "nothing can be done before")):
+        for config, message in ((odd, "height and width must be even"), (small, "nothing can be done before")):
             with pytest.raises(ValueError, match=message):
                 record_demos(config)
     assert LeRobotDataset("me/demos", root=root).num_episodes == 3

@@ -275,6 +275,8 @@ def test_no_stream_gets_its_task_where_one_is_unknown():
     other = next(task for task in env.scene.tasks if task != before[0])
     with pytest.raises(ValueError, match=r"a Task, not its instruction, is needed; valid tasks: .*Task"):
         env.set_task([0, 1], [other, other.instruction])
+    with pytest.raises(ValueError, match="shorter"):
+        env.set_task([0, 1], [other])
     assert env.tasks == before
 
 

@@ -379,6 +379,7 @@ def test_a_policy_is_known_by_its_files_and_not_by_its_folder(pocketvla, tmp_pat
     [
         ("--env.obs_type=pixels_agent_pos", "environment_state.*--env.obs_type=environment_state_agent_pos"),
         ("--env.scene=kitchen_3x3", "of 48 numbers, kitchen_3x3 gives 72.*--env.scene=kitchen_2x2"),
+        ("--policy.foo=1", "^error: --policy.path=.*: unrecognized arguments: --policy.foo=1$"),
         (
             "--env.render_size=[241,320]",
             "render_size are 241 and 320: a video's height and width must be even",

@@ -288,12 +288,10 @@ def test_runs_of_a_policy_that_was_made_anew_in_its_folder_are_not_taken_for_tod
     # A report elsewhere does without it.
     shutil.rmtree(policy)
     assert is_done(job)
-    # What is below the root is another job's output, which has a note of its own.
-    inside = root / "base"
-    inside.mkdir()
-    assert not [
-        name for name in made_by(replace(job, command=(f"--policy.path={inside}",))) if str(inside) in name
-    ]
+    # Another job's output has a note of its own.
+    policy.mkdir()
+    assert f"the policy {policy}" in made_by(job)
+    assert f"the policy {policy}" not in made_by(replace(job, needs=("clone",)))
 
 
 def test_another_commit_alone_is_only_noted(tmp_path, monkeypatch):

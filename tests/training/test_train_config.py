@@ -7,8 +7,9 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot_env_cronos import CronosEnvConfig
 
 from cronos_lerobot.agents.ppo.config import PaperPPOConfig, PPOConfig
+from cronos_lerobot.evaluation.policy_source import load_policy_config
 from cronos_lerobot.scripts import train as script
-from cronos_lerobot.training.config import CronosTrainConfig, load_policy_config
+from cronos_lerobot.training.config import CronosTrainConfig
 
 
 def parse(*arguments):

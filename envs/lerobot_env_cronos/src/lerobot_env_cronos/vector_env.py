@@ -241,14 +241,16 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         """Give streams `ids` their tasks; the reward's level starts from the state as it is.
 
         Raises:
-            ValueError: one is none of `scene.tasks` and `scene.reset_tasks`; all streams keep theirs.
+            ValueError: one is none of `scene.tasks` and `scene.reset_tasks`, or there are not as many as streams;
+                all streams keep theirs.
         """
         valid = self.scene.tasks + self.scene.reset_tasks
         ids = np.asarray(ids)
+        given = list(zip(ids, tasks, strict=True))
         if unknown := [task for task in tasks if task not in valid]:
             by_name = "a Task, not its instruction, is needed; " if isinstance(unknown[0], str) else ""
             raise ValueError(f"unknown task {unknown[0]!r}: {by_name}valid tasks: {list(valid)}")
-        for i, task in zip(ids, tasks, strict=True):
+        for i, task in given:
             self.tasks[i] = task
         self._judge(ids)
 

@@ -1,0 +1,77 @@
+"""Which runs are seeds of one experiment, and which of two of one seed counts."""
+
+import json
+
+from synthetic_runs import write_training_run
+
+from cronos_lerobot.report.runs import find_runs, group_runs
+from cronos_lerobot.report.tables import seed_rows
+
+
+def test_seeds_of_one_protocol_are_called_by_it_and_a_run_by_its_name(tmp_path):
+    for seed in (0, 1):
+        write_training_run(tmp_path / f"mine_{seed}", seed=seed, interval=160)
+    assert [group.label for group in group_runs(find_runs([tmp_path]).training)] == ["T = 160"]
+    assert [group.label for group in group_runs(find_runs([tmp_path / "mine_1"]).training)] == ["mine_1"]
+
+
+def test_resumed_run_stays_in_its_group(tmp_path):
+    for name in "ab":
+        manifest = write_training_run(tmp_path / name, seed=ord(name)) / "manifest.json"
+        content = json.loads(manifest.read_text())
+        (first,) = content["starts"]
+        first["config"]["policy"] = {"pretrained_path": "base"}
+        resumed = json.loads(json.dumps(first))
+        resumed["config"]["policy"]["pretrained_path"] = "a/checkpoints/last"
+        content["starts"] += [resumed] if name == "b" else []
+        manifest.write_text(json.dumps(content))
+    assert len(group_runs(find_runs([tmp_path]).training)) == 1
+
+
+def test_a_resume_that_was_undone_leaves_nothing(tmp_path):
+    """Of a run that went on with another T, and then once more from an earlier checkpoint with its own."""
+    for name in "ab":
+        manifest = write_training_run(tmp_path / name, seed=ord(name), interval=320) / "manifest.json"
+        content = json.loads(manifest.read_text())
+        starts = [json.loads(json.dumps(content["starts"][0])) for _ in range(3)]
+        for start, steps, interval in zip(starts, (0, 5120, 2560), (320, 1280, 320), strict=True):
+            start["interaction_steps"] = steps
+            start["config"]["protocol"]["scene_reset_interval"] = interval
+        content["starts"] = starts[:1] if name == "a" else starts
+        manifest.write_text(json.dumps(content))
+    runs = find_runs([tmp_path]).training
+    assert [(run.changed, [start["interaction_steps"] for start in run.starts]) for run in runs] == [
+        ({}, [0]), ({}, [0, 2560])
+    ]  # fmt: skip
+    assert len(group_runs(runs)) == 1
+
+
+def test_seeds_below_other_roots_are_of_one_experiment(tmp_path):
+    """As `cronos-reproduce` has it: a root may be moved. Another base policy is another experiment, and the demo's
+    in two folders may be two."""
+    clones = ("a/base/x/clone/last", "/home/me/base/x/clone/last", "a/base/y/clone/last")
+    for seed, path in enumerate((*clones, "a/base/last", "b/base/last")):
+        manifest = write_training_run(tmp_path / str(seed), seed=seed) / "manifest.json"
+        content = json.loads(manifest.read_text())
+        content["starts"][0]["config"]["policy"] = {"pretrained_path": path}
+        manifest.write_text(json.dumps(content))
+    groups = group_runs(find_runs([tmp_path]).training)
+    assert sorted(sorted(run.seed for run in group.runs) for group in groups) == [[0, 1], [2], [3], [4]]
+
+
+def test_of_two_runs_of_one_seed_the_longer_counts(tmp_path):
+    write_training_run(tmp_path / "short", seed=1, successes=(2, 3, 4), updates=4)
+    write_training_run(tmp_path / "long", seed=1, successes=(2, 4, 6))
+    write_training_run(tmp_path / "other", seed=2, successes=(2, 4, 4))
+    (group,) = group_runs(find_runs([tmp_path]).training)
+    assert sorted(run.name for run in group.runs) == ["long", "other"]
+    (row,) = seed_rows([group])
+    assert row["seeds"] == 2
+    # From another machine's clone the same seed is another run, where both say what they began with.
+    for name, fingerprint, count in (("short", "a", 2), ("long", "b", 3), ("short", "b", 2)):
+        manifest = tmp_path / name / "manifest.json"
+        content = json.loads(manifest.read_text())
+        content["starts"][0]["policy_fingerprint"] = fingerprint
+        manifest.write_text(json.dumps(content))
+        (group,) = group_runs(find_runs([tmp_path]).training)
+        assert len(group.runs) == count
