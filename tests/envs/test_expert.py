@@ -27,6 +27,11 @@ def env() -> CronosVectorEnv:
     return CronosVectorEnv(N, SCENE, obs_type="environment_state_agent_pos")
 
 
+@pytest.fixture(scope="module")
+def every_configuration() -> CronosVectorEnv:
+    return CronosVectorEnv(NUM_CONFIGURATIONS, SCENE, obs_type="environment_state_agent_pos")
+
+
 def start(env: CronosVectorEnv, split: str = "train") -> ScriptedExpert:
     """Every stream at its own configuration, tasks in turn."""
     env.scene_reset(EVERYONE, EVERYONE, split)
@@ -45,8 +50,8 @@ def roll(env: CronosVectorEnv, expert: ScriptedExpert, steps: int) -> np.ndarray
 
 
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task.instruction)
-def test_expert_succeeds_from_held_out_configurations(env, task):
-    assert measure_independent(SCENE, "held_out", task, env).mean() >= 0.95
+def test_expert_succeeds_from_held_out_configurations(every_configuration, task):
+    assert measure_independent(SCENE, "held_out", task, every_configuration).mean() >= 0.95
 
 
 def test_expert_keeps_succeeding_without_scene_resets():
@@ -132,11 +137,12 @@ def test_what_is_complete_stays_complete(env):
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_doing_nothing_completes_nothing_and_moves_nothing(env, split):
-    env.scene_reset(EVERYONE, EVERYONE, split)
+def test_doing_nothing_completes_nothing_and_moves_nothing(every_configuration, split):
+    env, everyone = every_configuration, np.arange(NUM_CONFIGURATIONS)
+    env.scene_reset(everyone, everyone, split)
     before = env.simulation.body_poses()[..., :3].copy()
     for _ in range(80):
-        env.step(np.tile(STILL, (N, 1)))
+        env.step(np.tile(STILL, (NUM_CONFIGURATIONS, 1)))
         for task in TASKS:
             assert not env.simulation.is_on(task.object, task.receptacle).any()
     assert np.abs(env.simulation.body_poses()[..., :3] - before).max() < 0.001
@@ -154,7 +160,7 @@ def test_grasped_objects_do_not_slip_at_full_speed(env, obj):
         # Streams that hold the object at carrying height wait for the others.
         lifted |= sim.is_grasped(obj) & (sim.body_pose(obj)[:, 2] > 0.05)
         env.step(np.where(lifted[:, None], STILL * [0, 0, 0, 0, 0, 0, 0], expert.act()))
-    assert lifted.mean() > 0.96
+    assert lifted.mean() > 0.97
 
     def in_hand() -> np.ndarray:
         p, R = sim.end_effector()
@@ -167,7 +173,7 @@ def test_grasped_objects_do_not_slip_at_full_speed(env, obj):
         action[:, 1] = towards_centre if (step // 5) % 2 == 0 else -towards_centre
         env.step(action)
     slip = np.linalg.norm(in_hand() - start_pose, axis=1)
-    assert (slip[lifted] < 0.005).mean() >= 0.96
+    assert (slip[lifted] < 0.005).mean() >= 0.97
 
 
 @pytest.mark.parametrize(("body", "limit"), [("yellow plate", 0.003), ("cloth", 0.003), ("ketchup bottle", 0.01)])
