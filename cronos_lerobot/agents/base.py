@@ -123,13 +123,22 @@ def decision_steps(policy: Any, task_switch_interval: int | None = None) -> int:
     """
     n = int(getattr(policy, "decision_steps", 1))
     if task_switch_interval is not None and task_switch_interval % n:
-        fitting = [m for m in range(1, task_switch_interval + 1) if task_switch_interval % m == 0 and m <= 2 * n]
+        longest = min(_longest_decision(policy, n), task_switch_interval)
+        fitting = [m for m in range(1, longest + 1) if task_switch_interval % m == 0]
         raise ValueError(
             f"the policy plays {n} actions at once, which does not divide --protocol.task_switch_interval="
             f"{task_switch_interval}: it would act on the old task's decision after a switch. Choose --policy."
             f"n_action_steps from {fitting}, or another interval."
         )
     return n
+
+
+def _longest_decision(policy: Any, n: int) -> int:
+    """Actions that `--policy.n_action_steps` may have a policy play at once; `n` where that is not known."""
+    config = getattr(policy, "config", None)
+    if horizon := getattr(config, "horizon", None):
+        return horizon - getattr(config, "n_obs_steps", 1) + 1
+    return getattr(config, "chunk_size", n)
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,9 @@ class AgentConfig(RLAlgorithmConfig):
         refuses them."""
         return {}
 
+    def check_start(self) -> None:
+        """Raise a ValueError, if a run cannot begin so; one that is resumed goes on from what it has become."""
+
     @classmethod
     def from_policy_config(cls, policy_cfg: Any) -> Self:
         """Return the defaults: what depends on the policy is asked of it when the agent is made."""
@@ -107,14 +110,18 @@ def check_agent(name: str) -> None:
         )
 
 
-def check_settings_are_read(config: RLAlgorithmConfig, given: Iterable[str]) -> None:
-    """Raise a ValueError, if a setting of the command line has no effect beside the others.
+def check_settings(config: RLAlgorithmConfig, given: Iterable[str], *, resume: bool) -> None:
+    """Raise a ValueError, if a setting of the command line has no effect beside the others, or no run begins so.
 
     Args:
         config: of the agent; an `unread` of its own names such settings, with what each needs.
         given: names of the command line's settings, `name` or `group.name`. Defaults and null may be given
             everywhere.
+        resume: whether the run goes on from a checkpoint.
     """
+    check_start = getattr(config, "check_start", None)
+    if check_start is not None and not resume:
+        check_start()
     unread = getattr(config, "unread", {})
     for name in sorted(unread.keys() & set(given)):
         value, default = map(attrgetter(name), (config, type(config)()))

@@ -1,6 +1,8 @@
 """Mp4 files that hold many episodes back to back: encoded from memory, copied from other files, and read."""
 
-from collections.abc import Iterator, Sequence
+import os
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -25,6 +27,39 @@ def check_video_size(flag: str, size: Sequence[int]) -> None:
     height, width = size
     if height % 2 or width % 2:
         raise ValueError(f"{flag} are {height} and {width}: a video's height and width must be even")
+
+
+@contextmanager
+def ordinary_priority() -> Generator[None]:
+    """Take back the real-time priority that SVT-AV1, LeRobot's default, gives the threads of a process of root.
+
+    As it opens, it makes its own threads and the one that called it SCHED_FIFO at 99: nothing else on the cores
+    of those, and of all threads that they begin later, would run beside them.
+    """
+    if not hasattr(os, "sched_setscheduler") or not os.path.isdir("/proc/self/task"):
+        yield
+        return
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    is_real_time = _real_time_threads()
+    try:
+        yield
+    finally:
+        for thread in _real_time_threads() - is_real_time:
+            try:
+                os.sched_setscheduler(thread, *before)
+            except ProcessLookupError:  # it has ended
+                continue
+
+
+def _real_time_threads() -> set[int]:
+    threads = set()
+    for thread in map(int, os.listdir("/proc/self/task")):
+        try:
+            if os.sched_getscheduler(thread) & ~os.SCHED_RESET_ON_FORK in (os.SCHED_FIFO, os.SCHED_RR):
+                threads.add(thread)
+        except ProcessLookupError:
+            continue
+    return threads
 
 
 class VideoFile:
@@ -81,7 +116,12 @@ class VideoFile:
         self.close()
 
     def _mux(self, frame: av.VideoFrame | None) -> None:
-        for packet in self._stream.encode(frame):
+        if self._stream.codec_context.is_open:
+            packets = self._stream.encode(frame)
+        else:
+            with ordinary_priority():
+                packets = self._stream.encode(frame)
+        for packet in packets:
             packet.duration = 1  # in the stream's time base; without it a file's last frame lasts 0 s
             self._container.mux(packet)
 

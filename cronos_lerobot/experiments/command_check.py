@@ -12,7 +12,7 @@ from draccus.utils import DecodingError, ParsingError, deflatten
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from cronos_lerobot.agents.registry import check_agent, check_settings_are_read
+from cronos_lerobot.agents.registry import check_agent, check_settings
 from cronos_lerobot.experiments.flags import read_flags
 from cronos_lerobot.experiments.jobs import Job
 from cronos_lerobot.training.config import CronosTrainConfig
@@ -74,7 +74,7 @@ def _check(given: dict[str, str], policy_type: str | None) -> None:
     }
     config = draccus.decode(CronosTrainConfig, deflatten(values, sep="."))
     settings = [name.removeprefix("algorithm.") for name in given if name.startswith("algorithm.")]
-    check_settings_are_read(config.algorithm, settings)
+    check_settings(config.algorithm, settings, resume=False)
 
 
 def _reason(error: Exception) -> str:

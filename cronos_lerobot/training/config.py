@@ -22,7 +22,7 @@ from lerobot_env_cronos.hub_config import is_of_this_package
 
 from cronos_lerobot.agents import builtin  # noqa: F401  (registers the agents)
 from cronos_lerobot.agents.ppo.config import PPOConfig
-from cronos_lerobot.agents.registry import check_agent, check_settings_are_read
+from cronos_lerobot.agents.registry import check_agent, check_settings
 from cronos_lerobot.evaluation.policy_source import load_policy_config
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.experts import check_expert
@@ -172,7 +172,7 @@ class CronosTrainConfig:
             self._check_env(self.env)
         check_agent(self.algorithm.type)
         given = (flag.removeprefix("--").split("=")[0] for flag in parser.get_cli_overrides("algorithm") or [])
-        check_settings_are_read(self.algorithm, given)
+        check_settings(self.algorithm, given, resume=self.resume)
         self._pin_benchmark(self.env)
         if not self.resume and (path := parser.get_path_arg("policy")):
             overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])

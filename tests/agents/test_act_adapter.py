@@ -40,6 +40,24 @@ def adapter():
     return make_trainable(make_act(), AdapterOptions(noise_std=0.2))
 
 
+@pytest.mark.parametrize("std", [0.005, 5.0])
+def test_noise_beyond_what_is_learned_is_refused(std):
+    message = rf"noise_std must be 0\.0067 to 2\.7183 for --policy\.type=act, .* got {std}"
+    with pytest.raises(ValueError, match=message):
+        make_trainable(make_act(), AdapterOptions(noise_std=std))
+
+
+def test_noise_that_was_driven_beyond_its_range_comes_back(adapter):
+    with torch.no_grad():
+        adapter.log_std.copy_(torch.full_like(adapter.log_std, -7.0))
+    trace = adapter.sample_actions(make_batch())["trace"]
+    optimizer = torch.optim.SGD([adapter.log_std], lr=1e-3)
+    # Far from what the policy would do: the noise should have been larger.
+    (-adapter.evaluate_actions(make_batch(), trace + 1)["log_prob"].mean()).backward()
+    optimizer.step()
+    assert (adapter._std > 1.01 * math.exp(-5)).all()
+
+
 def test_without_noise_it_acts_as_lerobots_select_action(adapter):
     assert isinstance(adapter, ACTAdapter)
     assert adapter.decision_steps == STEPS

@@ -50,9 +50,9 @@ def test_every_agent_of_this_package_has_a_config():
 def test_settings_that_nothing_reads_are_refused_where_they_are_given(config, needs):
     for name, needed in needs.items():
         with pytest.raises(ValueError, match=rf"--algorithm\.{name}=.* has no effect here: it needs .*{needed}"):
-            registry.check_settings_are_read(config, ["beta1", name])
+            registry.check_settings(config, ["beta1", name], resume=True)
     # A run that is resumed may have them of another setting that it had.
-    registry.check_settings_are_read(config, [name for name in vars(config) if name not in needs])
+    registry.check_settings(config, [name for name in vars(config) if name not in needs], resume=True)
 
 
 @pytest.mark.parametrize(
@@ -71,11 +71,11 @@ def test_settings_that_nothing_reads_are_refused_where_they_are_given(config, ne
     ],
 )
 def test_settings_that_are_read_may_be_given_and_defaults_everywhere(config, given):
-    registry.check_settings_are_read(config, given)
+    registry.check_settings(config, given, resume=False)
 
 
 def test_every_setting_that_may_be_unread_is_one():
     for config in (PPOConfig(value_loss="mse", lr_schedule="fixed", kl_stop_factor=None, target_kl=None),
                    ImitationConfig()):  # fmt: skip
         assert config.unread
-        registry.check_settings_are_read(config, config.unread)
+        registry.check_settings(config, config.unread, resume=False)

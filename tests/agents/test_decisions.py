@@ -1,5 +1,7 @@
 """Decisions of several actions: what is played, what is summed, and what follows them, by hand. gamma = 0.5."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -133,6 +135,13 @@ def test_chunks_that_do_not_divide_the_interval_are_refused():
     assert decision_steps(Chunks(), 80) == 4
     with pytest.raises(ValueError, match=r"4 actions at once.*task_switch_interval=82.*\[1, 2\]"):
         decision_steps(Chunks(), 82)
+    # No more are named than the policy decides on: a chunk, or what is left of a horizon after its past.
+    for config, fitting in (
+        (SimpleNamespace(chunk_size=9), r"\[1, 2, 4, 5, 8\]"),
+        (SimpleNamespace(horizon=6, n_obs_steps=2), r"\[1, 2, 4, 5\]"),
+    ):
+        with pytest.raises(ValueError, match=rf"6 actions at once.*n_action_steps from {fitting}"):
+            decision_steps(SimpleNamespace(decision_steps=6, config=config), 80)
     agent, policy = make_agent()
     policy.decision_steps = agent.num_steps = 5
     with pytest.raises(ValueError, match="decided on 4 actions; its decision_steps says 5"):

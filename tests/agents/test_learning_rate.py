@@ -112,3 +112,14 @@ def test_a_loaded_lr_lies_between_the_ends_that_are_given_now(became, schedule, 
     set_optimizer(ppo.optimizer, now, {"policy_lr": 5e-5, "value_lr": 1e-3})
     assert ppo.policy_lr == expected
     assert [group["lr"] for group in ppo.optimizer.param_groups if group["name"] == "value"] == [1e-3]
+
+
+def test_a_loaded_lr_may_be_held_beyond_the_one_that_the_run_began_with():
+    ppo = make_ppo()
+    ppo.policy_lr, saved = 3e-4, {"policy_lr": 5e-5, "value_lr": 1e-3}
+    set_optimizer(ppo.optimizer, PPOConfig(policy_lr_min=1e-4), saved)
+    assert ppo.policy_lr == 3e-4
+    set_optimizer(ppo.optimizer, PPOConfig(policy_lr_max=4e-5), saved)
+    assert ppo.policy_lr == 4e-5
+    with pytest.raises(ValueError, match=r"policy_lr must be .* to policy_lr_max=0\.001, got 0\.01"):
+        set_optimizer(ppo.optimizer, PPOConfig(policy_lr=0.01), saved)

@@ -10,6 +10,7 @@ from ppo_samples import flat, make_ppo, reward_for_up, rollout
 from cronos_lerobot.agents.ppo.config import RANGES, PaperPPOConfig, PPOConfig
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.processing import PolicyProcessors
+from cronos_lerobot.agents.registry import check_settings
 
 
 def test_ratio_is_one_before_the_first_step():
@@ -134,11 +135,6 @@ def test_a_critic_that_is_frozen_is_told_and_not_trained_without():
         ({"value_loss": "l1"}, "huber"),
         ({"target_kl": None}, "needs algorithm.target_kl"),
         ({"policy_lr_min": 1e-2}, "at most policy_lr_max=0.001, got 0.01"),
-        (
-            {"policy_lr": 2e-3},
-            r"policy_lr must be policy_lr_min=1e-06 to policy_lr_max=0.001, got 0.002; or .*lr_schedule=fixed",
-        ),
-        ({"policy_lr": 1e-7, "lr_schedule": "kl_step"}, "policy_lr must be policy_lr_min=1e-06 .* got 1e-07"),
         ({"temperature": 0.0}, "temperature must be > 0, got 0.0"),
         ({"policy_lr": -1.0}, "policy_lr must be >= 0, got -1.0"),
         ({"value_lr": math.nan}, "value_lr must be >= 0, got nan"),
@@ -157,6 +153,23 @@ def test_a_critic_that_is_frozen_is_told_and_not_trained_without():
 def test_bad_settings_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         PPOConfig(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"policy_lr": 2e-3},
+            r"policy_lr must be policy_lr_min=1e-06 to policy_lr_max=0.001, got 0.002; or .*lr_schedule=fixed",
+        ),
+        ({"policy_lr": 1e-7, "lr_schedule": "kl_step"}, "policy_lr must be policy_lr_min=1e-06 .* got 1e-07"),
+    ],
+)
+def test_no_run_begins_with_a_rate_beyond_its_ends(options, message):
+    with pytest.raises(ValueError, match=message):
+        check_settings(PPOConfig(**options), [], resume=False)
+    # A run that goes on has come to another one.
+    check_settings(PPOConfig(**options), [], resume=True)
 
 
 def test_every_number_has_a_range_that_its_defaults_keep():

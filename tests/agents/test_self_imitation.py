@@ -21,6 +21,7 @@ from cronos_lerobot.agents.ppo.config import PPOConfig, SelfImitationConfig
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.self_imitation import SelfImitation
 from cronos_lerobot.agents.processing import PolicyProcessors
+from cronos_lerobot.processes import Processes
 
 COEF = 0.25
 
@@ -81,6 +82,28 @@ def test_a_weighted_gradient_is_added_to_the_policys_and_to_no_other():
     assert policy.critic.weight.grad is None
     expected = flat(param.grad for param in twin.actor.parameters()).norm().item()
     assert metrics == pytest.approx({"clone_loss": loss.item(), "clone_grad_norm": expected}, rel=1e-5)
+
+
+class BesideOneWithNothing(Processes):
+    """The first of two processes, the second of which has no success."""
+
+    count = 2
+
+    def concatenate(self, array, axis=0):
+        return np.concatenate([array, np.zeros_like(array)], axis)
+
+
+def test_the_weight_is_that_of_the_processes_with_something_to_clone():
+    policy = CloneablePolicy()
+    cloning = make_cloning(policy, [segment(TASKS[0].instruction, 6)])
+    cloning._processes = BesideOneWithNothing()
+    cloning.begin_update(3)
+    cloning.add_gradients([*policy.actor.parameters()])
+    twin = copy.deepcopy(policy)
+    twin.zero_grad()
+    twin.forward(policy.seen[0])[0].backward()
+    # The mean over both processes, of which the other adds nothing, is COEF times the gradient.
+    torch.testing.assert_close(policy.actor.weight.grad / 2, COEF * twin.actor.weight.grad)
 
 
 def test_tasks_are_drawn_equally_often_and_their_frames_alike():

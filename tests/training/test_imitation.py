@@ -230,6 +230,36 @@ def test_two_processes_learn_together_and_resume(tmp_path):
     assert_same_run(tmp_path / "unbroken", tmp_path / "broken")
 
 
+def update_once(processes, cfg, segments):
+    """An update of which the first process has all that is remembered."""
+    mine = processes.share_of(cfg.num_envs)
+    set_seed(cfg.seed)
+    env = DummyEnv(mine.stop - mine.start)
+    agent = Trainer(cfg, env, DummyEnv, ClonedPolicy(), *identity_processors(), processes).agent
+    if processes.is_main:
+        agent.memory.load_state_dict(segments)
+    torch.manual_seed(0)
+    return agent.update(), agent.policy.actor.weight.tolist()
+
+
+def test_a_process_without_a_success_takes_the_steps_of_the_others(tmp_path):
+    cfg = settings(tmp_path / "run")
+    segments = train(cfg).agent.memory.state_dict()
+    cfg.output_dir = tmp_path / "other"
+    alone, both = update_once(Processes(), cfg, segments), together(update_once, cfg, segments)
+    assert alone[0]["optimizer_steps"] == 5
+    for metrics, actor in both:
+        # The loss and the gradient are of the one that has a batch, and not half of it.
+        assert metrics == pytest.approx(alone[0], rel=1e-5)
+        np.testing.assert_allclose(actor, alone[1], rtol=1e-4, atol=1e-6)
+
+
+def test_weights_too_coarse_for_its_steps_are_refused(tmp_path):
+    policy = ClonedPolicy().bfloat16()
+    with pytest.raises(ValueError, match=r"torch\.bfloat16 cannot hold .* --policy\.dtype=float32"):
+        Trainer(settings(tmp_path), DummyEnv(4), DummyEnv, policy, *identity_processors(), Processes())
+
+
 def test_a_policy_without_optimizer_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"--policy\.type=dummy_linear has no optimizer preset"):
         Trainer(settings(tmp_path), DummyEnv(4), DummyEnv, DummyPolicy(), *identity_processors())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -17,6 +18,7 @@ from cronos_lerobot.agents.weights import unwrapped
 FEATURES = "features"
 """What the critic reads, in a batch that `value_inputs` made."""
 LOG_STD_RANGE = (-5.0, 1.0)
+"""Of the deviation's logarithm [nats]; where a step of the optimizer leads beyond, it ends there."""
 
 
 @register_adapter("act")
@@ -31,7 +33,7 @@ class ACTAdapter(Adapter):
         options: of the noise.
 
     Raises:
-        ValueError: the policy ensembles its chunks over time.
+        ValueError: the policy ensembles its chunks over time, or the noise is beyond what is learned.
     """
 
     options_read = frozenset({"noise_std"})
@@ -43,6 +45,12 @@ class ACTAdapter(Adapter):
             raise ValueError(
                 f"--policy.temporal_ensemble_coeff={config.temporal_ensemble_coeff} mixes an action from many "
                 "chunks, whose likelihood is not known: train with --policy.temporal_ensemble_coeff=null."
+            )
+        low, high = (round(math.exp(end), 4) for end in LOG_STD_RANGE)
+        if not low <= options.noise_std <= high:
+            raise ValueError(
+                f"--algorithm.noise_std must be {low} to {high} for --policy.type=act, which learns it between "
+                f"them, got {options.noise_std}."
             )
         self.decision_steps = config.n_action_steps
         self._vectors = [name for name in (OBS_STATE, OBS_ENV_STATE) if name in config.input_features]
@@ -96,7 +104,10 @@ class ACTAdapter(Adapter):
 
     @property
     def _std(self) -> Tensor:
-        return self.log_std.clamp(*LOG_STD_RANGE).exp()
+        # Not the clamped value alone: that has no gradient to come back with.
+        with torch.no_grad():
+            self.log_std.clamp_(*LOG_STD_RANGE)
+        return self.log_std.exp()
 
     def _forward(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """The first actions of ACT's chunk (B, n, A), and what the critic reads (B, F), without gradient."""

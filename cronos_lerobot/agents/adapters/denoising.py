@@ -29,6 +29,9 @@ class DenoisingAdapter(Adapter):
         num_steps: S, as the policy's own denoising has.
         first: step of the chunk that is played first; n_action_steps are.
         feature_width: F, of what the critic reads; None if the subclass has values of its own.
+
+    Raises:
+        ValueError: the policy is to play more actions than a chunk has.
     """
 
     has_entropy = False
@@ -41,6 +44,11 @@ class DenoisingAdapter(Adapter):
         self.decision_steps = policy.config.n_action_steps
         self.num_steps, self.shape = num_steps, shape
         played = slice(first, first + self.decision_steps)
+        if played.stop > shape[0]:
+            raise ValueError(
+                f"--policy.n_action_steps={self.decision_steps} is more than the {shape[0] - first} actions that"
+                f" --policy.type={policy.config.type} decides on at once; take at most as many."
+            )
         self.scored = Scored(played, policy.config.action_feature.shape[0])
         if feature_width is not None:
             self.critic = Critic(feature_width).to(next(policy.parameters()).device)

@@ -118,18 +118,19 @@ class ImitationAgent(LearningAgent):
         metrics |= self._weigh()
         # Failed segments that are remembered may push successes out again.
         self._is_warm |= bool(found[:, 0].sum() >= self.config.warmup_segments)
-        # All processes take a step, or none.
-        has_batch = self._demos is not None or (found[:, 2].all() and found[:, 0].any())
-        if not self._is_warm or not has_batch:
+        # All processes take a step, or none; one that has nothing to clone takes that of the others.
+        has_batch = (found[:, 2] > 0) & found[:, 0].any() if self._demos is None else np.ones(len(found), bool)
+        if not self._is_warm or not has_batch.any():
             return metrics | {"optimizer_steps": 0.0}
         with self._stopwatch("update"):
             self._learner.train()
-            steps = [self._step() for _ in range(self.config.steps_per_update)]
+            own, share = bool(has_batch[self._processes.rank]), 1 / has_batch.mean()
+            steps = [self._step(share if own else None) for _ in range(self.config.steps_per_update)]
             self._learner.eval()
             # Running means, as those of batch normalization, are each process's own of its own batches.
             for module in dict.fromkeys((self._learner, self.policy)):
                 self._processes.copy_from_main(module.buffers())
-        means = self._processes.concatenate(np.array([steps])).mean(axis=(0, 1))
+        means = np.nanmean(self._processes.concatenate(np.array([steps])), axis=(0, 1))
         metrics |= {"loss": float(means[0]), "grad_norm": float(means[1])}
         return metrics | {"optimizer_steps": float(len(steps))}
 
@@ -187,6 +188,13 @@ class ImitationAgent(LearningAgent):
                 group["lr"] *= factor
         self._max_grad_norm = preset.grad_clip_norm
         self._trained = [param for param in self._learner.parameters() if param.requires_grad]
+        # Steps of such a rate, and those of an average, are smaller than what a half of the bits can hold.
+        if coarse := sorted({str(param.dtype) for param in self._trained} - {"torch.float32"}):
+            raise ValueError(
+                f"--algorithm.type=imitation would learn next to nothing: {', '.join(coarse)} cannot hold the small"
+                " steps of the weights that are trained. Load them with --policy.dtype=float32, or train adapters"
+                " (--peft.method_type=LORA)."
+            )
 
     @property
     def _optimizers(self) -> list[torch.optim.Optimizer]:
@@ -225,12 +233,22 @@ class ImitationAgent(LearningAgent):
         assert batch is not None
         return batch
 
-    def _step(self) -> tuple[float, float]:
-        """One optimizer step, as `lerobot-train` takes it; returns the loss and the gradient's norm."""
-        loss, _ = self._learner.forward(self._processors.preprocessor(self._batch()))
-        if not torch.isfinite(loss):
-            raise FloatingPointError(f"The loss is {loss.item()}.")
-        loss.backward()
+    def _step(self, share: float | None) -> tuple[float, float]:
+        """One optimizer step, as `lerobot-train` takes it, with the mean gradient of the processes with a batch.
+
+        Args:
+            share: all processes by those with a batch; None if this one has none.
+
+        Returns:
+            The loss, NaN without a batch, and the gradient's norm.
+        """
+        value = float("nan")
+        if share is not None:
+            loss, _ = self._learner.forward(self._processors.preprocessor(self._batch()))
+            if not torch.isfinite(loss):
+                raise FloatingPointError(f"The loss is {loss.item()}.")
+            (share * loss).backward()
+            value = loss.item()
         self._processes.average_gradients(self._trained)
         norm = torch.nn.utils.clip_grad_norm_(self._trained, self._max_grad_norm or float("inf"))
         for optimizer in self._optimizers:
@@ -241,7 +259,7 @@ class ImitationAgent(LearningAgent):
             after_step()
         if self.config.ema_decay:
             self._move_average()
-        return loss.item(), float(norm)
+        return value, float(norm)
 
     @torch.no_grad()
     def _move_average(self) -> None:

@@ -237,7 +237,11 @@ class PPOConfig(RLAlgorithmConfig):
                 f"algorithm.policy_lr_min must be at most policy_lr_max={self.policy_lr_max}, got "
                 f"{self.policy_lr_min}."
             )
-        # Beyond its ends an adaptive rate would leap to them, whichever way it should go.
+
+    def check_start(self) -> None:
+        """Raise a ValueError, if an adaptive rate begins beyond its ends: it would leap to them, whichever way it
+        should go.
+        """
         if self.lr_schedule != "fixed" and not self.policy_lr_min <= self.policy_lr <= self.policy_lr_max:
             raise ValueError(
                 f"algorithm.policy_lr must be policy_lr_min={self.policy_lr_min} to policy_lr_max="

@@ -61,6 +61,7 @@ class SelfImitation:
         drop_last = getattr(policy.config, "drop_n_last_frames", 0) or 0
         self.memory = SegmentMemory(int(self.config.memory_gib * 2**30), drop_last)
         self._weights: np.ndarray | None = None
+        self._share = 1.0
         self._demos = None
         if config.demos_share:
             self._demos = Demonstrations(config.demos, policy.config, shapes if config.demos_share < 1 else None)
@@ -98,7 +99,11 @@ class SelfImitation:
         memory.forget(num_updates - self.config.max_age)
         self._weights = by_task(memory.segments, memory.lengths) if len(memory) else None
         ages = sum(num_updates - segment.update for segment in memory.segments)
-        found = self._processes.concatenate(np.array([[len(memory), memory.num_frames, ages]])).sum(axis=0)
+        each = self._processes.concatenate(np.array([[len(memory), memory.num_frames, ages]]))
+        # The mean of all processes' gradients is that of those with a batch.
+        if self._demos is None and each[:, 0].any():
+            self._share = 1 / float((each[:, 0] > 0).mean())
+        found = each.sum(axis=0)
         metrics = {"memory_segments": float(found[0]), "memory_frames": float(found[1])}
         return metrics | ({"memory_age": float(found[2] / found[0])} if found[0] else {})
 
@@ -122,10 +127,9 @@ class SelfImitation:
         pairs = [(param, grad) for param, grad in zip(trained, gradients, strict=True) if grad is not None]
         if not pairs:
             raise ValueError(_refusal(self._policy, "`forward` has no gradient for what acts"))
+        weight = self._share * self.config.coef
         for param, grad in pairs:
-            param.grad = (
-                self.config.coef * grad if param.grad is None else param.grad.add_(grad, alpha=self.config.coef)
-            )
+            param.grad = weight * grad if param.grad is None else param.grad.add_(grad, alpha=weight)
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(grad) for _, grad in pairs]))
         return {"clone_loss": loss.item(), "clone_grad_norm": norm.item()}
 

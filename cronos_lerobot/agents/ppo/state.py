@@ -36,7 +36,12 @@ def set_optimizer(optimizer: Optimizer, config: PPOConfig, saved: dict[str, floa
         optimizer: with groups named `policy` and `value`.
         config: to go on with.
         saved: `policy_lr` and `value_lr` of the config that it was saved with.
+
+    Raises:
+        ValueError: a learning rate that it is given is beyond the ends.
     """
+    if config.policy_lr != saved["policy_lr"]:
+        config.check_start()
     for group in optimizer.param_groups:
         name = f"{group['name']}_lr"
         if getattr(config, name) != saved[name]:
