@@ -37,6 +37,7 @@ from lerobot.datasets.utils import (
     INFO_PATH,
     STATS_PATH,
 )
+from lerobot.datasets.video_utils import get_video_info
 from lerobot.utils.utils import flatten_dict, unflatten_dict
 
 from cronos_lerobot.data.png import encode_png
@@ -135,9 +136,10 @@ class Shard:
         meta, info = self._meta, self._meta.info
         for key, video in self.videos.items():
             video.close()
-            move_into_place(meta.root, [self._video_path(key)])
             if info.total_episodes == 0 and encoder is not None:
-                meta.update_video_info(key, video_encoder=encoder)
+                # As LeRobot's `update_video_info` does with a file that is in place.
+                described = get_video_info(self._stage(self._video_path(key)), encoder)
+                info.features[key]["info"] = (info.features[key].get("info") or {}) | described
         write_tasks(tasks_frame(tasks), self._staging)
         self._data.close()
         table = pa.Table.from_pylist(self.rows, schema=_episodes_schema(meta.root))
@@ -145,7 +147,8 @@ class Shard:
         meta.stats = aggregate_stats([*([meta.stats] if meta.stats else []), *self.stats])
         info.total_episodes += len(self.rows)
         info.total_frames += self.num_frames
-        staged = [DEFAULT_TASKS_PATH, self._data_path, self._episodes_path, *stage_summary(meta, tasks)]
+        videos = [self._video_path(key) for key in self.videos]
+        staged = [*videos, DEFAULT_TASKS_PATH, self._data_path, self._episodes_path, *stage_summary(meta, tasks)]
         move_into_place(meta.root, staged)
 
     def abandon(self) -> None:

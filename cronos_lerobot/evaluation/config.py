@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
@@ -145,10 +146,10 @@ class CronosEvalConfig:
             check_video_size("--env.render_size", self.env.render_size)
         if self.policy is not None and not self.rename_map:
             check_observations(self.policy, self.env)
-        most = self._most_configurations()
+        most = self._most_configurations(self.suites, self.splits)
         if self.eval.n_episodes is not None and self.eval.n_episodes > most:
             raise ValueError(f"eval.n_episodes must be 1 to {most}, got {self.eval.n_episodes}")
-        most = self._most_orderings()
+        most = self._most_orderings(self.splits)
         if self.eval.orderings is not None and self.eval.orderings > most:
             raise ValueError(f"eval.orderings must be 1 to {most}, got {self.eval.orderings}")
         if self.output_dir is None:
@@ -238,24 +239,24 @@ class CronosEvalConfig:
 
     @property
     def num_configurations(self) -> int:
-        """Configurations of each task and ordering."""
-        most = self._most_configurations()
+        """Configurations of each task and ordering, of whatever is chosen: the rest may be added to its folder."""
+        most = self._most_configurations(SUITES, SPLITS)
         return self.eval.n_episodes or (min(most, QUICK_CONFIGURATIONS) if self.quick else most)
 
-    def _most_configurations(self) -> int:
+    def _most_configurations(self, suites: Sequence[str], splits: Sequence[str]) -> int:
         benchmark = self.benchmark()
-        groups = [benchmark.groups(suite, split) for suite in self.suites for split in self.splits]
+        groups = [benchmark.groups(suite, split) for suite in suites for split in splits]
         return max(len(group.configurations) for group in chain.from_iterable(groups))
 
     @property
     def num_orderings(self) -> int:
         """Orderings of the sequential suite."""
-        most = self._most_orderings()
+        most = self._most_orderings(SPLITS)
         return min(most, self.eval.orderings or (QUICK_ORDERINGS if self.quick else most))
 
-    def _most_orderings(self) -> int:
+    def _most_orderings(self, splits: Sequence[str]) -> int:
         benchmark = self.benchmark()
-        return max(len(benchmark.groups("sequential", split)) for split in self.splits)
+        return max(len(benchmark.groups("sequential", split)) for split in splits)
 
     def make_parts(self) -> list[Part]:
         """All that is to be run."""
@@ -276,7 +277,7 @@ class CronosEvalConfig:
 
     @property
     def policy_name(self) -> str:
-        """The policy as it was given."""
+        """The policy as it was given; of a run's last checkpoint the one that it was then."""
         if self.policy is None:
             return EXPERT
         return self.source.name if self.source else str(self.policy.pretrained_path)
@@ -286,7 +287,7 @@ class CronosEvalConfig:
         """What tells the policy from another one of its name."""
         return EXPERT if self.policy is None else fingerprint(self.policy)
 
-    @property
+    @cached_property
     def policy_files(self) -> str | None:
         """The same of its weights and processors alone, whatever flags made of its config; None of the expert."""
         return None if self.policy is None else files_fingerprint(Path(self.policy.pretrained_path or ""))

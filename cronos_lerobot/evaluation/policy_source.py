@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import redirect_stderr
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import draccus
 from huggingface_hub import HfApi, snapshot_download
@@ -17,6 +18,7 @@ from huggingface_hub.constants import CONFIG_NAME
 from huggingface_hub.errors import HFValidationError
 from huggingface_hub.utils import validate_repo_id
 from lerobot.configs import PreTrainedConfig
+from lerobot.utils.constants import LAST_CHECKPOINT_LINK
 
 FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 """What a policy is loaded from: configs, weights, tokenizers."""
@@ -25,12 +27,17 @@ UNDECISIVE = ("pretrained_path", "pretrained_revision", "push_to_hub", "repo_id"
 """Fields of a policy's config that say where it is and not what it does."""
 
 
+BASE = ("base_model_name_or_path", "revision")
+"""What PEFT's adapters say of the policy that they go onto."""
+
+
 @dataclass(frozen=True)
 class PolicySource:
     """A checkpoint as it was when it was looked up."""
 
     name: str
-    """As it was given: a folder, or `<owner>/<repository>[@<revision>]` on the Hub."""
+    """As it was given: a folder, or `<owner>/<repository>[@<revision>]` on the Hub; of a run's last checkpoint the
+    one that it was then."""
     folder: Path
     """Its files; of the Hub's, those of one commit in the cache."""
     revision: str | None = None
@@ -48,7 +55,8 @@ def find_policy(name: str) -> PolicySource:
     if folder.is_dir():
         if not (folder / "config.json").is_file():
             raise ValueError(f"{name} is no checkpoint of a policy: it has no config.json")
-        return PolicySource(name, folder)
+        followed = _follow_last(folder)
+        return PolicySource(name if followed == folder else str(followed), followed)
     repository, _, revision = name.partition("@")
     try:
         validate_repo_id(repository)
@@ -56,6 +64,14 @@ def find_policy(name: str) -> PolicySource:
         raise ValueError(f"{name} is neither a folder nor <owner>/<repository> on the Hub") from None
     snapshot = Path(snapshot_download(repository, revision=revision or None, allow_patterns=list(FILES)))
     return PolicySource(name, snapshot, snapshot.name)
+
+
+def _follow_last(folder: Path) -> Path:
+    """`folder` below the checkpoint that is the last one now: a run that goes on has another one soon."""
+    for link in (folder, *folder.parents):
+        if link.name == LAST_CHECKPOINT_LINK and link.is_symlink():
+            return link.parent / link.readlink() / folder.relative_to(link)
+    return folder
 
 
 def load_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
@@ -94,8 +110,9 @@ def fingerprint(policy: PreTrainedConfig) -> str:
     """
     config = {name: value for name, value in draccus.encode(policy).items() if name not in UNDECISIVE}
     digest = hashlib.sha256(json.dumps(config, sort_keys=True, default=str).encode())
-    for file in _weights_and_processors(Path(policy.pretrained_path or "")):
-        digest.update(file.name.encode() + _hash(file))
+    folder = Path(policy.pretrained_path or "")
+    for content in (*_weights_and_processors(folder), *_base_of_adapters(folder)):
+        digest.update(content)
     for field in ("checkpoint", "adapter"):
         if name := getattr(policy, field, None):
             files = sorted(Path(name).glob("*.safetensors")) if Path(name).is_dir() else []
@@ -105,25 +122,43 @@ def fingerprint(policy: PreTrainedConfig) -> str:
 
 
 def files_fingerprint(folder: Path) -> str:
-    """A short hash of a checkpoint's weights and processors, whatever flags make of its config."""
+    """A short hash of a checkpoint's weights and processors, whatever flags make of its config.
+
+    Of PEFT's adapters without the policy that they go onto, which is called otherwise where they are published.
+    """
     digest = hashlib.sha256()
-    for file in _weights_and_processors(folder):
-        digest.update(file.name.encode() + _hash(file))
+    for content in _weights_and_processors(folder):
+        digest.update(content)
     return digest.hexdigest()[:16]
 
 
-def _weights_and_processors(folder: Path) -> Iterator[Path]:
-    """Not config.json, of which flags may have another mind, nor train_config.json, which says how it was made.
+def _weights_and_processors(folder: Path) -> Iterator[bytes]:
+    """Not config.json, of which flags may have another mind, nor train_config.json, which says how it was made."""
+    for pattern in ("*.safetensors", "policy_*.json"):
+        for file in sorted(folder.glob(pattern)):
+            yield file.name.encode() + _hash(file)
+    if adapters := _adapter_config(folder):
+        settings = {name: value for name, value in adapters.items() if name not in BASE}
+        yield json.dumps(settings, sort_keys=True).encode()
 
-    Of PEFT's adapters those of the policy in a folder that they go onto, too; one of the Hub is named there.
-    """
-    for pattern in ("*.safetensors", "policy_*.json", "adapter_config.json"):
-        yield from sorted(folder.glob(pattern))
-    if (adapters := folder / "adapter_config.json").is_file():
-        base = Path(json.loads(adapters.read_text()).get("base_model_name_or_path") or "")
-        # Without one it is Path("."), which no policy is.
-        if base.parts:
-            yield from sorted(base.glob("*.safetensors"))
+
+def _base_of_adapters(folder: Path) -> Iterator[bytes]:
+    """Of PEFT's adapters the policy that they go onto: its weights in a folder, its name on the Hub."""
+    name, revision = (_adapter_config(folder).get(field) for field in BASE)
+    if not name:
+        return
+    # The folder may have been named from where the training ran, such as outputs/clone.
+    places = (Path(name), *(parent / name for parent in folder.absolute().parents))
+    files = next((files for place in places if (files := sorted(place.glob("*.safetensors")))), None)
+    if files is None:
+        yield f"{name} {revision}".encode()
+    else:
+        yield from (file.name.encode() + _hash(file) for file in files)
+
+
+def _adapter_config(folder: Path) -> dict[str, Any]:
+    path = folder / "adapter_config.json"
+    return json.loads(path.read_text()) if path.is_file() else {}
 
 
 def _hash(file: Path) -> bytes:

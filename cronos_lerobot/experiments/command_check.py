@@ -73,6 +73,8 @@ def _check(given: dict[str, str], policy_type: str | None) -> None:
         name: cfgparsing.parse_string(value) for name, value in given.items() if not name.startswith("policy.")
     }
     config = draccus.decode(CronosTrainConfig, deflatten(values, sep="."))
+    if config.env is not None:
+        config.check_env(config.env)
     settings = [name.removeprefix("algorithm.") for name in given if name.startswith("algorithm.")]
     check_settings(config.algorithm, settings, resume=False)
 

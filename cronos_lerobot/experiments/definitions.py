@@ -312,7 +312,7 @@ def register_experiment(experiment: Experiment) -> None:
 
 
 def find_rows(experiment: Experiment, names: list[str]) -> tuple[Row, ...]:
-    """The rows called `names`, all of them if it is empty.
+    """The rows called `names`, each once, all of them if it is empty.
 
     Raises:
         ValueError: the experiment has no such row.
@@ -321,4 +321,4 @@ def find_rows(experiment: Experiment, names: list[str]) -> tuple[Row, ...]:
     for name in names:
         if name not in rows:
             raise ValueError(f"{experiment.name} has no row {name!r}; it has {', '.join(rows)}")
-    return tuple(rows[name] for name in names) or experiment.rows
+    return tuple(rows[name] for name in dict.fromkeys(names)) or experiment.rows

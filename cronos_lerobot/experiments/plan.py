@@ -10,6 +10,7 @@ from pathlib import Path
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from lerobot_env_cronos import gymnasium_id
+from lerobot_env_cronos.benchmark.benchmark import SUITES
 from lerobot_env_cronos.benchmark.configurations import SPLITS
 
 from cronos_lerobot.experiments.definitions import (
@@ -73,7 +74,8 @@ def base_jobs(base: Base, options: Options) -> list[Job]:
     name = f"base/{folder.name}"
     demos = Job(f"{name}/demos", tuple(record), folder / "demos", stage=BASE)
     # Evaluations may have come from another machine, without the clone that they are of.
-    evaluations = tuple(base_evaluation_folder(base, "independent", split, options) for split in SPLITS)
+    pairs = [(suite, split) for suite in SUITES for split in SPLITS]
+    evaluations = tuple(base_evaluation_folder(base, suite, split, options) for suite, split in pairs)
     clone_job = Job(f"{name}/clone", tuple(clone), folder / "clone", evaluations, needs=(demos.name,), stage=BASE)
     return [replace(job, environment=gymnasium_id(scene), root=options.root) for job in (demos, clone_job)]
 

@@ -52,8 +52,18 @@ def _own_state(part: Any) -> dict[str, Any]:
     state = method()
     if not isinstance(state, dict):
         raise ValueError(f"{type(part).__name__}.state_dict() must return a dict, got {state!r}.")
+    state = _plain(state)
     _check(state, f"{type(part).__name__}.state_dict()")
     return state
+
+
+def _plain(value: Any) -> Any:
+    """A copy with NumPy's numbers as Python's: a mean is one as soon as it is taken."""
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_plain(inner) for inner in value]
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _check(value: Any, where: str) -> None:

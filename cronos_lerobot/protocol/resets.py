@@ -12,7 +12,7 @@ import numpy as np
 from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
 
 from cronos_lerobot.protocol.config import ProtocolConfig
-from cronos_lerobot.protocol.interventions import Intervention
+from cronos_lerobot.protocol.interventions import BEFORE_SEGMENTS, Intervention
 from cronos_lerobot.protocol.loop_state import LoopState
 from cronos_lerobot.protocol.task_values import RunContext, TaskValues
 
@@ -322,15 +322,23 @@ def make_resets(protocol: ProtocolConfig, rng: Callable[[str], np.random.Generat
             another one draws.
 
     Raises:
-        ValueError: an extra reset is not registered.
+        ValueError: an extra reset is not registered, or does not say what it is counted as.
     """
     check_extra_resets(protocol.extra_resets)
+    extra = tuple(EXTRA_RESETS[name](rng(f"resets/extra/{name}"), protocol) for name in protocol.extra_resets)
+    for name, strategy in zip(protocol.extra_resets, extra, strict=True):
+        if getattr(strategy, "kind", None) not in BEFORE_SEGMENTS:
+            raise ValueError(
+                f"{type(strategy).__name__}.kind, of --protocol.extra_resets={name}, must be an Intervention"
+                f" before a segment, one of {[kind.name for kind in BEFORE_SEGMENTS]}, got "
+                f"{getattr(strategy, 'kind', None)!r}"
+            )
     scene_reset = CriticSceneReset if protocol.scene_reset == "critic" else PeriodicSceneReset
     return Resets(
         initial=InitialPlacement(rng("resets/initial"), protocol.num_configurations),
         divergence=DivergenceReset(rng("resets/divergence"), protocol.num_configurations),
         end_effector=EndEffectorReset() if protocol.end_effector_reset else NoReset(),
         heuristic=HeuristicReset(rng("resets/heuristic")) if protocol.heuristic_reset else NoReset(),
-        extra=tuple(EXTRA_RESETS[name](rng(f"resets/extra/{name}"), protocol) for name in protocol.extra_resets),
+        extra=extra,
         scene=scene_reset(rng("resets/scene"), protocol),
     )

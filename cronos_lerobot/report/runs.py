@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -334,7 +335,19 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
             group.label = ", ".join(filter(None, (protocol, _name_values(flat[key], others))))
         if changed := group.runs[0].changed:
             group.label += f" (resumed with {_name_values(changed, list(changed))})"
+    for label, count in Counter(group.label for group in groups.values()).items():
+        if count > 1:
+            _tell_apart({key: group for key, group in groups.items() if group.label == label}, flat)
     return list(groups.values())
+
+
+def _tell_apart(alike: dict[str, Group], flat: dict[str, dict[str, str]]) -> None:
+    """Add to one label of several groups what words do not say, or where that is too much their folders."""
+    names = sorted({name for key in alike for name in flat[key]})
+    differing = [name for name in names if len({flat[key].get(name) for key in alike}) > 1]
+    for key, group in alike.items():
+        is_short = 0 < len(differing) <= 3
+        group.label += f" ({_name_values(flat[key], differing) if is_short else group.runs[0].folder})"
 
 
 def _are_of_one_seed(run: TrainingRun, other: TrainingRun) -> bool:

@@ -44,6 +44,7 @@ RESERVED = (
     "--protocol.update_interval",
     "--policy.path",
     "--env.scene",
+    "--env.obs_type",
     "--eval.split",
     "--eval.temperature",
     "--resume",
@@ -193,6 +194,8 @@ def make_options(args: argparse.Namespace, extra: list[str], bases: Iterable[Bas
     taken = [flag for flag in extra if flag.split("=")[0] in RESERVED]
     if taken and taken[0].startswith("--eval.temperature="):
         raise ValueError(f"{taken[0]} after -- is of the runs alone: give --temperature, before it, for all")
+    if taken and taken[0].startswith("--env.obs_type="):
+        raise ValueError(f"{taken[0]} after -- is of the runs alone: give --obs_type, before it, for all")
     if taken:
         raise ValueError(f"{taken[0]} is set by the experiment; it cannot be given after --")
     if not args.temperature >= 0:

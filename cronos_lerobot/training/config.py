@@ -169,7 +169,7 @@ class CronosTrainConfig:
         if not is_of_this_package(self.env):
             raise ValueError(f"--env.type must be cronos to train in, got {self.env.type!r}.")
         if not self.resume:
-            self._check_env(self.env)
+            self.check_env(self.env)
         check_agent(self.algorithm.type)
         given = (flag.removeprefix("--").split("=")[0] for flag in parser.get_cli_overrides("algorithm") or [])
         check_settings(self.algorithm, given, resume=self.resume)
@@ -190,7 +190,7 @@ class CronosTrainConfig:
         self.record.check(Path(self.output_dir), self.num_envs, self.env, resume=self.resume)
 
     @staticmethod
-    def _check_env(env: CronosEnvConfig) -> None:
+    def check_env(env: CronosEnvConfig) -> None:
         """Refuse what training would not follow."""
         for name, why in EVALUATION_ONLY.items():
             if (value := getattr(env, name)) != getattr(CronosEnvConfig, name):

@@ -17,7 +17,7 @@ from synthetic_segments import FPS, assert_same_pictures, features, segment
 from cronos_lerobot.data import storage
 from cronos_lerobot.data.schema import demonstration_features
 from cronos_lerobot.data.video import VideoFile, ordinary_priority
-from cronos_lerobot.data.writer import SegmentWriter
+from cronos_lerobot.data.writer import RecordingError, SegmentWriter
 
 LENGTHS = [12, 1, 25, 7, 18]
 CAMERA = "observation.images.front"
@@ -318,6 +318,22 @@ def test_state_only_datasets_have_no_videos(tmp_path):
     dataset = LeRobotDataset("me/test", root=tmp_path / "d")
     np.testing.assert_array_equal(dataset[4]["action"].numpy(), frames["action"][4])
     assert dataset.meta.video_path is None
+
+
+def test_a_full_disk_leaves_nothing_of_the_flush_that_failed(tmp_path, segments, monkeypatch):
+    writer = write(tmp_path / "d", segments[:2], flush_after=[0, 1])
+    before = {path for path in (tmp_path / "d").rglob("*") if path.is_file()}
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(storage.pq, "write_table", full)
+    writer.add_segment(*segments[2], episode_metadata={"number": 2})
+    with pytest.raises(RecordingError, match="No space left"):
+        writer.flush()
+    assert {path for path in (tmp_path / "d").rglob("*") if path.is_file()} == before
+    monkeypatch.undo()
+    assert_holds(tmp_path / "d", segments[:2])
 
 
 def test_an_exception_keeps_what_was_recorded(tmp_path, segments):

@@ -1,5 +1,7 @@
 """What counts as placed: carried there, let go, still, and borne by the receptacle."""
 
+import copy
+
 import numpy as np
 import pytest
 from lerobot_env_cronos import CronosVectorEnv, Task, get_scene
@@ -247,6 +249,32 @@ def test_a_reset_task_is_complete_from_the_start_when_bodies_were_put_on_the_tab
     _, reward, *_ = env.step(np.tile(STILL, (2, 1)))
     assert env.is_success.all()
     assert not reward.any()
+
+
+def test_a_body_that_is_put_back_is_no_control_step_of_the_others():
+    env = make(1)
+    env.scene_reset([0], np.array([0]))
+    env.set_task([0], [env.scene.tasks[0]])
+    expert, task = ScriptedExpert(env), env.scene.tasks[0]
+    others = [body for body in env.scene.bodies if body not in (task.object, task.receptacle)]
+    seen = set()
+    for _ in range(60):
+        env.step(expert.act())
+        judge = env.simulation.judge
+        # Squeezed at one reading, which is no carry; on the receptacle at one, which is not yet placed.
+        if judge.held[0, 0] == 1 or (judge.place[0, 0] > 0 and not env.is_success[0]):
+            seen.add(int(judge.held[0, 0]))
+            before = judge.get_state()
+            helped = copy.deepcopy(env)
+            for body in others:
+                helped.put_back(0, body, np.random.default_rng(1))
+            after = helped.simulation.judge.get_state()
+            for name in ("held", "carried_to", "place", "confirmed", "rests"):
+                assert after[name][0, 0] == before[name][0, 0], name
+            helped.set_task([0], [helped.scene.tasks[0]])
+            assert not helped.is_success[0]
+    assert seen == {0, 1}
+    assert env.is_success[0]
 
 
 def test_what_was_read_is_part_of_the_state():

@@ -111,6 +111,19 @@ def test_registering_again_changes_nothing():
         (SCENE, [BLOCK, Body("blue coaster", (0.1, 0.0, 0.01), 1, "disc")], "must be positive"),
         (SCENE, [BLOCK, replace(COASTER, size=(0.09, 0.08, 0.005))], r"a disc is round: .* got \(0.09, 0.08\)"),
         (Scene("study", ("red block",), ()), [BLOCK], "objects and receptacles"),
+        # MuJoCo drops the second joint of a name without a word.
+        (SCENE, [replace(BLOCK, name="elbow"), COASTER], "a body cannot be named 'elbow': .*'waist'"),
+        (SCENE, [BLOCK, replace(COASTER, name="table")], "a body cannot be named 'table'"),
+        (
+            replace(SCENE, spawn_low=(0.45, -0.1), spawn_high=(0.6, 0.1)),
+            [BLOCK, COASTER],
+            "within the arm's reach",
+        ),
+        (
+            replace(SCENE, spawn_low=(0.3, 0.1), spawn_high=(0.4, -0.1)),
+            [BLOCK, COASTER],
+            r"spawn area of study_2x1: spawn_low=\(0.3, 0.1\) must be below",
+        ),
         (SCENE, [replace(BLOCK, size=(0.06, 0.05, 0.05)), COASTER], "red block is an object, 50 mm wide .* 44 mm"),
         (
             SCENE,

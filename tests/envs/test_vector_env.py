@@ -125,6 +125,16 @@ def test_end_effector_reset_drops_a_held_object():
     assert (env.simulation.body_pose(BOTTLE)[:, 2] < 0.05).all()
 
 
+def test_no_stream_may_be_helped():
+    env = CronosVectorEnv(2, obs_type="environment_state_agent_pos")
+    env.scene_reset(np.arange(2), np.arange(2))
+    before, nobody = env.simulation.qpos.copy(), np.flatnonzero([False, False])
+    env.scene_reset(nobody, nobody)
+    env.place_bodies(nobody, np.empty((0, 4, 7)))
+    env.end_effector_reset(nobody)
+    np.testing.assert_array_equal(env.simulation.qpos, before)
+
+
 def test_scene_reset_restores_only_its_streams():
     env = make()
     start, _ = env.reset(seed=0)

@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import eval_policy, rollout
 from lerobot_env_cronos import CronosEnvConfig, IndependentVectorEnv, SequentialVectorEnv, get_scene
+from lerobot_env_cronos.benchmark.benchmark import draw_benchmark
 from scripted_env import ScriptedEnv
 from tiny_checkpoints import STATE, save_policy
 
@@ -23,7 +25,7 @@ from cronos_lerobot.evaluation.chains import Chain, ChainRunner, chain_noise
 from cronos_lerobot.evaluation.config import CronosEvalConfig, SuitesConfig
 from cronos_lerobot.evaluation.outcomes import read_outcomes
 from cronos_lerobot.evaluation.plan import Part
-from cronos_lerobot.evaluation.policy_source import files_fingerprint, fingerprint
+from cronos_lerobot.evaluation.policy_source import files_fingerprint, find_policy, fingerprint
 from cronos_lerobot.evaluation.runner import Evaluation
 from cronos_lerobot.evaluation.store import RESULTS
 from cronos_lerobot.scripts import eval as script
@@ -262,6 +264,24 @@ def test_help_teaches(monkeypatch, capsys):
         assert text in output
 
 
+def test_suites_that_are_added_to_a_folder_leave_it_the_same_evaluation(tmp_path, monkeypatch):
+    """Of a benchmark whose chains begin at fewer configurations than its tasks."""
+    benchmark = draw_benchmark("kitchen_2x2", seed=1, num_configurations=4, num_orderings=2)
+    chains = {
+        split: tuple(replace(group, configurations=group.configurations[:2]) for group in groups)
+        for split, groups in benchmark.sequential.items()
+    }
+    monkeypatch.setattr(CronosEvalConfig, "benchmark", lambda self: replace(benchmark, sequential=chains))
+    both, one = (
+        CronosEvalConfig(expert=True, eval=SuitesConfig(suites=suites))
+        for suites in ("independent,sequential", "sequential")
+    )
+    assert one.num_configurations == both.num_configurations == 4
+    assert one.identity() == both.identity()
+    with pytest.raises(ValueError, match=r"n_episodes must be 1 to 2, got 3"):
+        CronosEvalConfig(expert=True, eval=SuitesConfig(suites="sequential", n_episodes=3)).validate()
+
+
 def test_quick_is_less():
     config, quick = CronosEvalConfig(), CronosEvalConfig(quick=True)
     assert (config.num_configurations, config.num_orderings) == (64, 10)
@@ -363,15 +383,36 @@ def test_a_policy_is_known_by_its_files_and_not_by_its_folder(pocketvla, tmp_pat
         file.write_bytes(changed[:-1] + bytes([changed[-1] ^ 1]))
         seen.add(fingerprint_of(copy))
     assert len(seen) == 3
-    # Adapters are loaded onto what lies in their base's folder then.
-    (copy / "adapter_config.json").write_text(json.dumps({"base_model_name_or_path": str(tmp_path / "base")}))
+    # Adapters are loaded onto what lies in their base's folder then, wherever that is called so from.
     base = tmp_path / "base"
     base.mkdir()
-    both = set()
-    for weights in (b"first", b"second"):
+    both = []
+    for weights, name in ((b"first", str(base)), (b"second", str(base)), (b"second", "base"), (b"", "me/base")):
         (base / "model.safetensors").write_bytes(weights)
-        both.add((fingerprint_of(copy), files_fingerprint(copy)))
-    assert len({one for one, _ in both}) == len({other for _, other in both}) == 2
+        (copy / "adapter_config.json").write_text(json.dumps({"r": 4, "base_model_name_or_path": name}))
+        both.append((fingerprint_of(copy), files_fingerprint(copy)))
+    first, second, relative, of_the_hub = (one for one, _ in both)
+    assert len({first, second, of_the_hub}) == 3
+    assert relative == second
+    # Published, they name a repository as their base; they are the same adapters.
+    assert len({files for _, files in both}) == 1
+    (copy / "adapter_config.json").write_text(json.dumps({"r": 8, "base_model_name_or_path": "me/base"}))
+    assert files_fingerprint(copy) != both[-1][1]
+
+
+def test_the_last_checkpoint_is_the_one_that_was_last_when_it_was_looked_up(pocketvla, tmp_path):
+    checkpoints = tmp_path / "run/checkpoints"
+    for step in ("000100", "000200"):
+        shutil.copytree(pocketvla, checkpoints / step / "pretrained_model")
+    (checkpoints / "last").symlink_to("000100")
+    source = find_policy(str(checkpoints / "last/pretrained_model"))
+    (checkpoints / "last").unlink()
+    (checkpoints / "last").symlink_to("000200")
+    assert source.folder == checkpoints / "000100/pretrained_model"
+    assert source.name == str(source.folder)
+    # Other links are the user's own names.
+    (tmp_path / "mine").symlink_to(checkpoints / "000100/pretrained_model")
+    assert find_policy(str(tmp_path / "mine")).name == str(tmp_path / "mine")
 
 
 @pytest.mark.parametrize(

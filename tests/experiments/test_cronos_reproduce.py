@@ -132,6 +132,7 @@ def test_list_names_every_row(monkeypatch, capsys):
         (["table1", "--", "--algorithm.target_kl"], "--algorithm.target_kl needs a value"),
         (["table1", "--", "target_kl"], "flags begin with --, got 'target_kl'"),
         (["table1", "--", "--save_freq", "3"], "--save_freq=3 is set by the experiment"),
+        (["table1", "--", "--env.obs_type=pixels_agent_pos"], "is of the runs alone: give --obs_type, before it"),
         (["table1", "--", "--eval.split=held_out"], "--eval.split=held_out is set by the experiment"),
         (["figure4", "--", "--eval.temperature=1"], "--eval.temperature=1 after -- is of the runs alone: give"),
         (["figure5", "--", "--protocol.reset_budget=100"], "figure5 evaluates their checkpoints at fixed steps"),
@@ -213,6 +214,8 @@ WOULD_NOT_BEGIN = {
     "--protocol.takeover_price=3": "protocol.takeover_price=3 is for takeovers",
     "--protocol.extra_resets=[stock]": "protocol.extra_resets has ['stock']",
     "--algorithm.type=nobody": "got 'nobody'",
+    "--algorithm.policy_lr=1": "algorithm.policy_lr must be policy_lr_min=1e-06",
+    "--env.split=held_out": "--env.split=held_out is of lerobot-eval",
     "--algorithm.self_imitation.max_age=3": "max_age=3 has no effect here: it needs an --algorithm.self_imitation",
 }
 

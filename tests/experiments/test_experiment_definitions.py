@@ -270,6 +270,11 @@ def test_evaluations_of_checkpoints():
     assert figure4[f"{base}/independent_held_out"].needs == (f"{base}/clone",)
     # It goes with the clone that it is of.
     assert figure4[f"{base}/independent_held_out"].output in figure4[f"{base}/clone"].made_from_it
+    # An experiment of one's own may look at the clone's chains.
+    made = {path.name for path in figure4[f"{base}/clone"].made_from_it}
+    assert made == {
+        f"{suite}_{split}" for suite in ("independent", "sequential") for split in ("train", "held_out")
+    }
     assert f"--policy.path={run}/train/checkpoints/1300480/pretrained_model" in evals[-1].command
     assert evals[0].needs == ("kitchen_2x2_state_paper/t80_1300k/seed2",)
     figure5 = [job for job in jobs_of("figure5", rows=["t80"]).values() if job.command[0] == "cronos-eval"]
@@ -310,6 +315,10 @@ def test_flags_given_last_replace_the_experiments():
 def test_unknown_row():
     with pytest.raises(ValueError, match=r"table1 has no row 't81'; it has t80, t1280,"):
         find_rows(EXPERIMENTS["table1"], ["t81"])
+
+
+def test_a_row_that_is_named_twice_is_one():
+    assert [row.name for row in find_rows(EXPERIMENTS["table1"], ["t1280", "t80", "t1280"])] == ["t1280", "t80"]
 
 
 def test_papers_numbers():

@@ -8,7 +8,13 @@ from test_rf_mtrl import FastEnv, protocol, run
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import SegmentEnd, Step
-from cronos_lerobot.protocol.resets import EXTRA_RESETS, ResetStrategy, check_extra_resets, register_reset
+from cronos_lerobot.protocol.resets import (
+    EXTRA_RESETS,
+    EndEffectorReset,
+    ResetStrategy,
+    check_extra_resets,
+    register_reset,
+)
 from cronos_lerobot.protocol.task_orders import TASK_ORDERS, make_task_order, register_task_order
 
 BOTH = [0, 1]
@@ -202,6 +208,22 @@ def test_a_scene_reset_of_an_extra_strategy_takes_the_place_of_the_periodic_one_
             assert loop.interventions[:, Intervention.SCENE_RESET].tolist() == [1, 1]
     finally:
         del EXTRA_RESETS["second"]
+
+
+@pytest.mark.parametrize("kind", [None, Intervention.NONE, Intervention.TAKEOVER])
+def test_a_strategy_that_does_not_say_what_it_counts_as_is_refused_before_the_run(kind):
+    @register_reset("unnamed")
+    class Unnamed(EndEffectorReset):
+        def __init__(self, rng, protocol):
+            self.kind = kind
+
+    try:
+        with pytest.raises(
+            ValueError, match=r"Unnamed\.kind, of --protocol\.extra_resets=unnamed, .*'SCENE_RESET'"
+        ):
+            run(protocol(extra_resets=["unnamed"]), 8)
+    finally:
+        del EXTRA_RESETS["unnamed"]
 
 
 def test_own_strategy_and_own_order_by_name():

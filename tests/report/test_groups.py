@@ -2,6 +2,7 @@
 
 import json
 
+import pytest
 from synthetic_runs import write_training_run
 
 from cronos_lerobot.report.runs import find_runs, group_runs
@@ -57,6 +58,37 @@ def test_seeds_below_other_roots_are_of_one_experiment(tmp_path):
         manifest.write_text(json.dumps(content))
     groups = group_runs(find_runs([tmp_path]).training)
     assert sorted(sorted(run.seed for run in group.runs) for group in groups) == [[0, 1], [2], [3], [4]]
+
+
+@pytest.mark.parametrize(
+    ("changes", "labels"),
+    [
+        (
+            {"curriculum": [[100, 80]]},
+            {"T = 320, CL (curriculum=[[50, 80]])", "T = 320, CL (curriculum=[[100, 80]])"},
+        ),
+        ({"curriculum": None}, {"T = 320, CL", "T = 320"}),
+    ],
+)
+def test_no_two_groups_have_one_label(tmp_path, changes, labels):
+    for seed, name in enumerate("abcd"):
+        manifest = write_training_run(tmp_path / name, seed=seed, interval=320) / "manifest.json"
+        content = json.loads(manifest.read_text())
+        protocol = content["starts"][0]["config"]["protocol"]
+        protocol |= {"curriculum": [[50, 80]]} | (changes if name in "cd" else {})
+        manifest.write_text(json.dumps(content))
+    assert {group.label for group in group_runs(find_runs([tmp_path]).training)} == labels
+
+
+def test_what_differs_in_too_much_is_told_by_its_folder(tmp_path):
+    for root in "ab":
+        manifest = write_training_run(tmp_path / root / "t80/seed1", interval=80) / "manifest.json"
+        content = json.loads(manifest.read_text())
+        content["starts"][0]["config"]["algorithm"] = dict.fromkeys("vwxyz", root)
+        manifest.write_text(json.dumps(content))
+    labels = [group.label for group in group_runs(find_runs([tmp_path]).training)]
+    assert len(set(labels)) == 2
+    assert all(str(tmp_path / root) in label for root, label in zip("ab", sorted(labels), strict=True))
 
 
 def test_of_two_runs_of_one_seed_the_longer_counts(tmp_path):

@@ -248,9 +248,9 @@ def test_a_process_without_a_success_takes_the_steps_of_the_others(tmp_path):
     cfg.output_dir = tmp_path / "other"
     alone, both = update_once(Processes(), cfg, segments), together(update_once, cfg, segments)
     assert alone[0]["optimizer_steps"] == 5
-    for metrics, actor in both:
+    for update, actor in both:
         # The loss and the gradient are of the one that has a batch, and not half of it.
-        assert metrics == pytest.approx(alone[0], rel=1e-5)
+        assert update == pytest.approx(alone[0], rel=1e-5)
         np.testing.assert_allclose(actor, alone[1], rtol=1e-4, atol=1e-6)
 
 

@@ -98,7 +98,7 @@ def test_what_a_checkpoint_cannot_hold_is_refused_before_the_run_begins(tmp_path
     [
         (3, "must return a dict, got 3"),
         ({"a": np.array(["x"], object)}, r"\['a'\] is an array of object"),
-        ({"a": np.int64(3)}, r"\['a'\] is of int64"),
+        ({"a": np.datetime64("2026-01-01")}, r"\['a'\] is of date"),
         ({(1, 2): 3}, r"has the key \(1, 2\)"),
     ],
 )
@@ -106,6 +106,15 @@ def test_states_that_are_none(state, message, monkeypatch):
     monkeypatch.setattr(CountingOrder, "state_dict", lambda self: state)
     with pytest.raises(ValueError, match=message):
         own_states([CountingOrder(None)])
+
+
+def test_a_number_of_numpy_is_a_number(monkeypatch):
+    """A mean that begins at 0.0 is one of NumPy's as soon as it is taken."""
+    state = {"mean": 0.9 * 0.0 + 0.1 * np.ones(3).mean(), "seen": [np.int64(3), {"any": np.True_}]}
+    monkeypatch.setattr(CountingOrder, "state_dict", lambda self: state)
+    (kept,) = own_states([CountingOrder(None)]).values()
+    assert kept == {"mean": 0.1, "seen": [3, {"any": True}]}
+    assert [type(value) for value in (kept["mean"], kept["seen"][0], kept["seen"][1]["any"])] == [float, int, bool]
 
 
 def test_who_tells_a_state_must_take_it_back(monkeypatch):

@@ -191,9 +191,9 @@ class ImitationAgent(LearningAgent):
         # Steps of such a rate, and those of an average, are smaller than what a half of the bits can hold.
         if coarse := sorted({str(param.dtype) for param in self._trained} - {"torch.float32"}):
             raise ValueError(
-                f"--algorithm.type=imitation would learn next to nothing: {', '.join(coarse)} cannot hold the small"
-                " steps of the weights that are trained. Load them with --policy.dtype=float32, or train adapters"
-                " (--peft.method_type=LORA)."
+                f"--algorithm.type=imitation would learn next to nothing: {', '.join(coarse)} cannot hold the"
+                " small steps of the weights that are trained. Load them with --policy.dtype=float32, or train"
+                " adapters (--peft.method_type=LORA)."
             )
 
     @property

@@ -5,10 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 
 from lerobot_env_cronos.benchmark.configurations import set_configurations_file
 from lerobot_env_cronos.benchmark.version import gymnasium_id
 from lerobot_env_cronos.scene.bodies import SHAPES
+from lerobot_env_cronos.scene.model import TABLE
+from lerobot_env_cronos.scene.robot import ARM_JOINTS, EE_HIGH, EE_LOW, FINGER_JOINTS, LINKS
 from lerobot_env_cronos.scene.scenes import BODIES, SCENES, Body, Scene
 from lerobot_env_cronos.scene.visuals.objects import LOOKS
 
@@ -18,6 +21,8 @@ PLAIN_SHAPES = ("box", "disc")
 ROUND_SHAPES = ("disc", "plate")
 MAX_WIDTH_M = 0.044
 """What the gripper takes between its fingers."""
+RESERVED = frozenset({TABLE, *ARM_JOINTS, *FINGER_JOINTS, *(link.name for link in LINKS)})
+"""Names of the table and of the robot's parts, by which MuJoCo and instructions know them."""
 
 
 def register_scene(scene: Scene, bodies: Sequence[Body] = (), configurations: Path | str | None = None) -> None:
@@ -32,8 +37,8 @@ def register_scene(scene: Scene, bodies: Sequence[Body] = (), configurations: Pa
             64 training and 64 held-out configurations are drawn from a fixed seed in every process.
 
     Raises:
-        ValueError: the name is taken by something else or malformed, a shape or a body is unknown, or the file
-            is of another scene. Nothing is registered then.
+        ValueError: a name is taken by something else or malformed, a shape or a body is unknown, the arm does not
+            reach all of the spawn area, or the file is of another scene. Nothing is registered then.
     """
     new_bodies = {body.name: body for body in bodies}
     _check(scene, new_bodies)
@@ -55,6 +60,8 @@ def _check(scene: Scene, new_bodies: dict[str, Body]) -> None:
     for name, body in new_bodies.items():
         if BODIES.get(name, body) != body:
             raise ValueError(f"there is another body {name!r}; names in use: {sorted(BODIES)}")
+        if name in RESERVED:
+            raise ValueError(f"a body cannot be named {name!r}: reserved are {sorted(RESERVED)}")
         if body.shape not in valid_shapes:
             raise ValueError(f"unknown shape {body.shape!r} of the {name}; valid shapes: {valid_shapes}")
         if min(body.size) <= 0 or body.density <= 0:
@@ -68,6 +75,13 @@ def _check(scene: Scene, new_bodies: dict[str, Body]) -> None:
     for name in scene.bodies:
         if name not in BODIES and name not in new_bodies:
             raise ValueError(f"unknown body {name!r}; valid bodies: {sorted(BODIES | new_bodies)}")
+    low, high = np.array(scene.spawn_low), np.array(scene.spawn_high)
+    if (low >= high).any() or (low < EE_LOW[:2]).any() or (high > EE_HIGH[:2]).any():
+        raise ValueError(
+            f"spawn area of {scene.name}: spawn_low={scene.spawn_low} must be below spawn_high="
+            f"{scene.spawn_high}, and both within the arm's reach, {EE_LOW[:2].tolist()} to "
+            f"{EE_HIGH[:2].tolist()} m"
+        )
     for name in scene.objects:
         body = (BODIES | new_bodies)[name]
         # Other shapes may be held where they are narrower, as a shovel is by its handle.

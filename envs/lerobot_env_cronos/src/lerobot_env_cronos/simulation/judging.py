@@ -108,13 +108,17 @@ class Judge:
         supports = forces[:, self._supports] / self._weight[:, None, None]
         return forces[:, self._hand] > 0, supports[..., 2], np.linalg.norm(supports, axis=-1)
 
-    def read(self, ids: np.ndarray, closing_axis: np.ndarray, *, settled: bool = False) -> None:
+    def read(
+        self, ids: np.ndarray, closing_axis: np.ndarray, *, settled: bool = False, stepped: bool = True
+    ) -> None:
         """Read the contacts of simulations `ids` (k,), after a control step or an intervention.
 
         Args:
             ids: the simulations.
             closing_axis: (k, 3) the direction in which the fingers close, world frame.
             settled: the bodies came to rest before: one reading counts as two.
+            stepped: False after an intervention without a control step, at which nothing comes to rest and no hold
+                grows older: it counts as no reading of its own.
         """
         unseen = ids[self._looks[ids] == 0]
         if len(unseen):
@@ -128,6 +132,7 @@ class Judge:
         place = np.where(in_air, IN_HAND, np.where(alone, carrier, NOTHING))
         pose = self._qpos[ids][:, self._pose]
         same = (place == self.place[ids]) & (in_air | (self._distance(pose, self.pose[ids]) <= STILL_DISTANCE))
+        same &= stepped | (place == self.confirmed[ids])
         confirmed = np.where(settled | same, place, NOTHING)
 
         # A hand that brushes past what was placed does not take it away.
@@ -137,7 +142,7 @@ class Judge:
         carried_to = self.carried_to[ids]
         elsewhere = (carried_to != IN_HAND) & (carried_to != carrier)
         carried_to = np.where(carrier == NOTHING, carried_to, np.where(elsewhere, NOTHING, carrier))
-        self.held[ids] = np.where(in_air, np.minimum(self.held[ids] + 1, CARRY_READINGS), 0)
+        self.held[ids] = np.where(in_air, np.minimum(self.held[ids] + stepped, CARRY_READINGS), 0)
         self.carried_to[ids] = np.where(self.held[ids] == CARRY_READINGS, IN_HAND, carried_to)
         self.grasped[ids], self.confirmed[ids] = grasped, confirmed
         self.place[ids], self.pose[ids] = place, pose

@@ -165,6 +165,8 @@ class Simulation:
 
     def place(self, ids: np.ndarray, poses: np.ndarray) -> None:
         """Put every body of the simulations `ids` at `poses` (k, bodies, 7) and the arm home."""
+        if not len(ids):
+            return
         qpos = np.empty((len(ids), self.model.nq))
         poses = np.asarray(poses)
         qpos[:, NUM_ROBOT_JOINTS:] = poses.reshape(len(ids), -1)
@@ -199,7 +201,7 @@ class Simulation:
         self.arm_target[ids] = arm_target
         self._ctrl[ids, :NUM_ARM_JOINTS] = arm_target
         self.judge.put_one(ids, body)
-        self._read(ids)
+        self._read(ids, stepped=False)
 
     def settle(self, ids: np.ndarray) -> None:
         """Let the bodies of the simulations come to rest, the arm holding still.
@@ -245,10 +247,10 @@ class Simulation:
         """Net contact force (n, 3) of a sensor [N], world frame."""
         return self.sensordata[:, self._sensor_slice[sensor]]
 
-    def _read(self, ids: np.ndarray, *, settled: bool = False) -> None:
+    def _read(self, ids: np.ndarray, *, settled: bool = False, stepped: bool = True) -> None:
         """Let the judge see the simulations `ids` as they are now."""
         _, R, _ = self._measured_pose(self.qpos[ids, :NUM_ARM_JOINTS])
-        self.judge.read(ids, R[:, :, 1], settled=settled)
+        self.judge.read(ids, R[:, :, 1], settled=settled, stepped=stepped)
 
     def is_grasped(self, obj: str) -> np.ndarray:
         """Both fingers press on the object (n,); see `Judge.is_grasped`."""
