@@ -81,6 +81,10 @@ class Processes:
 
     def copy_from_main(self, tensors: Iterable[Tensor]) -> None:
         """Overwrite `tensors` by those of the first process."""
+        self.copy_from(0, tensors)
+
+    def copy_from(self, source: int, tensors: Iterable[Tensor]) -> None:
+        """Overwrite `tensors` by those of process `source`."""
 
     def check_alike(self, state: dict[str, Any]) -> None:
         """Check that `state` is the same in all processes.
@@ -152,11 +156,11 @@ class LaunchedProcesses(Processes):
             for gradient, part in zip(bucket, mean.split([gradient.numel() for gradient in bucket]), strict=True):
                 gradient.copy_(part.view_as(gradient))
 
-    def copy_from_main(self, tensors: Iterable[Tensor]) -> None:
-        """Overwrite `tensors` by those of the first process."""
+    def copy_from(self, source: int, tensors: Iterable[Tensor]) -> None:
+        """Overwrite `tensors` by those of process `source`."""
         for tensor in tensors:
             contiguous = tensor.detach().contiguous()
-            dist.broadcast(contiguous, src=0)
+            dist.broadcast(contiguous, src=source)
             tensor.detach().copy_(contiguous)
 
     def check_alike(self, state: dict[str, Any]) -> None:

@@ -55,7 +55,7 @@ def find_policy(name: str) -> PolicySource:
     if folder.is_dir():
         if not (folder / "config.json").is_file():
             raise ValueError(f"{name} is no checkpoint of a policy: it has no config.json")
-        followed = _follow_last(folder)
+        followed = follow_last(folder)
         return PolicySource(name if followed == folder else str(followed), followed)
     repository, _, revision = name.partition("@")
     try:
@@ -66,7 +66,7 @@ def find_policy(name: str) -> PolicySource:
     return PolicySource(name, snapshot, snapshot.name)
 
 
-def _follow_last(folder: Path) -> Path:
+def follow_last(folder: Path) -> Path:
     """`folder` below the checkpoint that is the last one now: a run that goes on has another one soon."""
     for link in (folder, *folder.parents):
         if link.name == LAST_CHECKPOINT_LINK and link.is_symlink():
@@ -121,13 +121,16 @@ def fingerprint(policy: PreTrainedConfig) -> str:
     return digest.hexdigest()[:16]
 
 
-def files_fingerprint(folder: Path) -> str:
+def files_fingerprint(folder: Path, *, with_base: bool = True) -> str:
     """A short hash of a checkpoint's weights and processors, whatever flags make of its config.
 
-    Of PEFT's adapters without the policy that they go onto, which is called otherwise where they are published.
+    Args:
+        folder: the checkpoint.
+        with_base: of PEFT's adapters with the policy that they go onto, which is called otherwise where they are
+            published.
     """
     digest = hashlib.sha256()
-    for content in _weights_and_processors(folder):
+    for content in (*_weights_and_processors(folder), *(_base_of_adapters(folder) if with_base else ())):
         digest.update(content)
     return digest.hexdigest()[:16]
 
@@ -148,7 +151,7 @@ def _base_of_adapters(folder: Path) -> Iterator[bytes]:
     if not name:
         return
     # The folder may have been named from where the training ran, such as outputs/clone.
-    places = (Path(name), *(parent / name for parent in folder.absolute().parents))
+    places = (*(parent / name for parent in folder.absolute().parents), Path(name))
     files = next((files for place in places if (files := sorted(place.glob("*.safetensors")))), None)
     if files is None:
         yield f"{name} {revision}".encode()

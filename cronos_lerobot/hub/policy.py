@@ -80,7 +80,7 @@ def _read_scores(path: Path, checkpoint: Checkpoint) -> dict[str, Any]:
     evaluated = results.get("policy")
     # Results of before there was a hash of the files alone are taken at their word.
     files = results.get("policy_files")
-    if evaluated == EXPERT or (files and files != files_fingerprint(checkpoint.model)):
+    if evaluated == EXPERT or (files and files != files_fingerprint(checkpoint.model, with_base=False)):
         raise ValueError(f"--results={path} is of {evaluated}, whose weights are not those of {checkpoint.model}")
     return results
 

@@ -68,7 +68,12 @@ def _by_policy(outcomes: Sequence[Outcomes], suite: str, split: str) -> list[Out
             _add(found.setdefault(run, {}), checkpoint, replace(one, lengths=lengths))
     _check_spelled_alike(run for run, checkpoints in found.items() if "" not in checkpoints)
     policies: dict[str, Outcomes] = {}
-    for checkpoints in found.values():
+    for run, checkpoints in found.items():
+        if LAST in checkpoints and len(checkpoints) > 1:
+            raise ValueError(
+                f"{run} has evaluations of {LAST} and of {', '.join(sorted(checkpoints.keys() - {LAST}))}, and"
+                " which is the later is not known: name the folder of the one that is meant"
+            )
         last = checkpoints[max(checkpoints, key=_order)]
         _add(policies, identity(last), last)
     return list(policies.values())
@@ -96,8 +101,8 @@ def identity(outcomes: Outcomes) -> str:
     return f"{what} {sorted((name, str(outcomes.setting.get(name))) for name in WORTH_SAYING)}"
 
 
-def _order(checkpoint: str) -> tuple[bool, int, str]:
-    return checkpoint == LAST, int(checkpoint) if checkpoint.isdigit() else -1, checkpoint
+def _order(checkpoint: str) -> tuple[int, str]:
+    return int(checkpoint) if checkpoint.isdigit() else -1, checkpoint
 
 
 def run_and_checkpoint(outcomes: Outcomes) -> tuple[str, str]:

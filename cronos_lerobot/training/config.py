@@ -23,7 +23,7 @@ from lerobot_env_cronos.hub_config import is_of_this_package
 from cronos_lerobot.agents import builtin  # noqa: F401  (registers the agents)
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.registry import check_agent, check_settings
-from cronos_lerobot.evaluation.policy_source import load_policy_config
+from cronos_lerobot.evaluation.policy_source import follow_last, load_policy_config
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.experts import check_expert
 from cronos_lerobot.protocol.resets import check_extra_resets
@@ -176,7 +176,7 @@ class CronosTrainConfig:
         self._pin_benchmark(self.env)
         if not self.resume and (path := parser.get_path_arg("policy")):
             overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
-            self.policy = load_policy_config(path, overrides)
+            self.policy = load_policy_config(str(follow_last(Path(path))), overrides)
         if self.policy is None:
             raise ValueError("Choose a policy: --policy.path=<checkpoint or Hub id>, or --policy.type=<name>.")
         self._show_what_is_read(self.env, self.policy)

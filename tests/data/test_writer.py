@@ -10,13 +10,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from forked_commands import run_forked
-from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 from synthetic_segments import FPS, assert_same_pictures, features, segment
 
 from cronos_lerobot.data import storage
 from cronos_lerobot.data.schema import demonstration_features
-from cronos_lerobot.data.video import VideoFile, ordinary_priority
+from cronos_lerobot.data.video import ordinary_priority
 from cronos_lerobot.data.writer import RecordingError, SegmentWriter
 
 LENGTHS = [12, 1, 25, 7, 18]
@@ -160,15 +159,6 @@ def test_same_dataset_as_lerobots_own_writer(tmp_path, segments, video):
     rows = [dataset.hf_dataset.with_format("numpy")[:] for dataset in (ours, theirs)]
     for key in ("action", "timestamp", "index", "episode_index", "task_index", "next.done"):
         np.testing.assert_array_equal(rows[0][key], rows[1][key], err_msg=key)
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks Linux for the priorities of threads")
-def test_the_encoder_of_av1_leaves_everything_its_priority(tmp_path):
-    """As root it makes itself and its caller SCHED_FIFO at 99."""
-    with VideoFile(tmp_path / "a.mp4", FPS, 64, 64, RGBEncoderConfig(vcodec="libsvtav1", preset=12)) as video:
-        video.append(np.zeros((3, 64, 64, 3), np.uint8))
-        threads = [int(thread) for thread in os.listdir("/proc/self/task")]
-        assert {os.sched_getscheduler(thread) for thread in threads} <= {os.SCHED_OTHER, os.SCHED_BATCH}
 
 
 KILLED_WRITER = """

@@ -114,10 +114,11 @@ def test_registering_again_changes_nothing():
         # MuJoCo drops the second joint of a name without a word.
         (SCENE, [replace(BLOCK, name="elbow"), COASTER], "a body cannot be named 'elbow': .*'waist'"),
         (SCENE, [BLOCK, replace(COASTER, name="table")], "a body cannot be named 'table'"),
+        (SCENE, [replace(BLOCK, name="left_finger_link"), COASTER], "a body cannot be named 'left_finger_link'"),
         (
             replace(SCENE, spawn_low=(0.45, -0.1), spawn_high=(0.6, 0.1)),
             [BLOCK, COASTER],
-            "within the arm's reach",
+            "both in the workspace",
         ),
         (
             replace(SCENE, spawn_low=(0.3, 0.1), spawn_high=(0.4, -0.1)),

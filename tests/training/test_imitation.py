@@ -230,33 +230,39 @@ def test_two_processes_learn_together_and_resume(tmp_path):
     assert_same_run(tmp_path / "unbroken", tmp_path / "broken")
 
 
-def update_once(processes, cfg, segments):
-    """An update of which the first process has all that is remembered."""
+def update_once(processes, cfg, segments, rank=0):
+    """An update of which one process has all that is remembered."""
     mine = processes.share_of(cfg.num_envs)
     set_seed(cfg.seed)
     env = DummyEnv(mine.stop - mine.start)
     agent = Trainer(cfg, env, DummyEnv, ClonedPolicy(), *identity_processors(), processes).agent
-    if processes.is_main:
+    if processes.rank == rank:
         agent.memory.load_state_dict(segments)
     torch.manual_seed(0)
-    return agent.update(), agent.policy.actor.weight.tolist()
+    return agent.update(), agent.policy.actor.weight.tolist(), agent.policy.running_mean.tolist()
 
 
 def test_a_process_without_a_success_takes_the_steps_of_the_others(tmp_path):
     cfg = settings(tmp_path / "run")
     segments = train(cfg).agent.memory.state_dict()
     cfg.output_dir = tmp_path / "other"
-    alone, both = update_once(Processes(), cfg, segments), together(update_once, cfg, segments)
+    alone, first = update_once(Processes(), cfg, segments), together(update_once, cfg, segments)
     assert alone[0]["optimizer_steps"] == 5
-    for update, actor in both:
+    for update, *learned in first:
         # The loss and the gradient are of the one that has a batch, and not half of it.
         assert update == pytest.approx(alone[0], rel=1e-5)
-        np.testing.assert_allclose(actor, alone[1], rtol=1e-4, atol=1e-6)
+        for found, expected in zip(learned, alone[1:], strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
+    # The first process has none: what it has not seen is not what the others learned by.
+    (update, *learned), other = together(update_once, cfg, segments, 1)
+    assert update["optimizer_steps"] == 5
+    assert learned == list(other[1:])
+    assert np.abs(learned[1]).max() > 0
 
 
 def test_weights_too_coarse_for_its_steps_are_refused(tmp_path):
     policy = ClonedPolicy().bfloat16()
-    with pytest.raises(ValueError, match=r"torch\.bfloat16 cannot hold .* --policy\.dtype=float32"):
+    with pytest.raises(ValueError, match=r"torch\.bfloat16 cannot hold .* Load them in float32, or train adapters"):
         Trainer(settings(tmp_path), DummyEnv(4), DummyEnv, policy, *identity_processors(), Processes())
 
 

@@ -127,9 +127,9 @@ class ImitationAgent(LearningAgent):
             own, share = bool(has_batch[self._processes.rank]), 1 / has_batch.mean()
             steps = [self._step(share if own else None) for _ in range(self.config.steps_per_update)]
             self._learner.eval()
-            # Running means, as those of batch normalization, are each process's own of its own batches.
+            # Running means, as those of batch normalization, are each process's own of the batches that it had.
             for module in dict.fromkeys((self._learner, self.policy)):
-                self._processes.copy_from_main(module.buffers())
+                self._processes.copy_from(int(has_batch.argmax()), module.buffers())
         means = np.nanmean(self._processes.concatenate(np.array([steps])), axis=(0, 1))
         metrics |= {"loss": float(means[0]), "grad_norm": float(means[1])}
         return metrics | {"optimizer_steps": float(len(steps))}
@@ -190,10 +190,14 @@ class ImitationAgent(LearningAgent):
         self._trained = [param for param in self._learner.parameters() if param.requires_grad]
         # Steps of such a rate, and those of an average, are smaller than what a half of the bits can hold.
         if coarse := sorted({str(param.dtype) for param in self._trained} - {"torch.float32"}):
+            config = self.policy.config
+            # SmolVLA's is that of the network whose weights it is built around.
+            how = "dtype=float32" if hasattr(config, "dtype") else "load_vlm_weights=false"
+            how = f" (--policy.{how})" if hasattr(config, how.partition("=")[0]) else ""
             raise ValueError(
                 f"--algorithm.type=imitation would learn next to nothing: {', '.join(coarse)} cannot hold the"
-                " small steps of the weights that are trained. Load them with --policy.dtype=float32, or train"
-                " adapters (--peft.method_type=LORA)."
+                f" small steps of the weights that are trained. Load them in float32{how}, or train adapters"
+                " (--peft.method_type=LORA)."
             )
 
     @property

@@ -21,7 +21,10 @@ PLAIN_SHAPES = ("box", "disc")
 ROUND_SHAPES = ("disc", "plate")
 MAX_WIDTH_M = 0.044
 """What the gripper takes between its fingers."""
-RESERVED = frozenset({TABLE, *ARM_JOINTS, *FINGER_JOINTS, *(link.name for link in LINKS)})
+RESERVED = frozenset(
+    {"world", TABLE, "base_link", *(link.name for link in LINKS), *(f"{joint}_link" for joint in FINGER_JOINTS)}
+    | {*ARM_JOINTS, *FINGER_JOINTS}
+)
 """Names of the table and of the robot's parts, by which MuJoCo and instructions know them."""
 
 
@@ -37,8 +40,8 @@ def register_scene(scene: Scene, bodies: Sequence[Body] = (), configurations: Pa
             64 training and 64 held-out configurations are drawn from a fixed seed in every process.
 
     Raises:
-        ValueError: a name is taken by something else or malformed, a shape or a body is unknown, the arm does not
-            reach all of the spawn area, or the file is of another scene. Nothing is registered then.
+        ValueError: a name is taken by something else or malformed, a shape or a body is unknown, the spawn
+            area is not within the workspace, or the file is of another scene. Nothing is registered then.
     """
     new_bodies = {body.name: body for body in bodies}
     _check(scene, new_bodies)
@@ -76,10 +79,10 @@ def _check(scene: Scene, new_bodies: dict[str, Body]) -> None:
         if name not in BODIES and name not in new_bodies:
             raise ValueError(f"unknown body {name!r}; valid bodies: {sorted(BODIES | new_bodies)}")
     low, high = np.array(scene.spawn_low), np.array(scene.spawn_high)
-    if (low >= high).any() or (low < EE_LOW[:2]).any() or (high > EE_HIGH[:2]).any():
+    if not ((EE_LOW[:2] <= low) & (low < high) & (high <= EE_HIGH[:2])).all():
         raise ValueError(
             f"spawn area of {scene.name}: spawn_low={scene.spawn_low} must be below spawn_high="
-            f"{scene.spawn_high}, and both within the arm's reach, {EE_LOW[:2].tolist()} to "
+            f"{scene.spawn_high}, and both in the workspace, {EE_LOW[:2].tolist()} to "
             f"{EE_HIGH[:2].tolist()} m"
         )
     for name in scene.objects:

@@ -117,8 +117,8 @@ class Judge:
             ids: the simulations.
             closing_axis: (k, 3) the direction in which the fingers close, world frame.
             settled: the bodies came to rest before: one reading counts as two.
-            stepped: False after an intervention without a control step, at which nothing comes to rest and no hold
-                grows older: it counts as no reading of its own.
+            stepped: False where one body was put elsewhere without a control step: no other comes to rest by it,
+                and no hold grows older.
         """
         unseen = ids[self._looks[ids] == 0]
         if len(unseen):
