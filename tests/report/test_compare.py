@@ -209,6 +209,12 @@ def test_checkpoints_of_several_ages_are_said_and_a_run_of_two_names_is_refused(
     write_evaluation(tmp_path / "b/3", policy, tasks=["1110", "1001"])
     with pytest.raises(SystemExit, match=r"runs/seed1 and /elsewhere/runs/seed1 may be one training"):
         compare(monkeypatch, a, tmp_path / "b")
+    # As it was called while it trained, which may have been before the other or after.
+    write_evaluation(tmp_path / "b/3", "runs/seed1/checkpoints/last/pretrained_model", tasks=["1110", "1001"])
+    with pytest.raises(
+        SystemExit, match=r"runs/seed1 has evaluations of last and of 0307200, and which is the later"
+    ):
+        compare(monkeypatch, a, tmp_path / "b")
 
 
 def test_policies_are_told_apart_by_what_they_are_not_by_their_names(tmp_path, monkeypatch, capsys):
