@@ -1,6 +1,7 @@
 """`cronos-report compare`: folders of evaluations and runs, paired episode by episode."""
 
 import json
+import shutil
 import re
 import sys
 
