@@ -83,6 +83,8 @@ class VideoFile:
         self._stream.height = height
         self._stream.width = width
         self._stream.time_base = self._time_base
+        with ordinary_priority():
+            self._stream.codec_context.open()
 
     def append(self, frames: np.ndarray) -> None:
         """Encode an episode, uint8 (T, H, W, 3) RGB; its first frame becomes a keyframe."""
@@ -116,12 +118,7 @@ class VideoFile:
         self.close()
 
     def _mux(self, frame: av.VideoFrame | None) -> None:
-        if self._stream.codec_context.is_open:
-            packets = self._stream.encode(frame)
-        else:
-            with ordinary_priority():
-                packets = self._stream.encode(frame)
-        for packet in packets:
+        for packet in self._stream.encode(frame):
             packet.duration = 1  # in the stream's time base; without it a file's last frame lasts 0 s
             self._container.mux(packet)
 

@@ -290,11 +290,9 @@ class CronosEvalConfig:
     @cached_property
     def policy_files(self) -> str | None:
         """The same of its weights and processors alone, whatever flags made of its config; None of the expert."""
-        return (
-            None
-            if self.policy is None
-            else files_fingerprint(Path(self.policy.pretrained_path or ""), with_base=False)
-        )
+        if self.policy is None:
+            return None
+        return files_fingerprint(Path(self.policy.pretrained_path or ""), with_base=False)
 
     def identity(self) -> dict[str, Any]:
         """Everything that decides the result of a chain, as JSON values."""

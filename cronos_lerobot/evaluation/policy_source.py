@@ -26,9 +26,8 @@ FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 UNDECISIVE = ("pretrained_path", "pretrained_revision", "push_to_hub", "repo_id", "private", "tags", "license")
 """Fields of a policy's config that say where it is and not what it does."""
 
-
-BASE = ("base_model_name_or_path", "revision")
-"""What PEFT's adapters say of the policy that they go onto."""
+ADAPTER_CONFIG, BASE, REVISION = "adapter_config.json", "base_model_name_or_path", "revision"
+"""PEFT's file beside adapters, and what it says of the policy that they go onto."""
 
 
 @dataclass(frozen=True)
@@ -141,13 +140,13 @@ def _weights_and_processors(folder: Path) -> Iterator[bytes]:
         for file in sorted(folder.glob(pattern)):
             yield file.name.encode() + _hash(file)
     if adapters := _adapter_config(folder):
-        settings = {name: value for name, value in adapters.items() if name not in BASE}
+        settings = {name: value for name, value in adapters.items() if name not in (BASE, REVISION)}
         yield json.dumps(settings, sort_keys=True).encode()
 
 
 def _base_of_adapters(folder: Path) -> Iterator[bytes]:
     """Of PEFT's adapters the policy that they go onto: its weights in a folder, its name on the Hub."""
-    name, revision = (_adapter_config(folder).get(field) for field in BASE)
+    name, revision = (_adapter_config(folder).get(field) for field in (BASE, REVISION))
     if not name:
         return
     # The folder may have been named from where the training ran, such as outputs/clone.
@@ -160,7 +159,7 @@ def _base_of_adapters(folder: Path) -> Iterator[bytes]:
 
 
 def _adapter_config(folder: Path) -> dict[str, Any]:
-    path = folder / "adapter_config.json"
+    path = folder / ADAPTER_CONFIG
     return json.loads(path.read_text()) if path.is_file() else {}
 
 

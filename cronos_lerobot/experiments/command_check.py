@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import draccus
@@ -75,6 +76,9 @@ def _check(given: dict[str, str], policy_type: str | None) -> None:
     config = draccus.decode(CronosTrainConfig, deflatten(values, sep="."))
     if config.env is not None:
         config.check_env(config.env)
+        # A recording's folder is looked at when its run begins, or goes on.
+        if config.record.repo_id is None:
+            config.record.check(Path(config.output_dir or ""), config.num_envs, config.env, resume=False)
     settings = [name.removeprefix("algorithm.") for name in given if name.startswith("algorithm.")]
     check_settings(config.algorithm, settings, resume=False)
 

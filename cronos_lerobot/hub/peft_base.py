@@ -6,10 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+from cronos_lerobot.evaluation.policy_source import ADAPTER_CONFIG, BASE, REVISION
 from cronos_lerobot.hub.runs import is_repository
 
-ADAPTER_CONFIG = "adapter_config.json"
-BASE, REVISION = "base_model_name_or_path", "revision"
 CHECKPOINT, CHECKPOINT_REVISION = "checkpoint", "checkpoint_revision"
 """OpenVLA's own names of them, in config.json."""
 

@@ -215,6 +215,7 @@ WOULD_NOT_BEGIN = {
     "--protocol.extra_resets=[stock]": "protocol.extra_resets has ['stock']",
     "--algorithm.type=nobody": "got 'nobody'",
     "--algorithm.policy_lr=1": "algorithm.policy_lr must be policy_lr_min=1e-06",
+    "--record.streams=2": "--record.streams=2 records nothing without --record.repo_id",
     "--env.split=held_out": "--env.split=held_out is of lerobot-eval",
     "--algorithm.self_imitation.max_age=3": "max_age=3 has no effect here: it needs an --algorithm.self_imitation",
 }

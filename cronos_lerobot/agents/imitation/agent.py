@@ -190,10 +190,10 @@ class ImitationAgent(LearningAgent):
         self._trained = [param for param in self._learner.parameters() if param.requires_grad]
         # Steps of such a rate, and those of an average, are smaller than what a half of the bits can hold.
         if coarse := sorted({str(param.dtype) for param in self._trained} - {"torch.float32"}):
-            config = self.policy.config
             # SmolVLA's is that of the network whose weights it is built around.
-            how = "dtype=float32" if hasattr(config, "dtype") else "load_vlm_weights=false"
-            how = f" (--policy.{how})" if hasattr(config, how.partition("=")[0]) else ""
+            flags = {"dtype": "dtype=float32", "load_vlm_weights": "load_vlm_weights=false"}
+            config = self.policy.config
+            how = next((f" (--policy.{flag})" for name, flag in flags.items() if hasattr(config, name)), "")
             raise ValueError(
                 f"--algorithm.type=imitation would learn next to nothing: {', '.join(coarse)} cannot hold the"
                 f" small steps of the weights that are trained. Load them in float32{how}, or train adapters"

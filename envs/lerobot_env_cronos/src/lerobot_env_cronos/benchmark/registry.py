@@ -2,16 +2,18 @@
 
 import re
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 
 from lerobot_env_cronos.benchmark.configurations import set_configurations_file
 from lerobot_env_cronos.benchmark.version import gymnasium_id
 from lerobot_env_cronos.scene.bodies import SHAPES
 from lerobot_env_cronos.scene.model import TABLE
-from lerobot_env_cronos.scene.robot import ARM_JOINTS, EE_HIGH, EE_LOW, FINGER_JOINTS, LINKS
+from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, add_robot
 from lerobot_env_cronos.scene.scenes import BODIES, SCENES, Body, Scene
 from lerobot_env_cronos.scene.visuals.objects import LOOKS
 
@@ -21,11 +23,6 @@ PLAIN_SHAPES = ("box", "disc")
 ROUND_SHAPES = ("disc", "plate")
 MAX_WIDTH_M = 0.044
 """What the gripper takes between its fingers."""
-RESERVED = frozenset(
-    {"world", TABLE, "base_link", *(link.name for link in LINKS), *(f"{joint}_link" for joint in FINGER_JOINTS)}
-    | {*ARM_JOINTS, *FINGER_JOINTS}
-)
-"""Names of the table and of the robot's parts, by which MuJoCo and instructions know them."""
 
 
 def register_scene(scene: Scene, bodies: Sequence[Body] = (), configurations: Path | str | None = None) -> None:
@@ -59,12 +56,12 @@ def _check(scene: Scene, new_bodies: dict[str, Body]) -> None:
         raise ValueError(f"scene name {scene.name!r} must consist of a-z, 0-9 and _")
     if SCENES.get(scene.name, scene) != scene:
         raise ValueError(f"there is another scene {scene.name!r}; names in use: {sorted(SCENES)}")
-    valid_shapes = sorted(SHAPES.keys() & LOOKS.keys())
+    reserved, valid_shapes = _reserved_names(), sorted(SHAPES.keys() & LOOKS.keys())
     for name, body in new_bodies.items():
         if BODIES.get(name, body) != body:
             raise ValueError(f"there is another body {name!r}; names in use: {sorted(BODIES)}")
-        if name in RESERVED:
-            raise ValueError(f"a body cannot be named {name!r}: reserved are {sorted(RESERVED)}")
+        if name in reserved:
+            raise ValueError(f"a body cannot be named {name!r}: reserved are {sorted(reserved)}")
         if body.shape not in valid_shapes:
             raise ValueError(f"unknown shape {body.shape!r} of the {name}; valid shapes: {valid_shapes}")
         if min(body.size) <= 0 or body.density <= 0:
@@ -94,6 +91,14 @@ def _check(scene: Scene, new_bodies: dict[str, Body]) -> None:
                 f"the {name} is an object, {1000 * width:.0f} mm wide where it is narrowest; the gripper takes "
                 f"less than {1000 * MAX_WIDTH_M:.0f} mm"
             )
+
+
+@cache
+def _reserved_names() -> frozenset[str]:
+    """Of the table and of the robot's bodies and joints: MuJoCo drops a second joint of a name without a word."""
+    robot = mujoco.MjSpec()
+    add_robot(robot)
+    return frozenset({TABLE, *(part.name for part in (*robot.bodies, *robot.joints))})
 
 
 def register_gymnasium() -> None:
