@@ -125,9 +125,11 @@ def _open(
     task = find_task(scene.name, cfg.env.task)
     tasks = tasks_of(cfg, scene) if task is None else [task]
     check_starts(cfg.start, scene, tasks)
-    policy = None if cfg.start.policy is None else load_spectator(cfg.start.policy, cfg.env)
+    # Once: the last checkpoint of a run that goes on is soon another one.
+    source = None if cfg.start.policy is None else find_policy(cfg.start.policy).folder
+    policy = None if source is None else load_spectator(str(source), cfg.env)
     env = CronosVectorEnv(cfg.num_envs, cfg.env.scene, **cfg.env.gym_kwargs)
-    writer = open_writer(cfg, env)
+    writer = open_writer(cfg, env, source)
     if policy is not None:
         policy.seed(cfg.seed + writer.num_episodes)
     return env, writer, policy, tasks
@@ -170,8 +172,11 @@ def _collect(
     )
 
 
-def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv) -> SegmentWriter:
+def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv, source: Path | None = None) -> SegmentWriter:
     """A new dataset, or the one that is there if `resume` or `overwrite` says what to do with it.
+
+    Args:
+        source: the files of `start.policy`, if there is one.
 
     Raises:
         FileExistsError: the folder exists and neither flag is set.
@@ -181,7 +186,7 @@ def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv) -> SegmentWriter:
     """
     root = cfg.dataset.root
     assert root is not None
-    policy = None if cfg.start.policy is None else files_fingerprint(find_policy(cfg.start.policy).folder)
+    policy = None if source is None else files_fingerprint(source)
     origin = origin_of(env, DEMONSTRATIONS, flags_of(cfg), policy)
     if cfg.resume:
         writer = SegmentWriter.resume(cfg.dataset.repo_id, root, origin=origin, may_differ=MAY_DIFFER)

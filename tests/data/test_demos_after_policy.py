@@ -14,6 +14,7 @@ from tiny_checkpoints import STATE, save_policy
 from cronos_lerobot.data.demos import DemoConfig, ExpertError, StartConfig
 from cronos_lerobot.data.origin import read_origin
 from cronos_lerobot.evaluation.policy_source import files_fingerprint
+from cronos_lerobot.scripts import record_demos as recording
 from cronos_lerobot.scripts.record_demos import record_demos
 
 NUM_ENVS = 4
@@ -137,3 +138,26 @@ def test_the_command_begins_with_a_checkpoint_that_fits(tmp_path):
     assert not (tmp_path / "pixels").exists()
     with pytest.raises(ValueError, match="is neither a folder nor <owner>/<repository> on the Hub"):
         record_demos(command(tmp_path / "p", 1, start=StartConfig(policy="no such/policy at all")))
+
+
+def test_the_last_checkpoint_is_looked_up_once(tmp_path, monkeypatch):
+    checkpoints = tmp_path / "checkpoints"
+    for name in ("10", "20"):
+        torch.manual_seed(int(name))
+        save_policy(checkpoints / name, "pocketvla", STATE)
+    last = checkpoints / "last"
+    last.symlink_to("10")
+
+    def the_run_goes_on(*args, load=recording.load_spectator):
+        policy = load(*args)
+        last.unlink()
+        last.symlink_to("20")
+        return policy
+
+    monkeypatch.setattr(recording, "load_spectator", the_run_goes_on)
+    config = command(tmp_path / "d", 1, start=StartConfig(policy=str(last)))
+    config.env = CronosEnvConfig(**STATE)
+    record_demos(config)
+    dataset = LeRobotDataset("me/d", root=tmp_path / "d")
+    begun_with = read_origin(tmp_path / "d", dataset.meta.features, "it").start_policy
+    assert begun_with == files_fingerprint(checkpoints / "10") != files_fingerprint(checkpoints / "20")
