@@ -172,7 +172,7 @@ def _collect(
     )
 
 
-def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv, source: Path | None = None) -> SegmentWriter:
+def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv, source: Path | None) -> SegmentWriter:
     """A new dataset, or the one that is there if `resume` or `overwrite` says what to do with it.
 
     Args:
