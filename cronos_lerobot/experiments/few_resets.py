@@ -47,6 +47,7 @@ PLUGS: dict[str, Plug] = {
     "asked": Plug(("--protocol.scene_reset=critic",), (("--protocol.reset_budget", BUDGET),), interval=None),
     "early": Plug((), interval=LATE, stages=((EARLY_RESETS * EARLY, EARLY),)),
     "decay": Plug(("--algorithm.kl_decay_updates=10",)),
+    "learnable": Plug(("--protocol.reset_starts=learnable",)),
     "memory": Plug(("--algorithm.self_imitation.coef=0.05",)),
     "takeover": Plug(("--protocol.takeover_after=2",), (("--protocol.takeover_budget", BUDGET),), interval=None),
 }

@@ -18,6 +18,7 @@ MAX_FAILURES = 16
 
 RESET_PHASES = ("together", "staggered")
 SCENE_RESETS = ("periodic", "critic")
+RESET_STARTS = ("random", "learnable")
 VALUELESS_ORDERS = ("heuristic", "random")
 """Task orders that ask for no values; those of a user's may."""
 
@@ -80,6 +81,9 @@ class ProtocolConfig:
     scene_reset: str = "periodic"
     """Who asks for scene resets: `periodic`, every T steps, or `critic`, for streams in which the agent's values
     see nothing left to learn, one at a time, `reset_budget` in the whole run."""
+    reset_starts: str = "random"
+    """Where scene resets put a stream: `random`, any training configuration, the next task being the order's, or
+    `learnable`, a configuration and a first task of which the policy neither always succeeds nor always fails."""
     critic: CriticConfig = field(default_factory=CriticConfig)
     """How values choose, for `task_order=critic` and `scene_reset=critic`."""
     end_effector_reset: bool = True
@@ -143,9 +147,11 @@ class ProtocolConfig:
         return self.scene_reset_interval
 
     def _check_scene_reset(self) -> None:
-        for name, valid in (("reset_phase", RESET_PHASES), ("scene_reset", SCENE_RESETS)):
+        choices = {"reset_phase": RESET_PHASES, "scene_reset": SCENE_RESETS, "reset_starts": RESET_STARTS}
+        for name, valid in choices.items():
             if getattr(self, name) not in valid:
                 raise ValueError(f"protocol.{name} must be one of {valid}, got {getattr(self, name)!r}.")
+        self._check_reset_starts()
         if self.scene_reset == "periodic":
             longest = max(T or 0 for T in (self.scene_reset_interval, *(T for _, T in self.curriculum)))
             if self.reset_phase == "staggered" and longest <= self.task_switch_interval:
@@ -166,6 +172,20 @@ class ProtocolConfig:
             raise ValueError(
                 f"protocol.scene_reset_interval={self.scene_reset_interval} is for periodic scene resets; with "
                 "protocol.scene_reset=critic there are none: leave it out, or give null."
+            )
+
+    def _check_reset_starts(self) -> None:
+        if self.reset_starts == "random":
+            return
+        if self.learned_reset:
+            raise ValueError(
+                f"protocol.reset_starts={self.reset_starts} says which task comes first after a scene reset, and "
+                "with protocol.learned_reset=true it may be a reset task: choose one of them."
+            )
+        if self.scene_reset == "periodic" and self.scene_reset_interval is None and not self.curriculum:
+            raise ValueError(
+                f"protocol.reset_starts={self.reset_starts} says where scene resets put a stream, and with "
+                "protocol.scene_reset_interval=null there are none: leave one of them out."
             )
 
     def _check_takeovers(self) -> None:

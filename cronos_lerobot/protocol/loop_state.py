@@ -71,6 +71,8 @@ class LoopState:
     """(N, len(Intervention)) events of each kind."""
     task_value: np.ndarray = field(init=False)
     """(N,) the agent's value of the current task when it was given, where the task order asked for it; else 0."""
+    first_task: np.ndarray = field(init=False)
+    """(N,) the task that the last scene reset of a stream was for, until it is given; -1 is none."""
     reset_value: np.ndarray = field(init=False)
     """(N,) its best value over the tasks when the stream's last scene reset was asked for, if by value; else 0."""
     scene_resets_before: np.ndarray = field(init=False)
@@ -98,6 +100,7 @@ class LoopState:
         self.recent_success = np.full((n, HISTORY), -1, np.int64)
         self.interventions = np.zeros((n, len(Intervention)), np.int64)
         self.task_value = np.zeros(n)
+        self.first_task = np.full(n, -1, np.int64)
         self.reset_value = np.zeros(n)
         self.scene_resets_before = np.zeros(n, np.int64)
         self.asked_resets = np.zeros(n, np.int64)
@@ -132,8 +135,14 @@ class LoopState:
         }
 
     def switch_task(self, task: np.ndarray) -> None:
-        """Begin a segment of every stream; `task` is (N,) indices into the task set."""
-        self.task = np.asarray(task, np.int64)
+        """Begin a segment of every stream.
+
+        Args:
+            task: (N,) indices into the task set, for all but those whose scene reset was for another one.
+        """
+        was_for_one = self.first_task >= 0
+        self.task = np.where(was_for_one, self.first_task, np.asarray(task, np.int64))
+        self.first_task = np.full(self.num_streams, -1, np.int64)
         self.taken_over = np.zeros(self.num_streams, np.bool_)
         self.begins_segment = True
         self.switches += 1

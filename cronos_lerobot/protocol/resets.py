@@ -12,6 +12,7 @@ from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
 
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.interventions import BEFORE_SEGMENTS, Intervention
+from cronos_lerobot.protocol.learnable_starts import LearnableStarts
 from cronos_lerobot.protocol.loop_state import LoopState
 from cronos_lerobot.protocol.reset_strategy import ResetStrategy
 from cronos_lerobot.protocol.task_values import RunContext, TaskValues
@@ -277,12 +278,16 @@ def make_resets(protocol: ProtocolConfig, rng: Callable[[str], np.random.Generat
                 f" before a segment, one of {[kind.name for kind in BEFORE_SEGMENTS]}, got "
                 f"{getattr(strategy, 'kind', None)!r}"
             )
-    scene_reset = CriticSceneReset if protocol.scene_reset == "critic" else PeriodicSceneReset
+    scene: ResetStrategy = (CriticSceneReset if protocol.scene_reset == "critic" else PeriodicSceneReset)(
+        rng("resets/scene"), protocol
+    )
+    if protocol.reset_starts == "learnable":
+        scene = LearnableStarts(scene, rng("resets/starts"), protocol.num_configurations)
     return Resets(
         initial=InitialPlacement(rng("resets/initial"), protocol.num_configurations),
         divergence=DivergenceReset(rng("resets/divergence"), protocol.num_configurations),
         end_effector=EndEffectorReset() if protocol.end_effector_reset else NoReset(),
         heuristic=HeuristicReset(rng("resets/heuristic")) if protocol.heuristic_reset else NoReset(),
         extra=extra,
-        scene=scene_reset(rng("resets/scene"), protocol),
+        scene=scene,
     )

@@ -135,7 +135,8 @@ class CriticOrder:
         odds = self.weigh(values, self._values.find_complete(loop)).cumsum(axis=1)
         drawn = self.rng.random(loop.num_streams)[:, None] * odds[:, -1:]
         task = (odds > drawn).argmax(axis=1)
-        loop.task_value = values[np.arange(loop.num_streams), task]
+        given = np.where(loop.first_task >= 0, loop.first_task, task)
+        loop.task_value = values[np.arange(loop.num_streams), given]
         return task
 
     def weigh(self, values: np.ndarray, complete: np.ndarray) -> np.ndarray:

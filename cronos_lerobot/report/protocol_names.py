@@ -8,7 +8,7 @@ DESCRIBED = tuple(
     f"protocol.{name}"
     for name in (
         "scene_reset_interval", "curriculum", "end_effector_reset", "learned_reset", "heuristic_reset",
-        "extra_resets", "task_order", "num_configurations", "reset_phase", "scene_reset",
+        "extra_resets", "task_order", "num_configurations", "reset_phase", "reset_starts", "scene_reset",
         "takeover_after", "takeover_price", "reset_budget", "takeover_budget",
     )
 )  # fmt: skip
@@ -33,6 +33,8 @@ def describe_protocol(protocol: dict[str, Any]) -> str:
         del ticks["EER"]
     if protocol.get("reset_phase", "together") != "together":
         words.append(protocol["reset_phase"])
+    if protocol.get("reset_starts", "random") != "random":
+        words.append(f"{protocol['reset_starts']} starts")
     words += [word for word, name in ticks.items() if protocol.get(name)]
     words += protocol.get("extra_resets") or []
     if protocol.get("task_order", "heuristic") != "heuristic":

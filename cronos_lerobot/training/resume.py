@@ -35,7 +35,7 @@ _TABLE = {
     "policy.": {FOLLOWED: "device push_to_hub repo_id private tags license", REFUSED: "path *"},
     "protocol.": {
         FOLLOWED: "update_interval scene_reset_interval curriculum end_effector_reset heuristic_reset "
-        "extra_resets reset_budget reset_phase scene_reset critic.* task_order num_configurations "
+        "extra_resets reset_budget reset_phase reset_starts scene_reset critic.* task_order num_configurations "
         "takeover_after takeover_budget takeover_price takeover_expert",
         REFUSED: "task_switch_interval learned_reset reward",
     },

@@ -290,8 +290,8 @@ def test_many_differences_of_the_protocol_are_put_as_the_paper_does(tmp_path):
         ({"scene_reset_interval": None, "task_switch_interval": 80}, "no scene resets"),
         (
             {"scene_reset_interval": 1280, "task_switch_interval": 80, "end_effector_reset": True,
-             "reset_phase": "staggered", "task_order": "critic"},
-            "T = 1280, staggered, EER, critic order",
+             "reset_phase": "staggered", "reset_starts": "learnable", "task_order": "critic"},
+            "T = 1280, staggered, learnable starts, EER, critic order",
         ),
         (
             {"scene_reset_interval": 80, "task_switch_interval": 80, "end_effector_reset": True,

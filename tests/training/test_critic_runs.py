@@ -25,6 +25,7 @@ from cronos_lerobot.training.seeding import NamedGenerators
 
 EVERYTHING = {"scene_reset": "critic", "reset_budget": 12, "scene_reset_interval": None}
 STAGGERED = {"reset_phase": "staggered", "scene_reset_interval": 16}
+LEARNABLE = {"reset_starts": "learnable", "scene_reset_interval": 8}
 
 
 def critic_protocol(**options):
@@ -35,7 +36,7 @@ def critic_protocol(**options):
     return ProtocolConfig(**(defaults | options))
 
 
-@pytest.mark.parametrize("options", [EVERYTHING, STAGGERED], ids=["critic", "staggered"])
+@pytest.mark.parametrize("options", [EVERYTHING, STAGGERED, LEARNABLE], ids=["critic", "staggered", "learnable"])
 def test_resumed_run_equals_the_unbroken_one(tmp_path, options):
     unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
     whole = train(config(unbroken, protocol=critic_protocol(**options)))
