@@ -184,8 +184,17 @@ class ProtocolConfig:
             )
         if self.scene_reset == "periodic" and self.scene_reset_interval is None and not self.curriculum:
             raise ValueError(
-                f"protocol.reset_starts={self.reset_starts} says where scene resets put a stream, and with "
-                "protocol.scene_reset_interval=null there are none: leave one of them out."
+                f"protocol.reset_starts={self.reset_starts} says where scene resets put a stream that are "
+                "periodic or that the critic asks for, and with protocol.scene_reset_interval=null there are none "
+                "of them: leave one of the two out."
+            )
+        intervals = {self.scene_reset_interval, *(T for _, T in self.curriculum)}
+        every_switch = self.scene_reset == "periodic" and intervals == {self.task_switch_interval}
+        if every_switch and self.task_order != "heuristic":
+            raise ValueError(
+                f"protocol.reset_starts={self.reset_starts} says which task comes first after a scene reset, and "
+                f"with one at every task switch protocol.task_order={self.task_order} would say nothing: leave "
+                "one of the two out."
             )
 
     def _check_takeovers(self) -> None:

@@ -52,7 +52,11 @@ class TaskOrder(Protocol):
     """
 
     def draw(self, loop: LoopState) -> np.ndarray:
-        """Return the next task of every stream, (N,) indices below `loop.num_tasks`."""
+        """Return the next task of every stream, (N,) indices below `loop.num_tasks`.
+
+        With `protocol.reset_starts=learnable` a stream that was just reset is given its `loop.first_task` instead,
+        where that is not -1.
+        """
         ...
 
 

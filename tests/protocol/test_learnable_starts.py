@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from dummies import DummyEnv
 from test_critic import Opinionated
+from test_critic import run as run_by_value
 from test_rf_mtrl import FastEnv, protocol, run
 
 from cronos_lerobot.protocol.config import CriticConfig
@@ -155,11 +156,47 @@ def test_they_change_neither_when_nor_how_many():
     assert ends["random"] == ends["learnable"]
 
 
-def test_runs_without_them_draw_what_they_did():
+def test_they_draw_from_a_generator_of_their_own():
     generators = NamedGenerators(0)
-    assert "resets/starts" not in generators.state_dict()["numpy"]
     make_resets(protocol(), generators.for_numpy)
     assert "resets/starts" not in generators.state_dict()["numpy"]
+    make_resets(protocol(reset_starts="learnable"), generators.for_numpy)
+    assert "resets/starts" in generators.state_dict()["numpy"]
+
+
+@pytest.mark.parametrize("now", [2, 8])
+def test_a_resumed_run_may_draw_from_more_or_fewer_configurations(now):
+    before, env, loop = starts(4), Placed(3), TaskSet(TASKS).new_loop(3)
+    reset(before, env, loop)
+    before._awaited[:, :2] = [(0, 1), (3, 2), (1, 0)]
+    finish(loop, [True, False, True])
+    reset(before, env, loop)
+    before._awaited[:, :2] = [(0, 1), (3, 2), (1, 0)]
+    after = starts(now)
+    after.load_state_dict(before.state_dict())
+    assert after.weigh().shape == (now, 4)
+    assert after._outcomes.sum() == (2 if now == 2 else 3)
+    finish(loop, [False, False, False])
+    after.due(env, loop)
+    assert after._outcomes[0, 1].tolist() == [1, 0.8]
+    if now == 8:
+        assert after._outcomes[3, 2].tolist() == [1.8, 0]
+    drawn = set()
+    for _ in range(60):
+        after.apply(env, np.arange(3))
+        drawn |= set(env.configuration.tolist())
+    assert drawn == set(range(now))
+
+
+def test_resets_that_the_critic_asks_for_go_there_too_and_are_counted_as_asked():
+    config = protocol(
+        scene_reset="critic", reset_budget=6, reset_starts="learnable", critic=CriticConfig(failures=1)
+    )
+    _, loop, _ = run_by_value(config, steps=200, values=[0.1, 0.2, 0.3, 0.4])
+    assert loop.asked_resets.sum() == loop.interventions[:, Intervention.SCENE_RESET].sum() == 5
+    # The sixth would come after the last segment. The heuristic order gives each stream its tasks in turn.
+    told = loop.recent_task[0][loop.recent_task[0] >= 0]
+    assert not np.array_equal(told, (np.arange(len(told)) + told[0]) % 4)
 
 
 def test_the_critics_order_tells_the_value_of_the_task_that_is_given():
@@ -186,7 +223,11 @@ def test_the_critics_order_tells_the_value_of_the_task_that_is_given():
     [
         ({"reset_starts": "hard"}, r"reset_starts must be one of \('random', 'learnable'\), got 'hard'"),
         ({"reset_starts": "learnable", "learned_reset": True}, "learned_reset=true it may be .*: choose one"),
-        ({"reset_starts": "learnable", "scene_reset_interval": None}, "null there are none: leave one of them"),
+        ({"reset_starts": "learnable", "scene_reset_interval": None}, "null there are none of them: leave one"),
+        (
+            {"reset_starts": "learnable", "scene_reset_interval": 2, "task_order": "random"},
+            "=random would say nothing",
+        ),
     ],
 )
 def test_what_makes_no_sense_is_refused(options, message):
