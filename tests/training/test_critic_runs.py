@@ -117,7 +117,8 @@ def told_apart(answer):
 
 def in_processes(folder, minibatch_size, **options):
     cfg = settings(folder, minibatch_size, **options)
-    cfg.protocol = critic_protocol(**EVERYTHING | {"reset_budget": 60}, heuristic_reset=True)
+    asked = EVERYTHING | {"reset_budget": 60, "reset_starts": "learnable"}
+    cfg.protocol = critic_protocol(**asked, heuristic_reset=True)
     return cfg
 
 
