@@ -151,9 +151,11 @@ class ProtocolConfig:
         for name, valid in choices.items():
             if getattr(self, name) not in valid:
                 raise ValueError(f"protocol.{name} must be one of {valid}, got {getattr(self, name)!r}.")
-        self._check_reset_starts()
+        intervals = {T or 0 for T in (self.scene_reset_interval, *(T for _, T in self.curriculum))}
+        if self.reset_starts != "random":
+            self._check_reset_starts(intervals if self.scene_reset == "periodic" else None)
         if self.scene_reset == "periodic":
-            longest = max(T or 0 for T in (self.scene_reset_interval, *(T for _, T in self.curriculum)))
+            longest = max(intervals)
             if self.reset_phase == "staggered" and longest <= self.task_switch_interval:
                 raise ValueError(
                     "protocol.reset_phase=staggered puts resets at other task switches, and there is none between "
@@ -174,23 +176,19 @@ class ProtocolConfig:
                 "protocol.scene_reset=critic there are none: leave it out, or give null."
             )
 
-    def _check_reset_starts(self) -> None:
-        if self.reset_starts == "random":
-            return
+    def _check_reset_starts(self, intervals: set[int] | None) -> None:
         if self.learned_reset:
             raise ValueError(
                 f"protocol.reset_starts={self.reset_starts} says which task comes first after a scene reset, and "
                 "with protocol.learned_reset=true it may be a reset task: choose one of them."
             )
-        if self.scene_reset == "periodic" and self.scene_reset_interval is None and not self.curriculum:
+        if intervals == {0}:
             raise ValueError(
                 f"protocol.reset_starts={self.reset_starts} says where scene resets put a stream that are "
                 "periodic or that the critic asks for, and with protocol.scene_reset_interval=null there are none "
                 "of them: leave one of the two out."
             )
-        intervals = {self.scene_reset_interval, *(T for _, T in self.curriculum)}
-        every_switch = self.scene_reset == "periodic" and intervals == {self.task_switch_interval}
-        if every_switch and self.task_order != "heuristic":
+        if intervals == {self.task_switch_interval} and self.task_order != "heuristic":
             raise ValueError(
                 f"protocol.reset_starts={self.reset_starts} says which task comes first after a scene reset, and "
                 f"with one at every task switch protocol.task_order={self.task_order} would say nothing: leave "

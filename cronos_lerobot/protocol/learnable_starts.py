@@ -17,10 +17,10 @@ class LearnableStarts(ResetStrategy):
 
     A start is a training configuration and the task that is given first there. Of each it is kept how many of
     the segments that began so were successes. With the prior Beta(2 r, 2 (1 - r)), where r is their rate over
-    all starts, a start is drawn with a probability proportional to E[p (1 - p)] ** sharpness: its learnability
-    (Tzannetos et al., 2023; Rutherford et al., 2024, who take the highest), where one that was never tried
-    counts for what the others are on average. Each new outcome takes a fifth of what earlier ones of its start
-    count for, since the policy has changed since then.
+    all starts, a start is drawn with a probability proportional to the square of the expected p (1 - p), its
+    learnability (Tzannetos et al., 2023; Rutherford et al., 2024, who take the highest), where one that was never
+    tried counts for what the others are on average. Each new outcome takes a fifth of what earlier ones of its
+    start count for, since the policy has changed since then.
 
     It goes by outcomes alone, so that it serves every agent and policy, and changes neither how many scene
     resets there are nor when or for which stream: that is decided by the strategy that it is put around. What an
@@ -30,7 +30,6 @@ class LearnableStarts(ResetStrategy):
         inner: decides when scene resets are due, and counts them.
         rng: draws the starts.
         num_configurations: draws only from the first so many of the training split's 64.
-        sharpness: 0 is uniform.
     """
 
     kind = Intervention.SCENE_RESET
@@ -39,56 +38,57 @@ class LearnableStarts(ResetStrategy):
     in .31 of those where they have failed once, for which it is 3.3; before training they fail more often."""
     MEMORY = 0.8
     """What an outcome counts for when the next one of the same start is known."""
+    SHARPNESS = 2.0
+    """The power of the learnability that a start is drawn by; 0 would be uniform."""
 
-    def __init__(
-        self, inner: ResetStrategy, rng: np.random.Generator, num_configurations: int, sharpness: float = 2.0
-    ) -> None:
+    def __init__(self, inner: ResetStrategy, rng: np.random.Generator, num_configurations: int) -> None:
         self.inner, self.rng, self.num_configurations = inner, rng, num_configurations
-        self.sharpness = sharpness
         self._outcomes = np.empty((num_configurations, 0, 2))  # (configurations, tasks, 2): failures, successes
-        self._awaited = np.empty((0, 3), np.int64)  # (N, 3): configuration, task and divergences then; -1 is none
+        self._awaited = np.empty(0, np.int64)  # (N,): the configuration that the segment began in; -1 is no start
+        self._divergences = np.empty(0, np.int64)  # (N,): those that each stream had had then
 
     def bind(self, run: RunContext) -> None:
         """Tell the strategy that decides when."""
         self.inner.bind(run)
 
     def state_dict(self) -> dict[str, Any]:
-        """The outcomes by start, and what the streams were given that no outcome is known of yet."""
+        """The outcomes by start, and where the streams are of which no outcome is known yet."""
         if not self._outcomes.size:
             return {}
-        return {"outcomes": self._outcomes, "awaited": self._awaited, "inner": self.inner.state_dict()}
+        own = {"outcomes": self._outcomes, "awaited": self._awaited, "divergences": self._divergences}
+        return own | {"inner": self.inner.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from `state_dict`; of configurations that a resumed run no longer draws from nothing is kept."""
         kept = state["outcomes"][: self.num_configurations]
         self._outcomes = np.zeros((self.num_configurations, *kept.shape[1:]))
         self._outcomes[: len(kept)] = kept
-        self._awaited = state["awaited"].copy()
-        self._awaited[self._awaited[:, 0] >= self.num_configurations] = -1
+        self._awaited = np.where(state["awaited"] < self.num_configurations, state["awaited"], -1)
+        self._divergences = state["divergences"].copy()
         if state["inner"]:
             self.inner.load_state_dict(state["inner"])
 
     def due(self, env: Any, loop: LoopState) -> np.ndarray:
-        """Note what has come of the last starts, then ask the strategy that decides when."""
+        """Note what has come of the last starts, ask the strategy that decides when, and draw starts for those."""
         if not self._outcomes.size:
             self._outcomes = np.zeros((self.num_configurations, loop.num_tasks, 2))
-            self._awaited = np.full((loop.num_streams, 3), -1, np.int64)
-        self._note(loop)
-        return self.inner.due(env, loop)
-
-    def apply(self, env: Any, ids: np.ndarray) -> None:
-        """Place the streams `ids` at starts of their own."""
+            self._awaited = np.full(loop.num_streams, -1, np.int64)
+        else:
+            self._note(loop)
+        ids = self.inner.due(env, loop)
         weights = self.weigh().ravel()
         drawn = self.rng.choice(weights.size, size=len(ids), p=weights / weights.sum())
-        configurations, tasks = np.divmod(drawn, self._outcomes.shape[1])
-        self._awaited[ids, :2] = np.column_stack([configurations, tasks])
-        env.scene_reset(ids, configurations)
+        self._awaited[ids], loop.first_task[ids] = np.divmod(drawn, loop.num_tasks)
+        self._divergences = loop.interventions[:, Intervention.DIVERGENCE].copy()
+        return ids
+
+    def apply(self, env: Any, ids: np.ndarray) -> None:
+        """Place the streams `ids` at their starts."""
+        env.scene_reset(ids, self._awaited[ids])
 
     def count(self, loop: LoopState, ids: np.ndarray) -> None:
-        """Count them as the strategy that decides when does, and ask for the tasks."""
+        """Count them as the strategy that decides when does."""
         self.inner.count(loop, ids)
-        loop.first_task[ids] = self._awaited[ids, 1]
-        self._awaited[ids, 2] = loop.interventions[ids, Intervention.DIVERGENCE]
 
     def weigh(self) -> np.ndarray:
         """Weights (configurations, tasks) that the probabilities of the starts are proportional to."""
@@ -96,13 +96,12 @@ class LearnableStarts(ResetStrategy):
         rate = (successes.sum() + 1) / (self._outcomes.sum() + 2)
         a = self.PRIOR_STRENGTH * rate + successes
         b = self.PRIOR_STRENGTH * (1 - rate) + failures
-        return (a * b / ((a + b) * (a + b + 1))) ** self.sharpness
+        return (a * b / ((a + b) * (a + b + 1))) ** self.SHARPNESS
 
     def _note(self, loop: LoopState) -> None:
-        awaited = self._awaited
-        same_scene = awaited[:, 2] == loop.interventions[:, Intervention.DIVERGENCE]
-        for stream in np.flatnonzero((awaited[:, 0] >= 0) & same_scene & ~loop.taken_over):
-            start = self._outcomes[*awaited[stream, :2]]
+        same_scene = self._divergences == loop.interventions[:, Intervention.DIVERGENCE]
+        for stream in np.flatnonzero((self._awaited >= 0) & same_scene & ~loop.taken_over):
+            start = self._outcomes[self._awaited[stream], loop.task[stream]]
             start *= self.MEMORY
             start[loop.recent_success[stream, -1]] += 1
-        awaited[:] = -1
+        self._awaited[:] = -1
