@@ -37,10 +37,14 @@ def test_operations_are_those_of_the_layers(costs):
     assert one.activation_bytes < whole.activation_bytes
 
 
-def test_the_command_prints_what_it_counts(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["policy_size", "--cases", "smolvla, noise at 1 step", "--utilisation=1"])
+def test_the_command_prints_what_it_counts(costs, monkeypatch, capsys):
+    name = "smolvla, noise at 1 step"
+    asked = []
+    monkeypatch.setattr(policy_size, "count", lambda *case, **sizes: asked.append((case, sizes)) or costs[name])
+    monkeypatch.setattr(sys, "argv", ["policy_size", "--cases", name, "--utilisation=1"])
     policy_size.main()
     line = policy_size.json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert line["case"] == "smolvla, noise at 1 step"
+    assert line["case"] == name
+    assert asked == [(CASES[name], {"words": 48, "played": 10})]
     assert line["estimate"]["act_ms"] == pytest.approx(line["act"] / 495e9, abs=0.01)
     assert line["estimate"]["fixed_gb"] == pytest.approx(1.8 + 1.2, abs=0.05)
