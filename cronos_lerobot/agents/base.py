@@ -81,7 +81,8 @@ class TrainablePolicy(Protocol):
     def rl_parameter_groups(self) -> list[dict[str, Any]]:
         """Return two groups, {"name": "policy" or "value", "params": [...]}, without a parameter in common.
 
-        What is in neither of them is frozen while training.
+        What is in neither of them is frozen while training. A group may have a `weight_decay` and `betas` of its
+        own, for AdamW.
         """
         ...
 

@@ -2,6 +2,7 @@ import logging
 
 import numpy as np
 import pytest
+from dummies import DummyPolicy
 from ppo_samples import make_ppo, reward_for_up, rollout
 
 from cronos_lerobot.agents.ppo.config import PPOConfig
@@ -109,7 +110,7 @@ def test_a_loaded_lr_lies_between_the_ends_that_are_given_now(became, schedule, 
     ppo = make_ppo()
     ppo.policy_lr = became
     now = PPOConfig(policy_lr_min=1e-5, policy_lr_max=5e-4, lr_schedule=schedule)
-    set_optimizer(ppo.optimizer, now, {"policy_lr": 5e-5, "value_lr": 1e-3})
+    set_optimizer(ppo.optimizer, now, {"policy_lr": 5e-5, "value_lr": 1e-3}, ppo.optimizer_settings)
     assert ppo.policy_lr == expected
     assert [group["lr"] for group in ppo.optimizer.param_groups if group["name"] == "value"] == [1e-3]
 
@@ -117,9 +118,23 @@ def test_a_loaded_lr_lies_between_the_ends_that_are_given_now(became, schedule, 
 def test_a_loaded_lr_may_be_held_beyond_the_one_that_the_run_began_with():
     ppo = make_ppo()
     ppo.policy_lr, saved = 3e-4, {"policy_lr": 5e-5, "value_lr": 1e-3}
-    set_optimizer(ppo.optimizer, PPOConfig(policy_lr_min=1e-4), saved)
+    set_optimizer(ppo.optimizer, PPOConfig(policy_lr_min=1e-4), saved, ppo.optimizer_settings)
     assert ppo.policy_lr == 3e-4
-    set_optimizer(ppo.optimizer, PPOConfig(policy_lr_max=4e-5), saved)
+    set_optimizer(ppo.optimizer, PPOConfig(policy_lr_max=4e-5), saved, ppo.optimizer_settings)
     assert ppo.policy_lr == 4e-5
     with pytest.raises(ValueError, match=r"policy_lr must be .* to policy_lr_max=0\.001, got 0\.01"):
-        set_optimizer(ppo.optimizer, PPOConfig(policy_lr=0.01), saved)
+        set_optimizer(ppo.optimizer, PPOConfig(policy_lr=0.01), saved, ppo.optimizer_settings)
+
+
+def test_a_loaded_optimizer_keeps_the_policys_own_settings():
+    class Own(DummyPolicy):
+        def rl_parameter_groups(self):
+            policy, value = super().rl_parameter_groups()
+            return [policy | {"weight_decay": 0.25}, value | {"betas": (0.5, 0.75)}]
+
+    ppo = make_ppo(policy=Own(), weight_decay=0.125, beta1=0.625)
+    now = make_ppo(policy=Own(), weight_decay=0.0625, beta2=0.875)
+    now.optimizer.load_state_dict(ppo.optimizer.state_dict())
+    set_optimizer(now.optimizer, now.config, {"policy_lr": 5e-5, "value_lr": 1e-3}, now.optimizer_settings)
+    seen = [(group["weight_decay"], group["betas"]) for group in now.optimizer.param_groups]
+    assert seen == [(0.25, (0.9, 0.875)), (0.0625, (0.5, 0.75))]

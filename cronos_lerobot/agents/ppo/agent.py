@@ -151,7 +151,7 @@ class PPOAgent(LearningAgent):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from `state_dict`, with the streams of this process."""
         self.ppo.num_updates = state["num_updates"]
-        set_optimizer(self.ppo.optimizer, self.ppo.config, state["config"])
+        set_optimizer(self.ppo.optimizer, self.ppo.config, state["config"], self.ppo.optimizer_settings)
         if self.ppo.base_policy is not None:
             self.ppo.base_policy.load(state["base_policy"])
         if self._adapter is not None:
@@ -172,6 +172,12 @@ class PPOAgent(LearningAgent):
             raise ValueError(
                 f"{type(self.ppo.policy).__name__} decided on {actions.shape[1]} actions; its decision_steps says "
                 f"{self.num_steps}."
+            )
+        if self.ppo.config.ratio == "factor" and sample["log_prob"].ndim == 1:
+            raise ValueError(
+                "algorithm.ratio=factor clips each factor of a decision (the steps of a denoising chain): "
+                f"{type(self.ppo.policy).__name__} gives a decision one probability, which is what "
+                "algorithm.ratio=decision clips."
             )
         return encoded, Decision(
             actions=self.ppo.processors.physical_actions(actions.flatten(0, 1)).reshape(actions.shape),

@@ -128,7 +128,7 @@ class PPOConfig(RLAlgorithmConfig):
     clip: float = 0.2
     """The probability ratio is clipped to 1 - clip .. 1 + clip."""
     ratio: str = "decision"
-    """What has a ratio: the whole `decision`, or each `factor` of it, if the policy tells them apart (the steps of
+    """What has a ratio: the whole `decision`, or each `factor` of it, which a policy must tell apart (the steps of
     a denoising chain)."""
     denoising_discount: float = 1.0
     """Of L factors the last one counts in the policy's loss, each before it this much of the one after it (DPPO's

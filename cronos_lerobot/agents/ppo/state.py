@@ -27,7 +27,9 @@ def join_rollouts(rollout: dict[str, Any], processes: Processes) -> dict[str, An
     return map_leaves(rollout, np.ndarray, processes.collect) | {"instructions": texts}
 
 
-def set_optimizer(optimizer: Optimizer, config: PPOConfig, saved: dict[str, float]) -> None:
+def set_optimizer(
+    optimizer: Optimizer, config: PPOConfig, saved: dict[str, float], settings: list[dict[str, Any]]
+) -> None:
     """Give a loaded optimizer what `config` changes; other learning rates stay as they have become.
 
     An adaptive one that is beyond the ends that `config` has now goes on from the nearer one.
@@ -36,17 +38,17 @@ def set_optimizer(optimizer: Optimizer, config: PPOConfig, saved: dict[str, floa
         optimizer: with groups named `policy` and `value`.
         config: to go on with.
         saved: `policy_lr` and `value_lr` of the config that it was saved with.
+        settings: what each group has of the config or of the policy, besides its learning rate.
 
     Raises:
         ValueError: a learning rate that it is given is beyond the ends.
     """
     if config.policy_lr != saved["policy_lr"]:
         config.check_start()
-    for group in optimizer.param_groups:
+    for group, setting in zip(optimizer.param_groups, settings, strict=True):
         name = f"{group['name']}_lr"
         if getattr(config, name) != saved[name]:
             group["lr"] = getattr(config, name)
         if group["name"] == "policy" and config.lr_schedule != "fixed":
             group["lr"] = min(max(group["lr"], config.policy_lr_min), config.policy_lr_max)
-        group["weight_decay"] = config.weight_decay
-        group["betas"] = (config.beta1, config.beta2)
+        group |= setting
