@@ -12,6 +12,7 @@ import av
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.datasets.utils import DEFAULT_TASKS_PATH, EPISODES_DIR, INFO_PATH
 from lerobot.utils.constants import ACTION, DONE, REWARD
 from lerobot_env_cronos import get_scene
 from lerobot_env_cronos.scene.scenes import CONTROL_HZ
@@ -58,6 +59,7 @@ def check_dataset(root: Path) -> Origin:
         DatasetFileError: names the file or the column.
         ValueError: another version of the environment made it, or none.
     """
+    _check_meta_is_there(root)
     try:
         meta = LeRobotDatasetMetadata("local/dataset", root=root)
         rows = [row for path in sorted(root.glob("meta/episodes/*/*.parquet")) for row in _rows(path)]
@@ -124,6 +126,17 @@ def _check_tasks(meta: LeRobotDatasetMetadata, origin: Origin) -> None:
     known = {task.instruction for task in (*scene.tasks, *scene.reset_tasks)}
     if unknown := sorted(set(meta.tasks.index if meta.tasks is not None else []) - known):
         raise DatasetFileError(f"the dataset has tasks that {scene.name} has not: {unknown}")
+
+
+def _check_meta_is_there(root: Path) -> None:
+    """What LeRobot does not find in a folder it asks the Hub for."""
+    for name, found in (
+        (INFO_PATH, (root / INFO_PATH).is_file()),
+        (DEFAULT_TASKS_PATH, (root / DEFAULT_TASKS_PATH).is_file()),
+        (EPISODES_DIR, any((root / EPISODES_DIR).glob("*/*.parquet"))),
+    ):
+        if not found:
+            raise DatasetFileError(f"{root}/{name} is missing")
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:

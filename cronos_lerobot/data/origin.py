@@ -135,8 +135,9 @@ def read_origin(root: Path, features: Mapping[str, Mapping[str, Any]], what: str
     origin = Origin(**{name: stored[name] for name in Origin.__dataclass_fields__ if name in stored})
     if origin.kind not in KINDS:
         raise ValueError(f"{what} is of the kind {origin.kind!r}; valid kinds: {list(KINDS)}")
-    if mark and any(mark[name] != getattr(origin, name) for name in mark):
-        raise ValueError(f"{what}: {ORIGIN} says {origin.environment}, info.json says {mark['environment']}")
+    for name, value in mark.items():
+        if value != getattr(origin, name):
+            raise ValueError(f"{what}: {ORIGIN} says {name} {getattr(origin, name)}, info.json says {value}")
     return origin
 
 

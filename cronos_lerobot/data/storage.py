@@ -24,6 +24,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.compute_stats import aggregate_stats
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import (
+    load_episodes,
     write_info,
     write_stats,
     write_table_one_row_group_per_episode,
@@ -280,6 +281,7 @@ def truncate(meta: LeRobotDatasetMetadata, num_episodes: int) -> None:
             if str(path.relative_to(root)) not in videos:
                 path.unlink()
     shutil.rmtree(root / INCOMPLETE, ignore_errors=True)
+    meta.episodes = load_episodes(root) if rows else None
 
 
 def next_shard_index(meta: LeRobotDatasetMetadata) -> int:

@@ -175,14 +175,14 @@ class StreamDataset:
 
     def switches(self, stream: int | None = None) -> Iterator[Switch]:
         """The places between two segments that followed one another, of one stream or of all."""
-        for before, after in pairwise(self.segments if stream is None else self.segments_of(stream)):
+        for before, after in pairwise(self._in_time(stream)):
             if before.stream == after.stream and after.step == before.step + before.length:
                 yield Switch(before, after)
 
     def reset_free_episodes(self, stream: int | None = None) -> Iterator[list[Segment]]:
         """What there is between two scene resets: the segments of a stream from one to the next."""
         episode: list[Segment] = []
-        for segment in self.segments if stream is None else self.segments_of(stream):
+        for segment in self._in_time(stream):
             # What was filtered out may have been the first after a reset.
             if episode and _reset(segment) != _reset(episode[-1]):
                 yield episode
@@ -190,6 +190,16 @@ class StreamDataset:
             episode.append(segment)
         if episode:
             yield episode
+
+    def _in_time(self, stream: int | None) -> list[Segment]:
+        """The segments of a stream or of all; a ValueError where two runs' lie among each other."""
+        segments = self.segments if stream is None else self.segments_of(stream)
+        if any((a.stream, a.step) == (b.stream, b.step) for a, b in pairwise(segments)):
+            raise ValueError(
+                f"{self.repo_id} has steps of a stream twice, as recordings that were merged: what followed "
+                "what is in each of them, read them one by one"
+            )
+        return segments
 
     def columns(self, segment: Segment, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Columns of a segment, (T, ...) each; all but pixels if no names are given.
@@ -210,7 +220,7 @@ class StreamDataset:
 
     def stream_columns(self, stream: int, names: Sequence[str]) -> dict[str, np.ndarray]:
         """Columns of a whole stream, from its first step to its last."""
-        parts = [self.columns(segment, names) for segment in self.segments_of(stream)]
+        parts = [self.columns(segment, names) for segment in self._in_time(stream)]
         return {name: np.concatenate([part[name] for part in parts]) for name in names}
 
     def pixels(self, segment: Segment, camera: str, frames: slice = slice(None)) -> np.ndarray:

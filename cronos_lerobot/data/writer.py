@@ -341,7 +341,8 @@ class SegmentWriter:
             self._publish()
         if self._shard is None:
             self._shard = Shard(self._meta, self._next_shard, self._open_video)
-            self._oldest = item.ended
+            # A writer that lags would else flush after every segment, and never catch up.
+            self._oldest = max(item.ended, time.monotonic() - self._flush_interval_s / 2)
             self._next_shard += 1
         task_index = self._tasks.setdefault(item.task, len(self._tasks))
         self._shard.append(self._draw(item.frames), item.task, task_index, item.metadata)

@@ -78,7 +78,8 @@ def _check(given: dict[str, str], policy_type: str | None) -> None:
         config.check_env(config.env)
         # A recording's folder is looked at when its run begins, or goes on.
         if config.record.repo_id is None:
-            config.record.check(Path(config.output_dir or ""), config.num_envs, config.env, resume=False)
+            folder, length = Path(config.output_dir or ""), config.protocol.task_switch_interval
+            config.record.check(folder, config.num_envs, config.env, length, resume=False)
     settings = [name.removeprefix("algorithm.") for name in given if name.startswith("algorithm.")]
     check_settings(config.algorithm, settings, resume=False)
 

@@ -187,7 +187,9 @@ class CronosTrainConfig:
             raise FileExistsError(f"{self.output_dir} exists; choose another --output_dir or --resume=true.")
         if self.checkpoint_path is not None:
             check_resumed(self, self.checkpoint_path)
-        self.record.check(Path(self.output_dir), self.num_envs, self.env, resume=self.resume)
+        self.record.check(
+            Path(self.output_dir), self.num_envs, self.env, self.protocol.task_switch_interval, resume=self.resume
+        )
 
     @staticmethod
     def check_env(env: CronosEnvConfig) -> None:

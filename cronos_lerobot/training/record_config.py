@@ -9,8 +9,9 @@ from pathlib import Path
 
 from lerobot.datasets.utils import INFO_PATH
 from lerobot_env_cronos import CronosEnvConfig
+from lerobot_env_cronos.scene.scenes import CONTROL_HZ
 
-from cronos_lerobot.data.video import check_video_size
+from cronos_lerobot.data.video import MAX_FILE_DURATION_S, check_video_size
 from cronos_lerobot.data.writer import FLUSH_INTERVAL_S
 
 
@@ -70,12 +71,14 @@ class RecordConfig:
         height, width = render_size
         return f"_{width}x{height}"
 
-    def check(self, output_dir: Path, num_envs: int, env: CronosEnvConfig, *, resume: bool) -> None:
+    def check(
+        self, output_dir: Path, num_envs: int, env: CronosEnvConfig, segment_length: int, *, resume: bool
+    ) -> None:
         """Tell now what recording would stumble over later.
 
         Raises:
-            ValueError: more streams are to be recorded than there are, or none; pictures that no video has; or how
-                is said, but not what.
+            ValueError: more streams are to be recorded than there are, or none; pictures that no video has, or
+                more in a segment than one has; or how is said, but not what.
             OSError: a dataset cannot be made: it exists, or its folder cannot be written to; or it is not
                 there to be resumed.
         """
@@ -90,6 +93,11 @@ class RecordConfig:
         if self.num_streams == 0:
             raise ValueError(
                 "record.streams=0 records nothing: give a number from 1, or leave record.repo_id out."
+            )
+        if segment_length > (longest := int(MAX_FILE_DURATION_S * CONTROL_HZ)):
+            raise ValueError(
+                f"protocol.task_switch_interval must be at most {longest} to be recorded, a video's "
+                f"{MAX_FILE_DURATION_S:.0f} s, got {segment_length}."
             )
         root = self.root_in(output_dir)
         if resume:

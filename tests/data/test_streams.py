@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 import synthetic_streams
 from lerobot.datasets import LeRobotDataset, StreamingLeRobotDataset
-from lerobot.datasets.dataset_tools import delete_episodes
+from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
 from synthetic_segments import FPS, features, observation_space, segment
 from synthetic_streams import ORIGIN, PICTURES, STEPS, STREAMS, TASKS, UPDATE, K, record
 
@@ -224,6 +224,16 @@ def test_a_segment_that_is_there_twice_is_named(root, tmp_path):
         writer.add_segment(frames | scalars | pixels, again.task, episode_metadata=metadata)
     with pytest.raises(StreamError, match="stream 2, step 20: it is there twice"):
         StreamDataset("me/stream", tmp_path / "d", streaming=True).check()
+
+
+def test_recordings_of_two_runs_that_were_merged_have_no_order(root, tmp_path):
+    runs = [LeRobotDataset("me/stream", root=root) for _ in range(2)]
+    merge_datasets(runs, output_repo_id="me/both", output_dir=tmp_path / "d")
+    streams = StreamDataset("me/both", tmp_path / "d")
+    assert len(streams.segments) == 2 * len(StreamDataset("me/stream", root).segments)
+    for read in (streams.switches, streams.reset_free_episodes, lambda: streams.stream_columns(2, ["action"])):
+        with pytest.raises(ValueError, match=r"me/both has steps of a stream twice, .* read them one by one"):
+            list(read())
 
 
 def test_survives_lerobots_own_tools(root, tmp_path):

@@ -159,6 +159,16 @@ def test_chains_of_different_lengths(mine, tmp_path):
         read_benchmark(tmp_path, "it")
 
 
+def test_chains_of_different_lengths_whichever_ordering_comes_first(mine, tmp_path):
+    write_benchmark(mine[0], tmp_path)
+    for row in (0, 1, 2):
+        change(tmp_path, "sequential/train", row, ordering=1)
+    for row in (3, 4, 5):
+        change(tmp_path, "sequential/train", row, ordering=0, instructions=["put the toy bear on the carpet"])
+    with pytest.raises(BenchmarkError, match="row 3: a chain of 1 tasks; in earlier rows they have 3"):
+        read_benchmark(tmp_path, "it")
+
+
 @pytest.mark.parametrize(
     ("moved_m", "turned_rad", "sign", "is_same"),
     [

@@ -59,6 +59,12 @@ def test_a_negative_number_of_threads_is_refused():
         Simulation(get_scene(SCENE), 1, -3)
 
 
+def test_all_cores_are_those_that_the_process_may_use(monkeypatch):
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: {5}, raising=False)
+    simulation = Simulation(get_scene(SCENE), 2)
+    assert simulation.num_threads == simulation._batch.nthread == 1
+
+
 def test_a_body_that_spins_fast_slows_down_and_one_pressed_down_stays_on_the_table():
     env = CronosVectorEnv(2, "kitchen_2x2", obs_type="environment_state_agent_pos")
     env.reset(seed=0)

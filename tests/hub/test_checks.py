@@ -123,6 +123,8 @@ def forgetful(root):
             lambda root: truncate(only(root, "*.mp4"), 0.6),
             r"front/chunk-000/file-000.mp4 (is damaged|has \d+ frames)",
         ),
+        (lambda root: only(root, "meta/tasks.parquet").unlink(), "/meta/tasks.parquet is missing"),
+        (lambda root: only(root, "meta/episodes/*/*.parquet").unlink(), "/meta/episodes is missing"),
         (foreign, r"the actions are \['joint_0', .*, those of the WidowX are"),
         (forgetful, "does not say which version of the environment made it"),
     ],

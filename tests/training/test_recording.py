@@ -166,14 +166,16 @@ def test_a_recording_that_cannot_begin_stops_the_run_at_once(tmp_path, monkeypat
 )
 def test_how_to_record_without_a_dataset_is_refused(tmp_path, flags, message):
     with pytest.raises(ValueError, match=message):
-        RecordConfig(**flags).check(tmp_path, 4, CronosEnvConfig(), resume=False)
-    RecordConfig(**flags).check(tmp_path, 4, CronosEnvConfig(), resume=True)
-    RecordConfig().check(tmp_path, 4, CronosEnvConfig(), resume=False)
+        RecordConfig(**flags).check(tmp_path, 4, CronosEnvConfig(), 80, resume=False)
+    RecordConfig(**flags).check(tmp_path, 4, CronosEnvConfig(), 80, resume=True)
+    RecordConfig().check(tmp_path, 4, CronosEnvConfig(), 80, resume=False)
 
 
 def test_pictures_that_no_video_has_are_refused_before_anything_is_made(tmp_path):
-    def check(env, **flags):
-        RecordConfig("me/stream", **flags).check(tmp_path / "run", 4, CronosEnvConfig(**env), resume=False)
+    def check(env, segment_length=80, **flags):
+        RecordConfig("me/stream", **flags).check(
+            tmp_path / "run", 4, CronosEnvConfig(**env), segment_length, resume=False
+        )
 
     with pytest.raises(ValueError, match=r"--env\.observation_width are 65 and 128: .* even"):
         check({"observation_height": 65})
@@ -182,12 +184,15 @@ def test_pictures_that_no_video_has_are_refused_before_anything_is_made(tmp_path
     with pytest.raises(ValueError, match=r"--env\.render_size are 100 and 101: .* even"):
         check({"render_size": (100, 101)}, filmed_streams=1)
     check({"render_size": (100, 101)})
+    with pytest.raises(ValueError, match=r"task_switch_interval must be at most 5000 .* 1000 s, got 5001"):
+        check({}, segment_length=5001)
+    check({}, segment_length=5000)
     assert not (tmp_path / "run").exists()
 
 
 def test_resuming_without_the_recording_is_told(tmp_path):
     with pytest.raises(FileNotFoundError, match="no recording to resume in"):
-        RecordConfig("me/stream").check(tmp_path, 4, CronosEnvConfig(), resume=True)
+        RecordConfig("me/stream").check(tmp_path, 4, CronosEnvConfig(), 80, resume=True)
 
 
 def test_filmed_streams_are_a_dataset_of_their_own(tmp_path):

@@ -280,7 +280,7 @@ def _read_groups(table: _Table, scene: Scene, suite: str, num_configurations: in
         if tasks.setdefault(number, named) != named:
             before = [task.instruction for task in tasks[number]]
             raise table.fail(i, f"{key} {number} is {list(instructions)} here and {before} in an earlier row")
-        length = len(tasks[min(tasks)])
+        length = len(next(iter(tasks.values())))
         if len(named) != length:
             raise table.fail(i, f"a chain of {len(named)} tasks; in earlier rows they have {length}, as all must")
         if configuration in starts.setdefault(number, []):

@@ -60,7 +60,7 @@ class Simulation:
         self.num_sims = num_sims
         self.num_threads = num_threads or num_cores()
         self.model = build_model(scene, looks=False, physics=physics)
-        self._batch = Batch(self.model, num_sims, num_threads, persistent=True)
+        self._batch = Batch(self.model, num_sims, self.num_threads, persistent=True)
         self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl, self.sensordata = self._batch.bind("ctrl"), self._batch.bind("sensordata")
         self._qpos_slice = {
