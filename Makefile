@@ -20,12 +20,13 @@ $(UV):
 	$(PYTHON) -m pip install --quiet --disable-pip-version-check --target .uv 'uv>=0.8,<1'
 
 setup: system $(UV) ## Install the system packages and the locked Python environment
-	$(UV) sync --frozen --compile-bytecode --python $(PYTHON)
+	@# What was added to it since stays.
+	$(UV) sync --frozen --inexact --compile-bytecode --python $(PYTHON)
 
 system: ## Install EGL, software OpenGL, and FFmpeg to read videos
 	@sh .ci/system-packages
 
-demo: setup ## Record, clone, learn with a reset for every fourth task, evaluate, report: 12 minutes on 2 cores
+demo: setup ## Record, clone, learn with a reset for every fourth task, evaluate, report: 12 to 16 minutes on 2 cores
 	$(RUN) cronos-demo
 
 test: setup ## Run the whole test suite, one worker a core

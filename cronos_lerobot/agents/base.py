@@ -95,6 +95,11 @@ def is_trainable(policy: Any) -> bool:
     return not _missing_methods(policy)
 
 
+def samples(policy: Any) -> bool:
+    """Whether `policy` draws its actions at a temperature, by `sample_actions`."""
+    return callable(getattr(policy, "sample_actions", None))
+
+
 def _missing_methods(policy: Any) -> list[str]:
     return [name for name in POLICY_METHODS if not callable(getattr(policy, name, None))]
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from lerobot.utils.constants import OBS_IMAGES
 
 from cronos_lerobot.agents.base import Columns
 
@@ -54,3 +55,15 @@ class ObservationHistory:
 def observation_steps(policy: Any) -> int:
     """How many observations a TrainablePolicy looks at."""
     return int(getattr(policy, "observation_steps", 1))
+
+
+def blank_columns(policy: Any) -> Columns:
+    """One observation in which there is nothing: zeros (1, ...) for all that `policy` reads."""
+    columns: Columns = {}
+    history = (steps,) if (steps := observation_steps(policy)) > 1 else ()
+    for name, feature in (policy.config.input_features or {}).items():
+        shape, kind = feature.shape, np.float32
+        if name.startswith(OBS_IMAGES):
+            shape, kind = (*shape[1:], shape[0]), np.uint8
+        columns[name] = np.zeros((1, *history, *shape), kind)
+    return columns

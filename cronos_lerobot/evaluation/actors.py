@@ -17,7 +17,7 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 
-from cronos_lerobot.agents.base import Columns, is_trainable
+from cronos_lerobot.agents.base import Columns, samples
 from cronos_lerobot.agents.chunk_player import make_player
 from cronos_lerobot.agents.history import ObservationHistory, observation_steps
 from cronos_lerobot.agents.processing import PolicyProcessors, make_processors, observation_columns
@@ -177,7 +177,7 @@ class ExpertActor:
 
 def has_temperature(policy: Any) -> bool:
     """Whether a policy samples at a temperature that an evaluation chooses."""
-    return isinstance(policy, SteeredPolicy) or is_trainable(policy)
+    return isinstance(policy, SteeredPolicy) or samples(policy)
 
 
 def make_actor(

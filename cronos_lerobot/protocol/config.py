@@ -80,7 +80,7 @@ class ProtocolConfig:
     every T steps as well, but at times that are spread evenly over the streams."""
     scene_reset: str = "periodic"
     """Who asks for scene resets: `periodic`, every T steps, or `critic`, for streams in which the agent's values
-    see nothing left to learn, one at a time, `reset_budget` in the whole run."""
+    see nothing left to learn, as many at a switch as `reset_budget`, spread evenly over the run, has by then."""
     reset_starts: str = "random"
     """Where scene resets put a stream: `random`, any training configuration, the next task being the order's, or
     `learnable`, a configuration and a first task of which the policy neither always succeeds nor always fails."""

@@ -211,8 +211,9 @@ def check_resumed(config: Any, checkpoint: Path) -> dict[str, Any]:
         same = given.get(name) == own.get(name) or ("features" in name and not given.get(name))
         if not same and name not in _OWN_FOLDER and rule_of(name) == REFUSED:
             raise ValueError(_refusal(name, given.get(name), own.get(name)))
-    if (now := describe_environment(config.env)["benchmark"]) != run["benchmark"]:
-        was = run["benchmark"]
+    # The packaged benchmark's source names the release that it came with, its fingerprint what it is.
+    now, was = describe_environment(config.env)["benchmark"], run["benchmark"]
+    if (now and now["fingerprint"]) != (was and was["fingerprint"]):
         raise ValueError(f"the run of {checkpoint} began with the benchmark {was}, which now is {now}.")
     done, spent, budget = run["interaction_steps"], run["interventions"], config.protocol.reset_budget
     if config.total_steps < done:

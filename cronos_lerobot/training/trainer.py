@@ -80,6 +80,11 @@ class Trainer:
         self._drawn_alike = set(self.generators.state_dict()["numpy"])
         # Every named generator exists before a checkpoint is loaded into them.
         self.agent = self._make_agent()
+        if config.peft is not None and not any(param.requires_grad for param in policy.parameters()):
+            raise ValueError(
+                f"--peft.* puts adapters into the policy to train them, of which --algorithm.type="
+                f"{config.algorithm.type} trains nothing: leave --peft.* out."
+            )
         self.env = env if self.processes.count == 1 else ShardedEnv(env, self.processes)
         run = RunContext(self.env, self.agent, self.task_set.tasks, config.protocol, config.total_steps)
         bind_task_order(self._task_order, run)
@@ -183,10 +188,11 @@ class Trainer:
         """
         if self.processes.is_main:
             states = self._observers
-            self.logger = RunLogger(self.config, self.loop, states.get("logger", {}).get("offset"))
+            # First what may be refused: the logger cuts the metrics to where the checkpoint left them.
             self.recorder = StreamObserver.open(
                 self.config, self.env, states.get("recorder"), lambda why: self.logger.log("recording", why)
             )
+            self.logger = RunLogger(self.config, self.loop, states.get("logger", {}).get("offset"))
             write_manifest(self.config, self.processes.count, self.loop.n)
         self._is_open = True
 

@@ -170,16 +170,6 @@ def test_ratios_of_decisions_and_of_factors(ratio):
     assert "entropy" not in metrics
 
 
-def test_a_decision_of_one_probability_has_no_factors():
-    agent, policy = make_agent(ratio="factor")
-    sample = policy.sample_actions
-    policy.sample_actions = lambda *args, **kw: (s := sample(*args, **kw)) | {"log_prob": s["log_prob"].sum(1)}
-    with pytest.raises(
-        ValueError, match=r"ratio=factor clips each factor.*Chunks gives a decision one probability"
-    ):
-        agent.act(at(1, 2), ["a", "b"])
-
-
 def test_the_first_steps_of_a_denoising_may_count_less():
     assert factor_weights(torch.zeros(5, 3), 0.5).tolist() == [0.25, 0.5, 1]
     assert factor_weights(torch.zeros(5, 1), 1.0).tolist() == [1]

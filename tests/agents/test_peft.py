@@ -252,3 +252,7 @@ def test_adapters_around_a_policy_that_trains_by_itself_leave_it_one(tmp_path):
     assert is_trainable(wrapped)
     assert make_trainable(wrapped, OPTIONS) is wrapped
     assert isinstance(make_actor(wrapped, PolicyProcessors(*identity_processors()), 0.5), SamplingPolicy)
+    # What decides in a policy's place needs no more than this.
+    acting = torch.nn.Identity()
+    acting.sample_actions = wrapped.sample_actions
+    assert isinstance(make_actor(acting, PolicyProcessors(*identity_processors()), 0.5), SamplingPolicy)

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, get_scene, load_benchmark
@@ -157,6 +158,22 @@ def test_chains_of_different_lengths(mine, tmp_path):
         change(tmp_path, "sequential/train", row, instructions=["put the toy bear on the carpet"])
     with pytest.raises(BenchmarkError, match="row 3: a chain of 1 tasks; in earlier rows they have 3"):
         read_benchmark(tmp_path, "it")
+
+
+def test_splits_of_different_tasks_or_lengths(mine, tmp_path):
+    write_benchmark(mine[0], tmp_path / "tasks")
+    path = tmp_path / "tasks/independent/held_out.parquet"
+    table = pq.read_table(path)
+    pq.write_table(table.filter(pc.field("task") != 3), path)
+    with pytest.raises(BenchmarkError, match=r"independent/held_out: tasks .*; those of the training split are"):
+        read_benchmark(tmp_path / "tasks", "it")
+    write_benchmark(mine[0], tmp_path / "chains")
+    path = tmp_path / "chains/sequential/held_out.parquet"
+    rows = pq.read_table(path)
+    shorter = [row | {"instructions": row["instructions"][:2]} for row in rows.to_pylist()]
+    pq.write_table(pa.Table.from_pylist(shorter, schema=rows.schema), path)
+    with pytest.raises(BenchmarkError, match=r"sequential/held_out: chains of \[2\] tasks; those .* have \[3\]"):
+        read_benchmark(tmp_path / "chains", "it")
 
 
 def test_chains_of_different_lengths_whichever_ordering_comes_first(mine, tmp_path):

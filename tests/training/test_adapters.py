@@ -137,12 +137,22 @@ def test_diffusion_learns_by_its_chain_saves_resumes_and_is_a_lerobot_policy(tmp
             "entropy_coef=0.1",
             r"entropy_coef=0\.1: no entropy .*type=diffusion decides; give 0",
         ),
+        (
+            "pocketvla",
+            "ratio=factor",
+            r"ratio=factor clips .*type=pocketvla gives a decision one probability",
+        ),
     ],
 )
 def test_what_a_policy_does_not_follow_is_refused_before_it_begins(policy, flag, message, tmp_path, monkeypatch):
-    flags = FLAGS if policy == "act" else (*DIFFUSION, "--policy.noise_scheduler_type=DDIM")
+    flags = {
+        "act": FLAGS,
+        "diffusion": (*DIFFUSION, "--policy.noise_scheduler_type=DDIM"),
+        "pocketvla": ("--policy.type=pocketvla", *(f for f in FLAGS if not f.startswith("--policy."))),
+    }[policy]
     with pytest.raises(SystemExit, match=message):
         cronos_train(monkeypatch, *flags, f"--algorithm.{flag}", f"--output_dir={tmp_path / 'run'}")
+    assert not (tmp_path / "run").exists()
 
 
 def test_chunks_that_reach_beyond_a_switch_are_refused(tmp_path, monkeypatch):

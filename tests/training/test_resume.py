@@ -20,6 +20,7 @@ from cronos_lerobot.training import resume
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.logging import MetricsFile
 from cronos_lerobot.training.record_config import RecordConfig
+from cronos_lerobot.training.recording import StreamObserver
 from cronos_lerobot.training.seeding import NamedGenerators
 
 DOCS = Path(__file__).parents[2] / "docs/training.md"
@@ -139,6 +140,41 @@ def test_a_learning_rate_that_is_given_is_the_optimizers(tmp_path):
         assert groups["policy"]["lr"] == (before["policy"]["lr"] if expected is None else expected)
         assert groups["policy"]["betas"][0] == (0.9 if expected is None else 0.5)
         assert groups["value"]["lr"] == 1e-3
+
+
+def test_a_run_belongs_to_what_its_benchmark_is_whatever_release_it_came_with(tmp_path, monkeypatch):
+    train(config(tmp_path / "run", steps=STEPS_PER_UPDATE, eval_freq=0))
+    path = tmp_path / "run/checkpoints/last/training_state" / resume.RUN
+    began = {"source": "lerobot_env_cronos 0.2.0", "fingerprint": "abc"}
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"benchmark": began}))
+    for fingerprint in ("abc", "abd"):
+        now = {
+            "environment": None,
+            "benchmark": {"source": "lerobot_env_cronos 0.2.1", "fingerprint": fingerprint},
+        }
+        monkeypatch.setattr(resume, "describe_environment", lambda env, now=now: now)
+        if fingerprint == "abc":
+            make_trainer(resumed(tmp_path / "run")).load()
+        else:
+            with pytest.raises(ValueError, match=r"0\.2\.0.*'abc'.*now is .*0\.2\.1.*'abd'"):
+                make_trainer(resumed(tmp_path / "run")).load()
+
+
+def test_a_recording_that_is_refused_leaves_the_metrics_as_they_were(tmp_path, monkeypatch):
+    train(config(tmp_path / "run", eval_freq=0))
+    first = sorted((tmp_path / "run/checkpoints").glob("[0-9]*"))[0]
+    before = (tmp_path / "run/metrics.jsonl").read_bytes()
+
+    def refuse(*args):
+        raise ValueError("another process has it")
+
+    monkeypatch.setattr(StreamObserver, "open", refuse)
+    cfg = resumed(tmp_path / "run")
+    cfg.checkpoint_path = first
+    trainer = make_trainer(cfg)
+    with pytest.raises(ValueError, match="another process has it"):
+        trainer.train()
+    assert (tmp_path / "run/metrics.jsonl").read_bytes() == before
 
 
 def test_the_runs_plugins_are_imported_unless_others_are_given(tmp_path, monkeypatch):

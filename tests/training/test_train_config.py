@@ -1,3 +1,4 @@
+import dataclasses
 import sys
 
 import pytest
@@ -9,6 +10,7 @@ from lerobot_env_cronos import CronosEnvConfig
 from cronos_lerobot.agents.ppo.config import PaperPPOConfig, PPOConfig
 from cronos_lerobot.evaluation.policy_source import load_policy_config
 from cronos_lerobot.scripts import train as script
+from cronos_lerobot.training import config
 from cronos_lerobot.training.config import CronosTrainConfig
 
 
@@ -48,6 +50,18 @@ def test_saved_config_reads_back_and_takes_overrides(tmp_path):
         assert copy.to_dict() == cfg.to_dict() | {"steps": 77}
     with pytest.raises(FileNotFoundError, match="nowhere"):
         CronosTrainConfig.from_pretrained(tmp_path / "nowhere.json")
+
+
+def test_who_resumes_says_so_and_no_file_does(tmp_path, monkeypatch):
+    dataclasses.replace(CronosTrainConfig(policy=DummyPolicyConfig()), resume=True).save_pretrained(tmp_path)
+    looked_at = []
+    monkeypatch.setattr(config, "import_plugins", lambda checkpoint, arguments: looked_at.append(checkpoint))
+    monkeypatch.setattr(config, "check_types", lambda checkpoint, arguments: None)
+    for flags in ([], ["--steps=5"], ["--resume=false"]):
+        assert not CronosTrainConfig.from_pretrained(tmp_path, cli_args=flags).resume
+    assert not looked_at
+    assert CronosTrainConfig.from_pretrained(tmp_path, cli_args=["--resume=true"]).resume
+    assert len(looked_at) == 1
 
 
 def test_steps_are_rounded_up_to_whole_updates():

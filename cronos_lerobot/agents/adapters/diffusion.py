@@ -45,8 +45,8 @@ class DiffusionAdapter(DenoisingAdapter):
             )
         if options.noise_level > 1:
             raise ValueError(
-                f"--algorithm.noise_level={options.noise_level} is the eta of DDIM for a diffusion policy: from 0 "
-                "(no noise) to 1 (that of DDPM)."
+                f"--algorithm.noise_level={options.noise_level} is the eta of DDIM for a diffusion policy: above "
+                "0 (no noise) and at most 1 (that of DDPM)."
             )
         super().__init__(
             policy,

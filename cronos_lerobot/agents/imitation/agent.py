@@ -18,8 +18,8 @@ from cronos_lerobot.agents.base import (
     Batch,
     Columns,
     LearningAgent,
-    is_trainable,
     plain_sample,
+    samples,
 )
 from cronos_lerobot.agents.chunk_player import ChunkPlayer, Player, make_player
 from cronos_lerobot.agents.history import observation_steps
@@ -157,7 +157,7 @@ class ImitationAgent(LearningAgent):
             self._learner.load_state_dict(self.policy.state_dict() | state.get("learner", {}))
 
     def _make_player(self, generator: torch.Generator) -> Player:
-        if not is_trainable(self.policy):
+        if not samples(self.policy):
             if self.config.temperature != 1:
                 raise ValueError(
                     f"--algorithm.temperature={self.config.temperature} is not for --policy.type="

@@ -173,12 +173,6 @@ class PPOAgent(LearningAgent):
                 f"{type(self.ppo.policy).__name__} decided on {actions.shape[1]} actions; its decision_steps says "
                 f"{self.num_steps}."
             )
-        if self.ppo.config.ratio == "factor" and sample["log_prob"].ndim == 1:
-            raise ValueError(
-                "algorithm.ratio=factor clips each factor of a decision (the steps of a denoising chain): "
-                f"{type(self.ppo.policy).__name__} gives a decision one probability, which is what "
-                "algorithm.ratio=decision clips."
-            )
         return encoded, Decision(
             actions=self.ppo.processors.physical_actions(actions.flatten(0, 1)).reshape(actions.shape),
             trace=to_array("trace", sample["trace"]),

@@ -189,7 +189,7 @@ class PPOConfig(RLAlgorithmConfig):
     none of its own (ACT), where it is learned; the least deviation of a step of Diffusion's denoising."""
     noise_level: float = 0.5
     """Noise of the denoising of a flow policy (PocketVLA's flow head, SmolVLA, pi0), which has none of its own;
-    Diffusion's is DDIM's eta, from 0 to 1."""
+    Diffusion's is DDIM's eta, above 0 and at most 1."""
     noise_steps: int | None = None
     """At how many steps of a flow policy's denoising there is noise, drawn for each decision; an update evaluates
     the network at these alone. null is all of them."""

@@ -5,14 +5,18 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+import torch
+
 from cronos_lerobot.agents.adapters import builtin as _builtin  # noqa: F401 -- registers them
 from cronos_lerobot.agents.adapters.privileged import PrivilegedCritic
 from cronos_lerobot.agents.adapters.registry import Adapter, AdapterOptions, make_trainable
 from cronos_lerobot.agents.base import decision_steps
+from cronos_lerobot.agents.history import blank_columns
 from cronos_lerobot.agents.ppo.agent import PPOAgent
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
 from cronos_lerobot.agents.ppo.self_imitation import SelfImitation
+from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.agents.registry import AgentContext, register_agent
 
 
@@ -29,6 +33,8 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
     options = AdapterOptions(config.noise_std, config.noise_level, config.noise_steps)
     policy = make_trainable(context.policy, options)
     _check_followed(policy, config, options)
+    if config.ratio == "factor":
+        _check_factors(policy, context.processors)
     if config.critic_observation == "environment_state":
         policy = _with_privileged_critic(policy, context)
     if isinstance(policy, Adapter):
@@ -54,6 +60,21 @@ def _check_followed(policy: Any, config: Any, options: AdapterOptions) -> None:
         raise ValueError(
             f"--algorithm.entropy_coef={config.entropy_coef}: no entropy is known of what "
             f"--policy.type={policy.config.type} decides; give 0."
+        )
+
+
+def _check_factors(policy: Any, processors: PolicyProcessors) -> None:
+    """A decision on nothing says whether those of this policy have factors."""
+    policy.eval()
+    texts = ["put it there"]
+    with torch.inference_mode(), torch.random.fork_rng():
+        batch = processors.encoded_batch(processors.encode(blank_columns(policy), texts), texts)
+        log_prob = policy.sample_actions(batch, generator=torch.Generator(processors.device))["log_prob"]
+    if log_prob.ndim == 1:
+        raise ValueError(
+            "--algorithm.ratio=factor clips each factor of a decision, such as the steps of a denoising chain: "
+            f"--policy.type={policy.config.type} gives a decision one probability, which is what "
+            "--algorithm.ratio=decision clips."
         )
 
 

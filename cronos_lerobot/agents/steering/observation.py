@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from cronos_lerobot.agents.adapters.privileged import text_vector
-from cronos_lerobot.agents.base import Batch, Columns
-from cronos_lerobot.agents.history import observation_steps
+from cronos_lerobot.agents.base import Batch
+from cronos_lerobot.agents.history import blank_columns
 from cronos_lerobot.agents.processing import PolicyProcessors
 
 
@@ -53,13 +53,6 @@ def state_features(steerable: Any, batch: Batch) -> Tensor:
 @torch.inference_mode()
 def feature_width(observation: str, steerable: Any, processors: PolicyProcessors) -> int:
     """F, the width of what `observation` names, found by showing the policy nothing."""
-    columns: Columns = {}
-    history = (steps,) if (steps := observation_steps(steerable)) > 1 else ()
-    for name, feature in (steerable.config.input_features or {}).items():
-        shape, kind = feature.shape, np.float32
-        if name.startswith(OBS_IMAGES):
-            shape, kind = (*shape[1:], shape[0]), np.uint8
-        columns[name] = np.zeros((1, *history, *shape), kind)
-    batch = processors.batch(columns, ["put it there"])
+    batch = processors.batch(blank_columns(steerable), ["put it there"])
     features = state_features(steerable, batch) if observation == "state" else steerable.observe(batch)[1]
     return features.shape[1]

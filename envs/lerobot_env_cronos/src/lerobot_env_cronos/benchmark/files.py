@@ -168,6 +168,7 @@ def read_benchmark(folder: Path, source: str) -> Benchmark:
         suite: {split: _read_groups(tables[suite, split], scene, suite, len(poses[split])) for split in SPLITS}
         for suite in SUITES
     }
+    _check_alike(groups, {suite: tables[suite, "held_out"] for suite in SUITES})
     return Benchmark(scene, poses, groups["independent"], groups["sequential"], source)
 
 
@@ -297,6 +298,18 @@ def _read_groups(table: _Table, scene: Scene, suite: str, num_configurations: in
         )
         for number in sorted(tasks)
     )  # fmt: skip
+
+
+def _check_alike(groups: dict[str, dict[str, tuple[EpisodeGroup, ...]]], held_out: dict[str, _Table]) -> None:
+    """Both splits are of the same tasks, each of them once, and their chains are as long."""
+    train, other = ([group.instructions for group in groups["independent"][split]] for split in SPLITS)
+    if train != other or len({text for (text,) in train}) < len(train):
+        raise held_out["independent"].fail(None, f"tasks {other}; those of the training split are {train}")
+    train, other = (sorted({len(group.tasks) for group in groups["sequential"][split]}) for split in SPLITS)
+    if train != other:
+        raise held_out["sequential"].fail(
+            None, f"chains of {other} tasks; those of the training split have {train}"
+        )
 
 
 def _instructions(table: _Table, suite: str) -> Iterable[tuple[str, ...]]:
