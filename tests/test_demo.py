@@ -108,11 +108,15 @@ time.sleep(60)
 """
 
 
-@pytest.mark.parametrize("to_all", [True, False])
-def test_ctrl_c_leaves_a_command_the_time_to_save(to_all, tmp_path):
+@pytest.mark.parametrize(("to_all", "number"), [(1, signal.SIGINT), (0, signal.SIGINT), (0, signal.SIGTERM)])
+def test_a_signal_leaves_a_command_the_time_to_save(to_all, number, tmp_path):
     """Of a terminal, which sends it to the command as well, or of whoever knows the demo's process alone."""
-    command = ["python", "-c", SAVING, str(tmp_path)]
-    code = f"from cronos_lerobot.scripts.pipeline import run_command; run_command({command})"
+    step = ("a", "A", ["python", "-c", SAVING, str(tmp_path)], tmp_path / "d/a")
+    code = f"""
+from pathlib import Path, PosixPath
+from cronos_lerobot.scripts.pipeline import Step, run_steps
+run_steps([Step(*{step})], Path({str(tmp_path / "d")!r}))
+"""
     process = subprocess.Popen(
         [sys.executable, "-c", code],
         stdout=subprocess.DEVNULL,
@@ -125,7 +129,7 @@ def test_ctrl_c_leaves_a_command_the_time_to_save(to_all, tmp_path):
     deadline = time.monotonic() + 60
     while not (tmp_path / "ready").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
-    (os.killpg if to_all else os.kill)(process.pid, signal.SIGINT)
+    (os.killpg if to_all else os.kill)(process.pid, number)
     _, said = process.communicate(timeout=30)
     assert (tmp_path / "saved").exists()
     assert said.endswith("KeyboardInterrupt\n")

@@ -54,6 +54,12 @@ class Row:
     def __post_init__(self) -> None:
         if wrong := [flag for flag in self.flags if not flag.startswith("--") or "=" not in flag]:
             raise ValueError(f"flags of a row are --name=value, one word each, got {wrong[0]!r}.")
+        if self.curriculum and self.stages:
+            raise ValueError(f"a row has the paper's curriculum or stages of its own, {self.stages}, not both.")
+        if self.num_configurations != 64 and self.base != NARROW:
+            raise ValueError(
+                f"a row of {self.num_configurations} configuration has a base of its own, not {self.base!r}."
+            )
 
     @property
     def name(self) -> str:

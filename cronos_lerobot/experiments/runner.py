@@ -112,7 +112,7 @@ class Runner:
             KeyboardInterrupt: Ctrl-C, SIGTERM or a closed terminal; the running jobs have been stopped and can be
                 resumed.
         """
-        previous = _raise_on_signals()
+        previous = raise_on_signals()
         try:
             for job in self.jobs.values():
                 self._look_up(job)
@@ -277,7 +277,12 @@ def _silence_ending_signals() -> None:
             signal.signal(number, signal.SIG_IGN)
 
 
-def _raise_on_signals() -> dict[signal.Signals, Any]:
+def usable_cores() -> int:
+    """Cores that this process may use, which a job or a container may have fewer of than the machine."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def raise_on_signals() -> dict[signal.Signals, Any]:
     """Let ENDING_SIGNALS end this process as Ctrl-C does; returns the handlers before."""
     if threading.current_thread() is not threading.main_thread():
         return {}

@@ -6,6 +6,7 @@ import json
 import os
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cronos_lerobot.experiments.arithmetic import portable_arithmetic
+from cronos_lerobot.experiments.runner import raise_on_signals
 from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.provenance import package_versions
 from cronos_lerobot.training.stopping import SAME_S
@@ -58,7 +60,13 @@ def run_steps(steps: Sequence[Step], folder: Path) -> None:
         StepFailedError: a command failed; running the steps again goes on from there.
     """
     with FolderLock(folder):
-        _run_steps(steps, folder)
+        # A step must not go on by itself, with the folder free for another process.
+        previous = raise_on_signals()
+        try:
+            _run_steps(steps, folder)
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
 
 
 def _run_steps(steps: Sequence[Step], folder: Path) -> None:
@@ -107,7 +115,8 @@ def run_command(command: list[str]) -> None:
 
     Raises:
         StepFailedError: it ended with an error.
-        KeyboardInterrupt: Ctrl-C; the command has ended by itself, or was killed by a second one.
+        KeyboardInterrupt: Ctrl-C, or a signal that ends us; the command has ended by itself, or was killed by a
+            second one.
     """
     print(f"    $ {command_line(command)}\n", flush=True)
     # The script of the environment that this Python runs in, whatever PATH says.

@@ -7,7 +7,6 @@ log file each, shared between experiments, skipped when done, and resumed from t
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Iterable
 from dataclasses import replace
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING
 from cronos_lerobot.experiments.definitions import COMMANDS, EXPERIMENTS, Base, Experiment, Row, find_rows
 from cronos_lerobot.experiments.flags import join_flags
 from cronos_lerobot.experiments.jobs import Job, is_done
+from cronos_lerobot.experiments.runner import usable_cores
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
 from cronos_lerobot.experiments.slurm import SlurmError, SlurmOptions
 from cronos_lerobot.locks import FolderInUseError
@@ -198,6 +198,10 @@ def make_options(args: argparse.Namespace, extra: list[str], bases: Iterable[Bas
         raise ValueError(f"{taken[0]} after -- is of the runs alone: give --obs_type, before it, for all")
     if taken:
         raise ValueError(f"{taken[0]} is set by the experiment; it cannot be given after --")
+    for name, value in (flag.partition("=")[::2] for flag in extra):
+        # More than one of each configuration are as many of all.
+        if name == "--eval.n_episodes" and value.isdigit() and int(value) > 64 and int(value) % 64:
+            raise ValueError(f"{name}={value} must be at most 64, the configurations, or so many times 64")
     if not args.temperature >= 0:
         raise ValueError(f"--temperature must be at least 0, got {args.temperature}")
     scale = SCALES[args.scale]
@@ -284,7 +288,7 @@ def run_jobs(jobs: list[Job], args: argparse.Namespace, slurm: SlurmOptions | No
     """Run what is not done, here or on a cluster; returns the state of every job by name."""
     try:
         if slurm is None:
-            parallel = args.jobs or max(1, (os.cpu_count() or 1) // args.threads)
+            parallel = args.jobs or max(1, usable_cores() // args.threads)
             return run_here(jobs, parallel, args.threads)
         return run_on_slurm(jobs, slurm, args.root, args.threads, args.jobs)
     except (SlurmError, FolderInUseError) as error:

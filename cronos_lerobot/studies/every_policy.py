@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,7 +25,7 @@ from cronos_lerobot.experiments.display import make_display
 from cronos_lerobot.experiments.jobs import Job
 from cronos_lerobot.experiments.plan import LAST_POLICY, resume_command
 from cronos_lerobot.experiments.progress import train_progress
-from cronos_lerobot.experiments.runner import DONE, Runner
+from cronos_lerobot.experiments.runner import DONE, Runner, usable_cores
 from cronos_lerobot.report.png import to_png
 from cronos_lerobot.report.runs import TrainingRun, read_training_run
 from cronos_lerobot.studies.every_policy_report import (
@@ -246,7 +245,7 @@ def main() -> None:
     parser.add_argument("--agents", nargs="+", choices=agents, default=agents)
     parser.add_argument("--intervals", nargs="+", type=int, choices=RESETS, default=list(RESETS), help="T")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="commands at a time")
+    parser.add_argument("--jobs", type=int, default=usable_cores(), help="commands at a time")
     parser.add_argument("--report_only", action="store_true", help="run nothing")
     parser.add_argument(
         "--merge", type=Path, nargs="+", default=[], metavar="GAINS.CSV", help="report these runs, too"

@@ -130,18 +130,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/learn_from_streams"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--steps", type=int, default=153_600, help="interaction steps of the recorded run")
+    parser.add_argument("--steps", type=int, help="interaction steps of the recorded run: 153,600, or the scale's")
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=["filtered"], help="of cloning the stream")
     parser.add_argument("--head", choices=HEADS, default="tokens", help="of the base and of the clones")
-    parser.add_argument("--scale", choices=SCALES, default="full", help="smoke learns nothing")
+    parser.add_argument("--scale", choices=("full", "smoke"), default="full", help="smoke learns nothing")
     args = parser.parse_args()
-    scale = SCALES[args.scale] if args.scale == "smoke" else replace(SCALES["full"], train_steps=args.steps)
+    scale = SCALES[args.scale]
+    steps = args.steps or (scale.train_steps if args.scale == "smoke" else 153_600)
+    scale = replace(scale, train_steps=steps)
     try:
         run_steps(make_steps(scale, args.seeds, args.output_dir, args.ways, args.head), args.output_dir)
     except (FileExistsError, FolderInUseError) as error:
         sys.exit(f"error: {error}")
     except StepFailedError as error:
         sys.exit(f"error: {error}\nrun the same command again to go on from here")
+    except KeyboardInterrupt:
+        sys.exit("\ninterrupted: the same command goes on from here")
     table = make_table(args.seeds, args.output_dir, args.ways)
     Console(width=None if sys.stdout.isatty() else 120).print(table)
     if "filtered" in args.ways:

@@ -128,6 +128,10 @@ def test_list_names_every_row(monkeypatch, capsys):
         (["table1", "--import=no_module"], "--import=no_module cannot be imported (No module named 'no_module')"),
         (["table1", "--base.checkpoint=400"], "base.checkpoint must be one of [80, 160, 240, 320], got 400"),
         (["table1", "--", "--steps=3"], "--steps=3 is set by the experiment"),
+        (
+            ["table1", "--", "--eval.n_episodes=100"],
+            "--eval.n_episodes=100 must be at most 64, the conf",
+        ),
         (["table1", "--", "--save_freq=3"], "--save_freq=3 is set by the experiment"),
         (["table1", "--", "--algorithm.target_kl"], "--algorithm.target_kl needs a value"),
         (["table1", "--", "target_kl"], "flags begin with --, got 'target_kl'"),

@@ -201,6 +201,18 @@ def test_given_numbers_of_episodes_hold_for_rows_with_one_configuration():
     assert {"--eval.n_episodes=1", "--eval.repetitions=16"} <= set(flags["t80_1config"])
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"curriculum": True, "stages": ((245760, 640),), "tag": "s"}, "curriculum or stages of its own"),
+        ({"num_configurations": 1, "base": "wide"}, "1 configuration has a base of its own, not 'wide'"),
+    ],
+)
+def test_rows_that_would_do_less_than_they_say_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        Row(1280, **options)
+
+
 def test_runs_are_evaluated_at_the_budgets_of_all_tables_that_share_them():
     at = "--eval_at_interventions=[1000, 1600, 2000, 4000, 6000, 8000]"
     for name in ("table1", "figure4"):

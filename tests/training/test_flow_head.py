@@ -146,6 +146,12 @@ def test_lora_in_every_layer_as_lerobot_train_has_it(tmp_path, monkeypatch):
         "--num_workers=0", f"--output_dir={tmp_path / 'adapted'}",
     )  # fmt: skip
     adapted = tmp_path / "adapted/checkpoints/last/pretrained_model"
+    steering = [*(flag for flag in TRAIN if not flag.startswith("--algorithm.")), "--algorithm.type=steering"]
+    with pytest.raises(SystemExit, match=r"--peft\.\* .* --algorithm\.type=steering trains nothing"):
+        cronos_train(
+            monkeypatch, f"--policy.path={clone}", "--policy.device=cpu", *OBSERVATIONS["state"], *steering, *peft,
+            "--steps=40", f"--output_dir={tmp_path / 'none'}",
+        )  # fmt: skip
     for name, base, flags in (("on", adapted, ()), ("new", clone, peft)):
         cronos_train(
             monkeypatch, f"--policy.path={base}", "--policy.device=cpu", *OBSERVATIONS["state"], *TRAIN, *flags,
