@@ -131,10 +131,10 @@ def make_table(runs: Iterable[Ended]) -> str:
 
 
 def _gain_cell(gain: Summary) -> str:
-    if gain.ci95 is None:
+    if (interval := gain.varied_ci95) is None:
         return f"{gain.mean:+.3f}"
-    text = "{:+.3f} [{:+.3f}, {:+.3f}]".format(gain.mean, *gain.ci95)
-    return f"**{text}**" if gain.ci95[0] > 0 else text
+    text = "{:+.3f} [{:+.3f}, {:+.3f}]".format(gain.mean, *interval)
+    return f"**{text}**" if interval[0] > 0 else text
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,8 @@ def draw_gains(runs: Sequence[Ended]) -> Figure:
         ax.plot([line.before] * 2, [y - 0.4, y + 0.4], color="#8a8a8a", linewidth=2)
         ax.plot([line.before, line.before + gain.mean], [y, y], color=color, linewidth=1, alpha=0.4)
         ax.plot([one.after for one in line.runs], [y] * len(line.runs), ".", color=color, alpha=0.6, markersize=5)
-        bars = None if gain.ci95 is None else [[gain.mean - gain.ci95[0]], [gain.ci95[1] - gain.mean]]
+        interval = gain.varied_ci95
+        bars = None if interval is None else [[gain.mean - interval[0]], [interval[1] - gain.mean]]
         marker = INTERVALS[run.interval][1]
         ax.errorbar(line.before + gain.mean, y, xerr=bars, fmt=marker, color=color, markersize=6, capsize=3)
     ax.set_yticks(heights, [f"{run.policy}, {run.agent}, T = {INTERVALS[run.interval][0]}" for run in firsts])

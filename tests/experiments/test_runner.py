@@ -195,6 +195,19 @@ def test_job_of_another_process_is_waited_for(tmp_path):
     assert release.wait() == 0
 
 
+def test_of_what_may_only_be_read_the_note_is_believed(tmp_path, monkeypatch):
+    job = count_job(tmp_path, "a")
+    run([job])
+    job.record.write_text(json.dumps(json.loads(job.record.read_text()) | {"status": "running"}))
+    assert status(job) == "stopped"
+
+    def refuse(*args):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("cronos_lerobot.experiments.jobs.os.open", refuse)
+    assert status(job) == "running"
+
+
 @pytest.mark.parametrize("text", ["", '{"command": ["pyth', "[]", '{"status": "done"}'])
 def test_damaged_note_is_said_and_nothing_is_deleted_for_it(tmp_path, text, capsys):
     job = count_job(tmp_path, "a")

@@ -83,6 +83,9 @@ def test_the_table_has_the_gain_over_the_seeds(tmp_path):
     # An interval above zero is bold: 0.055 +- 12.706 * 0.005 is not, 0.055 +- 12.706 * 0.0005 is.
     ends = [end for end in find_ends(read_runs(tmp_path)) if end.agent == "imitation"]
     assert "**" not in make_table(ends)
+    # Two that came to the same do not say that all do.
+    tied = [replace(end, after=0.55) for end in ends]
+    assert make_table(tied).splitlines()[2].endswith("| .550 .550 | +0.050 |")
     ends = [replace(end, after=after) for end, after in zip(ends, (0.5545, 0.5555), strict=True)]
     assert make_table(ends).endswith("| **+0.055 [+0.049, +0.061]** |")
 
