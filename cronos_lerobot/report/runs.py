@@ -10,12 +10,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import draccus
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from lerobot_env_cronos import check_environment_id
 from lerobot_env_cronos.scene.scenes import SCENES
 
 from cronos_lerobot.evaluation.store import RESULTS
+from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.report.protocol_names import DESCRIBED, describe_protocol
 from cronos_lerobot.report.statistics import Rate, sum_rates
 from cronos_lerobot.report.suites import SuiteRun, check_results, is_results, read_suite_runs
@@ -302,6 +304,13 @@ def _below_root(config: dict[str, Any]) -> dict[str, Any]:
     return config | {"policy": policy | {"pretrained_path": found[1]}} if found else config
 
 
+def _with_defaults(config: dict[str, Any]) -> dict[str, Any]:
+    """A config with the flags of the protocol that it is too old for, whose defaults are what was done before."""
+    if "protocol" not in config:
+        return config
+    return config | {"protocol": draccus.encode(ProtocolConfig()) | config["protocol"]}
+
+
 def group_runs(runs: list[TrainingRun]) -> list[Group]:
     """Group runs by their config but for seed and length, labelled by what tells the groups apart.
 
@@ -312,7 +321,8 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
     groups: dict[str, Group] = {}
     flat = {}
     for run in runs:
-        config = _below_root({name: value for name, value in run.config.items() if name not in NOT_THE_EXPERIMENT})
+        mine = {name: value for name, value in run.config.items() if name not in NOT_THE_EXPERIMENT}
+        config = _below_root(_with_defaults(mine))
         key = json.dumps([config, run.changed], sort_keys=True) if config else str(run.folder)
         group = groups.setdefault(key, Group(run.name))
         # A longer run of the same seed begins with the shorter one: counted twice it would narrow the spread.

@@ -29,6 +29,18 @@ def test_resumed_run_stays_in_its_group(tmp_path):
     assert len(group_runs(find_runs([tmp_path]).training)) == 1
 
 
+def test_a_run_from_before_a_flag_is_a_seed_of_those_that_have_its_default(tmp_path):
+    for seed, starts in enumerate((None, "random", "learnable")):
+        manifest = write_training_run(tmp_path / str(seed), seed=seed, interval=160) / "manifest.json"
+        content = json.loads(manifest.read_text())
+        protocol = content["starts"][0]["config"]["protocol"]
+        protocol.pop("reset_starts", None)
+        protocol |= {} if starts is None else {"reset_starts": starts}
+        manifest.write_text(json.dumps(content))
+    groups = group_runs(find_runs([tmp_path]).training)
+    assert [sorted(run.seed for run in group.runs) for group in groups] == [[0, 1], [2]]
+
+
 def test_a_resume_that_was_undone_leaves_nothing(tmp_path):
     """Of a run that went on with another T, and then once more from an earlier checkpoint with its own."""
     for name in "ab":
