@@ -26,6 +26,8 @@ SAME_PLACE, MARK_POINTS = 1.2, 7.0
 """Marks whose places differ by less than this factor stand side by side, so far from each other [points]."""
 MOST_MARKS = 9
 """Of one base policy in a panel of steps, where nobody could tell more of them apart."""
+FEW_ROWS = 6
+"""Of a list: its panel is lower than the name of the axis is long with fewer."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +69,13 @@ def interventions_figure(result: ExperimentResult) -> Figure | None:
         return None
     most = max(map(len, by_base.values()))
     styles = row_styles(result)
-    figure = (_with_list if most > MOST_MARKS else _with_steps)(by_base, styles, drawn)
+    has_list = most > MOST_MARKS
+    figure = (_with_list if has_list else _with_steps)(by_base, styles, drawn)
     panels = figure.axes[::2]
     for ax, (base, rows) in zip(panels, by_base.items(), strict=True):
         _join_ends(ax, rows, result, styles)
         ax.set_title(f"{base} base policy", fontsize=9, color=INK, loc="left")
-        ax.set_ylabel("success, training configurations")
+        ax.set_ylabel("success" if has_list and len(rows) < FEW_ROWS else "success, training configurations")
     _logarithmic(panels, [end.interventions for end in drawn.values()])
     for ax in panels:
         ax.label_outer()
