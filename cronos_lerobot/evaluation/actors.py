@@ -21,7 +21,7 @@ from cronos_lerobot.agents.base import Columns, samples
 from cronos_lerobot.agents.chunk_player import make_player
 from cronos_lerobot.agents.history import ObservationHistory, observation_steps
 from cronos_lerobot.agents.processing import PolicyProcessors, make_processors, observation_columns
-from cronos_lerobot.agents.steering.steered import SteeredPolicy, with_steering
+from cronos_lerobot.agents.steering.steered import with_steering
 
 
 class Actor(Protocol):
@@ -58,7 +58,7 @@ class Actor(Protocol):
 
 
 class SamplingPolicy:
-    """A `TrainablePolicy` or a SteeredPolicy, sampled at a temperature.
+    """What has `sample_actions`, sampled at a temperature.
 
     A decision on several actions is played to its end, in each environment for itself, unless a new task begins.
 
@@ -175,11 +175,6 @@ class ExpertActor:
         return self._expert.act()[ids]
 
 
-def has_temperature(policy: Any) -> bool:
-    """Whether a policy samples at a temperature that an evaluation chooses."""
-    return isinstance(policy, SteeredPolicy) or samples(policy)
-
-
 def make_actor(
     policy: Any, processors: PolicyProcessors, temperature: float, env_processors: tuple[Any, Any] | None = None
 ) -> SamplingPolicy | SelectingPolicy:
@@ -191,7 +186,7 @@ def make_actor(
         temperature: of the sampling, if the policy has one (`sample_actions`).
         env_processors: LeRobot's processors between environment and policy, (before, after), if any.
     """
-    if has_temperature(policy):
+    if samples(policy):
         return SamplingPolicy(policy, processors, temperature)
     return SelectingPolicy(policy, processors, env_processors or (_as_it_is, _as_it_is))
 

@@ -11,8 +11,9 @@ from typing import Any
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
 from lerobot_env_cronos import SequentialVectorEnv
 
+from cronos_lerobot.agents.base import samples
 from cronos_lerobot.agents.processing import PolicyProcessors
-from cronos_lerobot.evaluation.actors import has_temperature, make_actor
+from cronos_lerobot.evaluation.actors import make_actor
 from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
 from cronos_lerobot.evaluation.plan import make_parts
 from cronos_lerobot.evaluation.results import Record, independent_results
@@ -100,7 +101,7 @@ def evaluate_independent(
     }
     records = [record for some in by_seed.values() for record in some]
     groups = env.benchmark.groups("independent", options["split"])
-    temperature = options["temperature"] if has_temperature(policy) else None
+    temperature = options["temperature"] if samples(policy) else None
     header = {"split": options["split"], "temperature": temperature}
     header |= {"steps": sum(record["steps"] for record in records), "episodes": episode_lists(by_seed)}
     return header | independent_results(records, [group.tasks[0] for group in groups])

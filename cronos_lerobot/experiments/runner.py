@@ -278,7 +278,10 @@ def _silence_ending_signals() -> None:
 
 
 def usable_cores() -> int:
-    """Cores that this process may use, which a job or a container may have fewer of than the machine."""
+    """Cores that this process may use, which a job or a container may have fewer of than the machine.
+
+    As the environment's `num_cores`, which MuJoCo's seconds would have to be imported for.
+    """
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -39,6 +39,8 @@ WAYS = {
 }
 HEADS = {"tokens": [], "flow": ["--policy.head=flow"]}
 """Flags of `lerobot-train` for the policies that are compared."""
+LENGTHS = {"full": replace(SCALES["full"], train_steps=153_600), "smoke": SCALES["smoke"]}
+"""The study by `--scale`."""
 
 
 def make_steps(
@@ -130,14 +132,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/learn_from_streams"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--steps", type=int, help="interaction steps of the recorded run: 153,600, or the scale's")
+    parser.add_argument("--steps", type=int, help="interaction steps of the recorded run; default: the scale's")
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=["filtered"], help="of cloning the stream")
     parser.add_argument("--head", choices=HEADS, default="tokens", help="of the base and of the clones")
-    parser.add_argument("--scale", choices=("full", "smoke"), default="full", help="smoke learns nothing")
+    parser.add_argument("--scale", choices=LENGTHS, default="full", help="smoke learns nothing")
     args = parser.parse_args()
-    scale = SCALES[args.scale]
-    steps = args.steps or (scale.train_steps if args.scale == "smoke" else 153_600)
-    scale = replace(scale, train_steps=steps)
+    scale = LENGTHS[args.scale]
+    if args.steps is not None:
+        scale = replace(scale, train_steps=args.steps)
     try:
         run_steps(make_steps(scale, args.seeds, args.output_dir, args.ways, args.head), args.output_dir)
     except (FileExistsError, FolderInUseError) as error:

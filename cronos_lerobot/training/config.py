@@ -247,15 +247,15 @@ class CronosTrainConfig:
         file = Path(path) / TRAIN_CONFIG_NAME if Path(path).is_dir() else Path(path)
         if not file.is_file():
             raise FileNotFoundError(f"No training config at {file}.")
-        asked = parser.parse_arg("resume", cli_args or [])
-        if asked == "true":
+        resume = parser.parse_arg("resume", cli_args or []) == "true"
+        if resume:
             # LeRobot's parser keeps the plugins of the command line from `cli_args`.
             import_plugins(_checkpoint_of(file), sys.argv[1:])
             check_types(_checkpoint_of(file), cli_args or [])
         with draccus.config_type("json" if file.suffix == ".json" else "yaml"):
             config = draccus.parse(cls, file, args=cli_args or [])
         # The file of a resumed run may say it, which asks for nothing.
-        config.resume = config.resume and asked is not None
+        config.resume = resume
         return config
 
     def save_pretrained(self, folder: Path) -> None:

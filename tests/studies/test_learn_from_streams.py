@@ -1,6 +1,9 @@
 """The ways of cloning a recorded stream differ in what they say they differ in, and in nothing else."""
 
+import pytest
+
 from cronos_lerobot.scripts.demo import SCALES
+from cronos_lerobot.studies import learn_from_streams
 from cronos_lerobot.studies.learn_from_streams import WAYS, make_steps
 
 
@@ -42,3 +45,23 @@ def test_only_what_is_asked_for_is_made(tmp_path):
     assert [name for name in names if not name.endswith(("train", "held_out"))] == [
         "record", "clone", "filter", "filtered_1", "filtered_2"
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("flags", "steps"),
+    [((), 153_600), (("--steps=10240",), 10_240), (("--scale=smoke",), SCALES["smoke"].train_steps),
+     (("--scale=smoke", "--steps=10240"), 10_240)],
+)  # fmt: skip
+def test_scale_and_steps_are_followed(flags, steps, tmp_path, monkeypatch):
+    asked = []
+
+    def stop(made, folder):
+        asked.extend(made)
+        raise FileExistsError("no further")
+
+    monkeypatch.setattr(learn_from_streams, "run_steps", stop)
+    monkeypatch.setattr("sys.argv", ["learn_from_streams", f"--output_dir={tmp_path}", *flags])
+    with pytest.raises(SystemExit, match="no further"):
+        learn_from_streams.main()
+    (train,) = (step for step in asked if step.name == "train")
+    assert flags_of(train)["--steps"] == str(steps)

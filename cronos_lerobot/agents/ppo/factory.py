@@ -67,7 +67,7 @@ def _check_factors(policy: Any, processors: PolicyProcessors) -> None:
     """A decision on nothing says whether those of this policy have factors."""
     policy.eval()
     texts = ["put it there"]
-    with torch.inference_mode(), torch.random.fork_rng():
+    with torch.inference_mode():
         batch = processors.encoded_batch(processors.encode(blank_columns(policy), texts), texts)
         log_prob = policy.sample_actions(batch, generator=torch.Generator(processors.device))["log_prob"]
     if log_prob.ndim == 1:
