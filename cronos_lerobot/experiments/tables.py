@@ -11,8 +11,15 @@ import numpy as np
 from cronos_lerobot.experiments.definitions import INTERACTION_STEPS, INTERVENTIONS
 from cronos_lerobot.experiments.differences import Gain, RowDifference
 from cronos_lerobot.experiments.orders import Order
-from cronos_lerobot.experiments.results import APART, ExperimentResult, RowResult, paper_results, sequential
-from cronos_lerobot.protocol.metrics import Summary, interpolate, summarise, summarise_rates
+from cronos_lerobot.experiments.results import (
+    APART,
+    ExperimentResult,
+    RowResult,
+    paper_results,
+    sequential,
+    summarise_points,
+)
+from cronos_lerobot.protocol.metrics import Summary, interpolate, summarise
 from cronos_lerobot.report.series import segment_rates, task_rates
 from cronos_lerobot.report.statistics import Rate
 
@@ -61,8 +68,7 @@ def _main_row(result: ExperimentResult, row: RowResult, shared: float | None) ->
     paper = paper_results()["final_success"].get(result.experiment.name, {}).get(setting.name)
     cells |= {"paper_mean": paper[0] if paper else None, "paper_std": paper[1] if paper else None}
     starts = [seed.curve("train")[0] for seed in row.finished if seed.curve("train")]
-    before = [point.success for point in starts if not point.interaction_steps]
-    cells |= _numbers("base_success", summarise_rates(before))
+    cells |= _numbers("base_success", summarise_points([point for point in starts if not point.interaction_steps]))
     cells |= _numbers("interventions", summarise([seed.run.last["interventions"] for seed in row.finished]))
     cells |= _numbers("D", row.area(INTERACTION_STEPS))
     cells |= _numbers("D_normalised", row.gap(INTERACTION_STEPS))

@@ -140,9 +140,9 @@ class Summary:
 
 
 def summarise_rates(values: Numbers) -> Summary | None:
-    """As `summarise`, of numbers between 0 and 1, where the interval ends, too."""
+    """As `summarise`, of numbers between 0 and 1, where the interval ends, too; none where all are alike."""
     summary = summarise(values)
-    return summary and summary.within(0.0, 1.0)
+    return summary and replace(summary, ci95=summary.varied_ci95).within(0.0, 1.0)
 
 
 def summarise(values: Numbers) -> Summary | None:

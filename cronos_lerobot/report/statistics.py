@@ -56,7 +56,7 @@ class SeedRate(Rate):
     def interval(self) -> tuple[float, float]:
         """95 % t-interval of the mean over the seeds, within 0 and 1; Wilson's of one, or of some all alike."""
         summary = summarise_rates([rate.value for rate in self.seeds])
-        over_seeds = summary.varied_ci95 if summary else None
+        over_seeds = summary.ci95 if summary else None
         return over_seeds or super().interval
 
     def __add__(self, other: Rate) -> Rate:

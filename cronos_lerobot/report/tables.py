@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +68,7 @@ def seed_rows(groups: Iterable[Group]) -> list[Row]:
         row: Row = {"runs": group.label, "seeds": len(curves), "split": curves[0][-1]["split"]}
         row |= {"n": curves[0][-1]["n"], "interaction_steps": end}
         rates = [success_at(x, y, end) for x, y in zip(steps, success, strict=True)]
-        summary = summarise_rates(rates)
-        row |= _summary_columns("success", summary and replace(summary, ci95=summary.varied_ci95))
+        row |= _summary_columns("success", summarise_rates(rates))
         last = [curve[-1] for curve in curves]
         are_there = all(e["interaction_steps"] == end for e in last)
         row |= {name: sum(e.get(name, 0) for e in last) if are_there else None for name in APART}

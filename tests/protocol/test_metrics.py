@@ -5,7 +5,7 @@ from math import isnan, sqrt
 import numpy as np
 import pytest
 
-from cronos_lerobot.protocol.metrics import interpolate, performance_gap, success_at, summarise
+from cronos_lerobot.protocol.metrics import interpolate, performance_gap, success_at, summarise, summarise_rates
 
 
 def test_gap_is_the_area_above_the_curve():
@@ -100,3 +100,12 @@ def test_one_seed_has_no_spread_and_a_missing_one_no_summary():
     assert (summary.mean, summary.std, summary.ci95, str(summary)) == (0.5, None, None, "0.500")
     assert summarise([]) is None
     assert summarise([0.5, float("nan")]) is None
+
+
+def test_rates_end_at_0_and_1_and_some_all_alike_have_no_interval():
+    # t with one degree of freedom is 12.706, the standard error of .2 and .4 is .1.
+    wide, alike = summarise_rates([0.2, 0.4]), summarise_rates([0.5, 0.5, 0.5])
+    assert wide is not None
+    assert alike is not None
+    assert wide.ci95 == (0.0, 1.0)
+    assert (alike.mean, alike.std, alike.ci95) == (0.5, 0.0, None)
