@@ -36,7 +36,7 @@ def test_main_table(options):
     assert (t80["success_train_ci95_low"], t80["success_train_ci95_high"]) == (0.0, 1.0)
     assert (t80["paper_mean"], t80["paper_std"]) == (0.897, 0.027)
     assert (t80["base_success_mean"], t80["interventions_mean"]) == (0.25, RESETS[80])
-    # One policy that both seeds begin with: Wilson's interval of 8 successes in 32, not none of two that are alike.
+    # One policy that both seeds begin with: Wilson's interval of 8 successes in 32, none of two that are alike.
     assert t80["base_success_ci95_low"] == pytest.approx(0.1325, abs=1e-4)
     assert t80["base_success_ci95_high"] == pytest.approx(0.4211, abs=1e-4)
     # Gaps .75, .5, .375 and .75, .5, .125 at three evaluations equally far apart.
