@@ -246,7 +246,7 @@ def _unfinished(result: ExperimentResult) -> list[str]:
                 )
             lines += [f"- {name}: not evaluated" for name in seed.missing if seed.finished]
         lines += [f"- {name}: no record so far ({state})" for name, state in row.unrecorded.items()]
-        missing = row.wanted - len(row.seeds) - len(row.unrecorded)
+        missing = row.wanted - len(row.seeds) - len(row.unrecorded) - row.left_out
         if missing:
             lines.append(f"- {_group(result, row)}: {missing} of {row.wanted} seeds not begun")
     if lines:

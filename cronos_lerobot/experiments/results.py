@@ -128,6 +128,8 @@ class RowResult:
     """How many seeds the experiment has."""
     unrecorded: dict[str, str] = field(default_factory=dict)
     """What has become of runs that were started and have no record yet, by their names; see `jobs.status`."""
+    left_out: int = 0
+    """Runs that are there and not the experiment's; see `ExperimentResult.changed`."""
 
     @property
     def finished(self) -> list[SeedResult]:
@@ -269,7 +271,9 @@ def collect(experiment: Experiment, rows: Iterable[Row], options: Options) -> Ex
         for spec in run_specs(experiment, options, [row]):
             if seed := _read_seed(spec, result):
                 row_result.seeds.append(seed)
-            elif not _has_record(spec) and (state := status(job := train_job(spec, None))) not in (None, DONE):
+            elif _has_record(spec):
+                row_result.left_out += 1
+            elif (state := status(job := train_job(spec, None))) not in (None, DONE):
                 row_result.unrecorded[spec.name] = f"{state}, see {job.log}" if state == FAILED else state
         result.rows.append(row_result)
     return result

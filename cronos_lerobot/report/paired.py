@@ -61,6 +61,12 @@ class Pairs:
         return np.bincount(self.clusters, weights=whole).round().astype(int)
 
     @property
+    def units(self) -> str:
+        """Several of `unit`."""
+        first, *rest = self.unit.split()
+        return " ".join([f"{first}s", *rest])
+
+    @property
     def clusters(self) -> np.ndarray:
         """(episodes,) the number of its configuration, from 0."""
         return np.unique(self.configurations, return_inverse=True)[1]
@@ -119,7 +125,7 @@ def compare_policies(pairs: Pairs, power: float) -> Difference:
         value,
         interval,
         sign_flip_p(pairs.whole_differences),
-        f"{name}, exact sign-flip p over {k} {_plural(pairs.unit)}",
+        f"{name}, exact sign-flip p over {k} {pairs.units}",
         None if needed is None else max(needed, FEWEST),
         detectable(spread, k, power, k - 1) if k >= FEWEST else None,
     )
@@ -147,7 +153,7 @@ def compare_trainings(pairs: Pairs, power: float) -> Difference | None:
     variance = trainings + more
     spread = sqrt(sum(v * len(side) for v, side in zip(of_side, sides, strict=True)))
     counts = f"{len(pairs.a)} against {len(pairs.b)} trainings"
-    method = f"t-interval and p by training and {pairs.unit} ({counts}, {k} {_plural(pairs.unit)})"
+    method = f"t-interval and p by training and {pairs.unit} ({counts}, {k} {pairs.units})"
     per_side = len(sides)
     needed = samples_needed(spread, value, power, lambda n: per_side * (n - 1))
     if not variance:
@@ -158,10 +164,6 @@ def compare_trainings(pairs: Pairs, power: float) -> Difference | None:
     p = 2 * float(student_t.sf(abs(value) / sqrt(variance), df))
     found = (float(student_t.ppf(1 - ALPHA / 2, df)) + float(student_t.ppf(power, df))) * sqrt(variance)
     return Difference(value, (value - half, value + half), p, method, needed, found)
-
-
-def _plural(unit: str) -> str:
-    return unit.replace(unit.split()[0], f"{unit.split()[0]}s", 1)
 
 
 def cluster_variance(values: np.ndarray, clusters: np.ndarray) -> float:

@@ -35,6 +35,8 @@ class PairedRow:
     """Of trainings like these; None if there is one of each. A side of one is taken as it is."""
     sampled: str = ""
     """The sides that have several trainings, of which `trainings` speaks: `A`, `B` or `AB`."""
+    units: str = "configurations"
+    """What `configurations` counts: where all episodes are of one, its repetitions."""
     p_holm: float | None = None
     """p of a single task or position, adjusted for as many tests as there are of them."""
 
@@ -166,6 +168,7 @@ def _row(what: str, pairs: Pairs, power: float) -> PairedRow:
         compare_policies(pairs, power),
         compare_trainings(pairs, power),
         "A" * (len(pairs.a) > 1) + "B" * (len(pairs.b) > 1),
+        pairs.units,
     )
 
 
@@ -213,7 +216,7 @@ def _suite_text(suite: PairedSuite, power: float) -> str:
     seeds = ", ".join(map(str, suite.seeds))
     kind = "episodes" if suite.suite == "independent" else "chains"
     lines = [
-        f"{suite.suite} {suite.split}: {first.pairs} pairs of {kind} from {first.configurations} configurations,"
+        f"{suite.suite} {suite.split}: {first.pairs} pairs of {kind} from {first.configurations} {first.units},"
         f" sampling seed {seeds}"
     ]
     lines += [f"  {name}: {', '.join(policies)}" for name, policies in (("A", suite.a), ("B", suite.b))]
@@ -257,7 +260,7 @@ def _sentences(row: PairedRow, power: float) -> Iterator[str]:
         elif not row.trainings and row.more_episodes is not None:
             yield (
                 f"  One of {abs(found.value):.3f} takes about {row.more_episodes} more episodes of each policy,"
-                f" from {found.needed} configurations in all."
+                f" from {found.needed} {row.units} in all."
             )
     if row.trainings and row.sampled != "AB":
         yield "  Of other trainings of the single policy this says nothing."

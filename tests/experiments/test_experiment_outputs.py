@@ -188,7 +188,7 @@ def test_run_without_its_last_evaluation_has_no_success_at_the_end(options):
     assert row["D_normalised_mean"] is not None
 
 
-def test_run_of_another_command_is_named_and_left_out(options):
+def test_run_of_another_command_is_named_and_left_out(options, tmp_path):
     make_run(options, "table1", "t80", 1, (2, 4, 6))
     other = replace(options, extra=("--algorithm.target_kl=0.02",))
     result = results(other, "table1")
@@ -197,6 +197,9 @@ def test_run_of_another_command_is_named_and_left_out(options):
     assert "none there, --algorithm.target_kl=0.02 here" in text
     row = by_row(tables.main_rows(result))["t80"]
     assert (row["seeds"], row["success_train_mean"]) == (0, None)
+    # It has begun, though not for this page.
+    text = write_outputs(EXPERIMENTS["table1"], EXPERIMENTS["table1"].rows, other, tmp_path / "out")
+    assert "t80: 1 of 2 seeds not begun" in text
 
 
 def test_flags_besides_those_of_the_rows_are_on_the_page(options, tmp_path):

@@ -79,6 +79,25 @@ def test_a_decision_would_need_more_episodes(tmp_path, monkeypatch, capsys):
     assert "One of 0.050 takes about 490 more episodes of each policy, from 255 configurations in all." in text
 
 
+def test_episodes_of_one_configuration_are_counted_by_repetition(tmp_path, monkeypatch, capsys):
+    a = write_run(tmp_path / "a", 1, ["11000000"])
+    b = write_run(tmp_path / "b", 1, ["10110000"])
+    for folder in (a, b):
+        lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+        for line in lines:
+            line["episodes"] = [[seed + c, number, 0, x] for seed, number, c, x in line["episodes"]]
+        (folder / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    (suite,) = compared(monkeypatch, capsys, a, b)["comparisons"]
+    assert (suite["rows"][0]["configurations"], suite["rows"][0]["units"]) == (
+        8,
+        "repetitions of one configuration",
+    )
+    compare(monkeypatch, a, b)
+    text = capsys.readouterr().out
+    assert "8 pairs of episodes from 8 repetitions of one configuration, sampling seed 1000, 1001" in text
+    assert re.search(r"takes about \d+ more episodes of each policy, from \d+ repetitions of one config", text)
+
+
 def test_from_five_configurations_nothing_can_be_decided(tmp_path, monkeypatch, capsys):
     """B is better from all five: 2 of 2^5 ways are as far from even, p = .0625; six would give 2 of 2^6, .031."""
     a = write_evaluation(tmp_path / "a", "me/a", tasks=["00000"])
