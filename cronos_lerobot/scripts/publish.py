@@ -94,9 +94,15 @@ def _publish(
 ) -> None:
     """Write the tree, to the dry run's folder or to one that is pushed and gone."""
     if config.dry_run:
-        config.output_dir.mkdir(parents=True, exist_ok=True)
-        what = write(config, config.output_dir)
-        files = [path for path in config.output_dir.rglob("*") if path.is_file()]
+        # Whole or not there: what is refused halfway leaves nothing to remove before the next try.
+        place = config.output_dir.resolve()
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{place.name}.", dir=place.parent) as beside:
+            tree = Path(beside, place.name)
+            tree.mkdir()
+            what = write(config, tree)
+            tree.rename(place)
+        files = [path for path in place.rglob("*") if path.is_file()]
         size = sum(path.stat().st_size for path in files) / 1e6
         print(f"dry run: {what}\n{len(files)} files, {size:.2f} MB in {config.output_dir}; nothing was pushed")
         return
