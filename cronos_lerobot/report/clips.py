@@ -6,7 +6,7 @@ import base64
 from dataclasses import dataclass
 from pathlib import Path
 
-from cronos_lerobot.report.runs import EvaluationRun
+from cronos_lerobot.report.lerobot_evaluations import EvaluationRun
 
 MAX_CLIP_BYTES = 3_000_000
 """A longer video stays a file beside the page."""

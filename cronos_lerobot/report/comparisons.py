@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from cronos_lerobot.report.runs import EvaluationRun, Group, TrainingRun, evaluation_rates
+from cronos_lerobot.report.lerobot_evaluations import EvaluationRun
+from cronos_lerobot.report.runs import Group, TrainingRun, evaluation_rates
 from cronos_lerobot.report.statistics import Gain, Rate, SeedRate, sum_rates
 
 

@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 
 from cronos_lerobot.report import clips, figures, suite_views, tables
 from cronos_lerobot.report.comparisons import Comparison, compare_evaluations, compare_training, titled
+from cronos_lerobot.report.lerobot_evaluations import EvaluationRun
 from cronos_lerobot.report.png import to_png
-from cronos_lerobot.report.runs import EvaluationRun, Group, TrainingRun, group_runs
+from cronos_lerobot.report.runs import Group, TrainingRun, group_runs
 from cronos_lerobot.report.suites import SuiteRun
 
 PAGE = "index.html"

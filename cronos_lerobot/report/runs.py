@@ -14,16 +14,14 @@ import draccus
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from lerobot_env_cronos import check_environment_id
-from lerobot_env_cronos.scene.scenes import SCENES
 
 from cronos_lerobot.evaluation.store import RESULTS
 from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.report.lerobot_evaluations import EVAL_INFO, EvaluationRun, read_evaluation_runs
 from cronos_lerobot.report.protocol_names import DESCRIBED, describe_protocol
-from cronos_lerobot.report.statistics import Rate, sum_rates
+from cronos_lerobot.report.statistics import Rate
 from cronos_lerobot.report.suites import SuiteRun, check_results, is_results, read_suite_runs
 from cronos_lerobot.training.logging import MANIFEST, METRICS
-
-EVAL_INFO = "eval_info.json"
 
 NOT_THE_EXPERIMENT = (
     "seed", "steps", "output_dir", "job_name", "resume", "record", "wandb", "tensorboard", "torch_threads",
@@ -114,34 +112,6 @@ def _made(evaluation: Evaluation) -> tuple[Any, ...]:
 def _describe_made(evaluation: Evaluation) -> str:
     split, temperature, n = _made(evaluation)
     return f"{split}, n={n}" + (f", temperature {temperature}" if temperature is not None else "")
-
-
-@dataclass
-class EvaluationRun:
-    """An output folder of `lerobot-eval`."""
-
-    folder: Path
-    suite: str
-    """LeRobot's task group, e.g. `independent_held_out`."""
-    successes: dict[str, list[bool]]
-    """By instruction, or ordering of a sequential suite: one flag for each episode."""
-    videos: dict[str, list[Path]]
-    """By instruction: the videos of the first episodes, in their order."""
-
-    @property
-    def name(self) -> str:
-        """The folder's name."""
-        return self.folder.resolve().name
-
-    @property
-    def tasks(self) -> dict[str, Rate]:
-        """Success by instruction."""
-        return {task: Rate(sum(flags), len(flags)) for task, flags in self.successes.items()}
-
-    @property
-    def overall(self) -> Rate:
-        """Success of all tasks together."""
-        return sum_rates(self.tasks.values())
 
 
 @dataclass
@@ -268,30 +238,6 @@ def config_of(folder: Path, starts: list[dict[str, Any]]) -> dict[str, Any]:
         return config | {"policy": first["policy"]} if "policy" in first else config
     path = folder / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME
     return json.loads(path.read_text()) if path.is_file() else {}
-
-
-def read_evaluation_runs(folder: Path, scene: str = "kitchen_2x2") -> list[EvaluationRun]:
-    """Read an output folder of `lerobot-eval`: one EvaluationRun for each suite in it.
-
-    Args:
-        folder: holds eval_info.json.
-        scene: the scene, which the file does not name; its tasks are numbered in the file.
-    """
-    instructions = [task.instruction for task in SCENES[scene].tasks]
-    runs: dict[str, EvaluationRun] = {}
-    for entry in json.loads((folder / EVAL_INFO).read_text())["per_task"]:
-        suite, number = entry["task_group"], entry["task_id"]
-        run = runs.setdefault(suite, EvaluationRun(folder, suite, {}, {}))
-        if suite.startswith("sequential"):
-            task = f"ordering {number}"  # an episode is a chain of all tasks
-        else:
-            task = instructions[number] if number < len(instructions) else f"task {number}"
-        run.successes[task] = [bool(flag) for flag in entry["metrics"]["successes"]]
-        paths = [Path(path) for path in entry["metrics"].get("video_paths", [])]
-        # The paths are as seen when the evaluation ran; the folder may have moved since.
-        moved = [folder / "videos" / path.parent.name / path.name for path in paths]
-        run.videos[task] = [path for path in moved if path.is_file()]
-    return list(runs.values())
 
 
 def _below_root(config: dict[str, Any]) -> dict[str, Any]:

@@ -9,7 +9,8 @@ from typing import Any
 
 from cronos_lerobot.protocol.metrics import Summary, performance_gap, success_at, summarise, summarise_rates
 from cronos_lerobot.report.comparisons import Comparison, titled
-from cronos_lerobot.report.runs import EvaluationRun, Group, TrainingRun, agent_metrics, evaluation_rates
+from cronos_lerobot.report.lerobot_evaluations import EvaluationRun
+from cronos_lerobot.report.runs import Group, TrainingRun, agent_metrics, evaluation_rates
 from cronos_lerobot.report.statistics import Gain, Rate
 
 Row = dict[str, Any]

@@ -23,7 +23,7 @@ from rich.table import Table
 
 from cronos_lerobot.data.stream_filter import PROVENANCE
 from cronos_lerobot.locks import FolderInUseError
-from cronos_lerobot.report.runs import read_evaluation_runs
+from cronos_lerobot.report.lerobot_evaluations import read_evaluation_runs
 from cronos_lerobot.report.statistics import Rate
 from cronos_lerobot.scripts.demo import SCALES, Scale, clone_step, eval_step, record_step, train_step
 from cronos_lerobot.scripts.pipeline import Step, StepFailedError, run_steps

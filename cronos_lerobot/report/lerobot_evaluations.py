@@ -1,0 +1,65 @@
+"""Reads the folders of `lerobot-eval`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_env_cronos.scene.scenes import SCENES
+
+from cronos_lerobot.report.statistics import Rate, sum_rates
+
+EVAL_INFO = "eval_info.json"
+
+
+@dataclass
+class EvaluationRun:
+    """An output folder of `lerobot-eval`."""
+
+    folder: Path
+    suite: str
+    """LeRobot's task group, e.g. `independent_held_out`."""
+    successes: dict[str, list[bool]]
+    """By instruction, or ordering of a sequential suite: one flag for each episode."""
+    videos: dict[str, list[Path]]
+    """By instruction: the videos of the first episodes, in their order."""
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self.folder.resolve().name
+
+    @property
+    def tasks(self) -> dict[str, Rate]:
+        """Success by instruction."""
+        return {task: Rate(sum(flags), len(flags)) for task, flags in self.successes.items()}
+
+    @property
+    def overall(self) -> Rate:
+        """Success of all tasks together."""
+        return sum_rates(self.tasks.values())
+
+
+def read_evaluation_runs(folder: Path, scene: str = "kitchen_2x2") -> list[EvaluationRun]:
+    """Read an output folder of `lerobot-eval`: one EvaluationRun for each suite in it.
+
+    Args:
+        folder: holds eval_info.json.
+        scene: the scene, which the file does not name; its tasks are numbered in the file.
+    """
+    instructions = [task.instruction for task in SCENES[scene].tasks]
+    runs: dict[str, EvaluationRun] = {}
+    for entry in json.loads((folder / EVAL_INFO).read_text())["per_task"]:
+        suite, number = entry["task_group"], entry["task_id"]
+        run = runs.setdefault(suite, EvaluationRun(folder, suite, {}, {}))
+        if suite.startswith("sequential"):
+            task = f"ordering {number}"  # an episode is a chain of all tasks
+        else:
+            task = instructions[number] if number < len(instructions) else f"task {number}"
+        run.successes[task] = [bool(flag) for flag in entry["metrics"]["successes"]]
+        paths = [Path(path) for path in entry["metrics"].get("video_paths", [])]
+        # The paths are as seen when the evaluation ran; the folder may have moved since.
+        moved = [folder / "videos" / path.parent.name / path.name for path in paths]
+        run.videos[task] = [path for path in moved if path.is_file()]
+    return list(runs.values())
