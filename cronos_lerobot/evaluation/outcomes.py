@@ -18,8 +18,16 @@ AGREE = {
 """What two evaluations must have alike to be of the same episodes."""
 AGREE_IN_CHAINS = {"advance": "advance", "end_effector_reset": "end_effector_reset"}
 """What the chains must have alike, too."""
-WORTH_SAYING = ("temperature", "obs_type", "renderer", "versions")
+PICTURES = ("camera_name", "observation_height", "observation_width", "rename_map")
+"""What a policy from pixels is shown, beside the renderer; fields of an evaluation's identity."""
+WORTH_SAYING = ("temperature", "obs_type", "renderer", *PICTURES, "versions")
 """What may differ, as it is of the policy or should not matter, but is said."""
+
+
+def pictures(obs_type: str | None, env: Mapping[str, Any], rename_map: Mapping[str, str] | None) -> dict[str, Any]:
+    """The fields of PICTURES, None where there is nothing to say; of a policy from the state there is not."""
+    shown = {**env, "rename_map": rename_map} if obs_type == "pixels_agent_pos" else {}
+    return {name: shown.get(name) or None for name in PICTURES}
 
 
 class Episode(NamedTuple):
@@ -97,6 +105,8 @@ def _outcomes(folder: Path, results: Mapping[str, Any]) -> Outcomes:
     setting = {name: results.get(name) for name in (*AGREE, *AGREE_IN_CHAINS, *WORTH_SAYING)}
     benchmark = results["benchmark"]
     setting |= {"environment": benchmark["environment"], "benchmark": benchmark["fingerprint"]}
+    identity = results.get("identity") or {}
+    setting |= pictures(results.get("obs_type"), identity.get("env") or {}, identity.get("rename_map"))
     return Outcomes(
         results["policy"],
         results["policy_fingerprint"],

@@ -105,9 +105,13 @@ def load_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
 def fingerprint(policy: PreTrainedConfig) -> str:
     """A short hash of all that decides a policy's actions: its config, its weights and its processors.
 
-    Weights that the config names (`checkpoint`, `adapter`) count too: by their files, or the Hub's commit.
+    Weights that the config names (`checkpoint`, `adapter`) count too: by their files, or the Hub's commit. It is the
+    same on every device.
     """
     config = {name: value for name, value in draccus.encode(policy).items() if name not in UNDECISIVE}
+    if "device" in config:
+        # Policies have been hashed with it, nearly all on the CPU.
+        config["device"] = "cpu"
     digest = hashlib.sha256(json.dumps(config, sort_keys=True, default=str).encode())
     folder = Path(policy.pretrained_path or "")
     for content in (*_weights_and_processors(folder), *_base_of_adapters(folder)):

@@ -7,7 +7,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from cronos_lerobot.evaluation.outcomes import WORTH_SAYING, Episode, Outcomes, read_outcomes, shared_episodes
+from cronos_lerobot.evaluation.outcomes import (
+    AGREE_IN_CHAINS,
+    WORTH_SAYING,
+    Episode,
+    Outcomes,
+    pictures,
+    read_outcomes,
+    shared_episodes,
+)
 from cronos_lerobot.evaluation.store import COMPARISON, RESULTS
 from cronos_lerobot.report.comparisons import at_their_end
 from cronos_lerobot.report.runs import TrainingRun, files_called, group_runs, read_training_run
@@ -121,12 +129,18 @@ def _together(one: Outcomes, other: Outcomes) -> Outcomes:
             f"{one.policy} was evaluated as two different policies ({one.fingerprint} and {other.fingerprint}):"
             " name the folders of one of them"
         )
+    names = [name for name in one.setting if one.setting[name] != other.setting[name]]
+    differ = "; ".join(f"{name}: {one.setting[name]} and {other.setting[name]}" for name in names)
     if one.lengths.keys() & other.lengths.keys():
-        names = [name for name in one.setting if one.setting[name] != other.setting[name]]
-        differ = "; ".join(f"{name}: {one.setting[name]} and {other.setting[name]}" for name in names)
         raise ValueError(
             f"{one.policy} has two evaluations of the same episodes ({differ or 'made alike'}): name the folder of"
             " the one that is meant"
+        )
+    chains = any(episode.suite == "sequential" for episode in one.lengths)
+    if any(chains or name not in AGREE_IN_CHAINS for name in names if name != "versions"):
+        raise ValueError(
+            f"{one.policy} has evaluations that were not made alike ({differ}): name the folders of those that are"
+            " meant"
         )
     return replace(one, lengths=one.lengths | other.lengths)
 
@@ -200,7 +214,7 @@ def periodic_evaluation(run: TrainingRun, number: int) -> Outcomes:
         )
     start = run.starts[-1] if run.starts else {}
     env = run.config.get("env") or {}
-    setting = {
+    setting = pictures(env.get("obs_type"), env, run.config.get("rename_map")) | {
         "scene": env.get("scene"),
         "environment": start.get("environment"),
         "benchmark": (start.get("benchmark") or {}).get("fingerprint"),

@@ -6,9 +6,9 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_env_cronos.scene.scenes import SCENES
+from lerobot_env_cronos import load_benchmark
 
-from cronos_lerobot.report.statistics import Rate, sum_rates
+from cronos_lerobot.report.statistics import ChainRate, Rate, sum_rates
 
 EVAL_INFO = "eval_info.json"
 
@@ -24,6 +24,8 @@ class EvaluationRun:
     """By instruction, or ordering of a sequential suite: one flag for each episode."""
     videos: dict[str, list[Path]]
     """By instruction: the videos of the first episodes, in their order."""
+    num_configurations: int = 64
+    """Of the split. Episodes begin with one after the other, and anew with the first."""
 
     @property
     def name(self) -> str:
@@ -32,8 +34,10 @@ class EvaluationRun:
 
     @property
     def tasks(self) -> dict[str, Rate]:
-        """Success by instruction."""
-        return {task: Rate(sum(flags), len(flags)) for task, flags in self.successes.items()}
+        """Success by instruction or ordering."""
+        if not self.suite.startswith("sequential"):
+            return {task: Rate(sum(flags), len(flags)) for task, flags in self.successes.items()}
+        return {name: ChainRate.of(flags, self.num_configurations) for name, flags in self.successes.items()}
 
     @property
     def overall(self) -> Rate:
@@ -41,22 +45,27 @@ class EvaluationRun:
         return sum_rates(self.tasks.values())
 
 
-def read_evaluation_runs(folder: Path, scene: str = "kitchen_2x2") -> list[EvaluationRun]:
+def read_evaluation_runs(
+    folder: Path, scene: str = "kitchen_2x2", benchmark: str | None = None
+) -> list[EvaluationRun]:
     """Read an output folder of `lerobot-eval`: one EvaluationRun for each suite in it.
 
     Args:
         folder: holds eval_info.json.
         scene: the scene, which the file does not name; its tasks are numbered in the file.
+        benchmark: whose episodes they are, as `--env.benchmark` names it; the package's by default.
     """
-    instructions = [task.instruction for task in SCENES[scene].tasks]
+    episodes = load_benchmark(benchmark, scene)
     runs: dict[str, EvaluationRun] = {}
     for entry in json.loads((folder / EVAL_INFO).read_text())["per_task"]:
         suite, number = entry["task_group"], entry["task_id"]
-        run = runs.setdefault(suite, EvaluationRun(folder, suite, {}, {}))
-        if suite.startswith("sequential"):
+        kind, _, split = suite.partition("_")
+        groups = {group.number: group for group in episodes.groups(kind, split)}
+        run = runs.setdefault(suite, EvaluationRun(folder, suite, {}, {}, len(episodes.configurations[split])))
+        if kind == "sequential":
             task = f"ordering {number}"  # an episode is a chain of all tasks
         else:
-            task = instructions[number] if number < len(instructions) else f"task {number}"
+            task = groups[number].instructions[0] if number in groups else f"task {number}"
         run.successes[task] = [bool(flag) for flag in entry["metrics"]["successes"]]
         paths = [Path(path) for path in entry["metrics"].get("video_paths", [])]
         # The paths are as seen when the evaluation ran; the folder may have moved since.

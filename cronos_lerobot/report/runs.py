@@ -136,12 +136,13 @@ class FoundRuns:
     the evaluations of runs that are not `alike`."""
 
 
-def find_runs(folders: Iterable[Path], scene: str = "kitchen_2x2") -> FoundRuns:
+def find_runs(folders: Iterable[Path], scene: str = "kitchen_2x2", benchmark: str | None = None) -> FoundRuns:
     """Read the runs of cronos-train, lerobot-eval and cronos-eval in `folders` and below them, each once.
 
     Args:
         folders: where to look.
         scene: of the evaluations of lerobot-eval, whose files do not name it.
+        benchmark: of the same; the package's by default.
 
     Raises:
         FileNotFoundError: a folder is missing or holds no run.
@@ -168,7 +169,7 @@ def find_runs(folders: Iterable[Path], scene: str = "kitchen_2x2") -> FoundRuns:
         for path in files[METRICS]:
             keep(training, path, lambda path=path: read_training_run(path.parent))
         for path in files[EVAL_INFO]:
-            keep(evaluation, path, lambda path=path: read_evaluation_runs(path.parent, scene))
+            keep(evaluation, path, lambda path=path: read_evaluation_runs(path.parent, scene, benchmark))
         results = [path for path in files[RESULTS] if is_results(path)]
         for path in results:
             keep(suites, path, lambda path=path: check_results(path))

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from math import hypot
 from operator import add
 
+import numpy as np
 from lerobot_env_cronos.statistics import wilson_interval
 
+from cronos_lerobot.evaluation.rates import cluster_interval
 from cronos_lerobot.protocol.metrics import summarise, summarise_rates
 
 
@@ -40,6 +42,33 @@ class Rate:
 
 
 @dataclass(frozen=True)
+class ChainRate(Rate):
+    """Chains of tasks, of which those from one configuration go together."""
+
+    flags: tuple[bool, ...] = ()
+    """Whether each was completed."""
+    configurations: tuple[int, ...] = ()
+    """Where each began."""
+
+    @classmethod
+    def of(cls, flags: Sequence[bool], num_configurations: int) -> ChainRate:
+        """The rate of chains that begin with one configuration after the other."""
+        return cls(sum(flags), len(flags), tuple(flags), tuple(i % num_configurations for i in range(len(flags))))
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Its 95 % interval, by configuration."""
+        return cluster_interval(np.array(self.flags), np.array(self.configurations))
+
+    def __add__(self, other: Rate) -> Rate:
+        """Both sets of chains together."""
+        if not isinstance(other, ChainRate):
+            return super().__add__(other)
+        flags, configurations = self.flags + other.flags, self.configurations + other.configurations
+        return ChainRate(self.successes + other.successes, self.n + other.n, flags, configurations)
+
+
+@dataclass(frozen=True)
 class SeedRate(Rate):
     """The episodes of several seeds together. Those of a seed are no more independent than its training."""
 
@@ -54,10 +83,10 @@ class SeedRate(Rate):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % t-interval of the mean over the seeds, within 0 and 1; Wilson's of one, or of some all alike."""
+        """95 % t-interval of the mean over the seeds, within 0 and 1; by episodes of one, or of some all alike."""
         summary = summarise_rates([rate.value for rate in self.seeds])
         over_seeds = summary.ci95 if summary else None
-        return over_seeds or super().interval
+        return over_seeds or sum_rates(self.seeds).interval
 
     def __add__(self, other: Rate) -> Rate:
         """Both sets of episodes together, seed by seed if they are of as many."""

@@ -8,16 +8,15 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from cronos_lerobot.report.clips import Clip
-from cronos_lerobot.report.figures import COLORS, INK, SPLIT_LABELS, style_axes
+from cronos_lerobot.report.figures import INK, SPLIT_LABELS, style_axes, style_of
 from cronos_lerobot.report.suites import SuiteRun
 from cronos_lerobot.report.tables import APART
 
 ORDERINGS = ("all", "seen", "unseen")
 """In training, whose heuristic streams run the training cycle without end."""
-MAX_DRAWN = len(COLORS)
-"""Evaluations in the figure, the first ones; the tables have all."""
 
 
 def independent_rows(runs: Iterable[SuiteRun]) -> list[dict[str, Any]]:
@@ -62,7 +61,7 @@ def _chain_cells(found: dict[str, Any]) -> dict[str, Any]:
 
 def sequential_figure(runs: Iterable[SuiteRun]) -> Figure | None:
     """Success by position with 95 % intervals, a panel for each split."""
-    drawn = [run for run in runs if run.splits("sequential")][:MAX_DRAWN]
+    drawn = [run for run in runs if run.splits("sequential")]
     splits = list(dict.fromkeys(split for run in drawn for split in run.splits("sequential")))
     if not splits:
         return None
@@ -73,8 +72,9 @@ def sequential_figure(runs: Iterable[SuiteRun]) -> Figure | None:
         ax.set_title(SPLIT_LABELS.get(split, split), fontsize=9, color=INK, loc="left")
     axes[0].set_ylabel("success")
     if len(drawn) > 1:
-        handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8, frameon=False)
+        # A panel does not have the bars of a policy that was not evaluated on its split.
+        bars = [Patch(label=run.name, **_look(i)) for i, run in enumerate(drawn)]
+        figure.legend(handles=bars, loc="outside lower center", ncols=2, fontsize=8, frameon=False)
     return figure
 
 
@@ -86,10 +86,15 @@ def _draw_positions(ax: Axes, runs: list[SuiteRun], split: str) -> None:
         x = np.arange(len(positions)) + (i - (len(runs) - 1) / 2) * width
         y = np.array([position["success"] for position in positions])
         ends = np.array([position["ci95"] for position in positions]).reshape(-1, 2)
-        ax.bar(x, y, 0.92 * width, yerr=np.abs(ends - y[:, None]).T, color=COLORS[i], ecolor=INK, label=run.name)
+        ax.bar(x, y, 0.92 * width, yerr=np.abs(ends - y[:, None]).T, ecolor=INK, **_look(i))
     style_axes(ax, "task in the sequence")
     ax.set_xticks(range(number), [f"SEQ {k}" for k in range(number)])
     ax.set_ylim(0, 1.02)
+
+
+def _look(i: int) -> dict[str, Any]:
+    color, _, hatch = style_of(i)
+    return {"facecolor": color, "hatch": hatch, "edgecolor": "white"}
 
 
 def suite_clips(runs: Iterable[SuiteRun]) -> list[Clip]:

@@ -52,9 +52,15 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--videos", nargs="+", type=Path, metavar="MP4", default=[], help="more videos to show")
     parser.add_argument("--output", type=Path, default=Path("report"), help="folder to write (default: report)")
     parser.add_argument(
-        "--scene", default="kitchen_2x2",
-        help="of lerobot-eval's folders, which number the tasks and do not name the scene (default: kitchen_2x2)",
-    )  # fmt: skip
+        "--scene",
+        help="of lerobot-eval's folders, which number the tasks and do not name the scene (default: that of "
+        "--benchmark, or of the runs of cronos-train on the page, else kitchen_2x2)",
+    )
+    parser.add_argument(
+        "--benchmark",
+        metavar="NAME",
+        help="of lerobot-eval's folders, as --env.benchmark named it (default: the package's)",
+    )
     parser.add_argument("--title", default="CRONOS report", help="headline of the page")
     return parser
 
@@ -66,23 +72,42 @@ def make_report(
     after: list[Path] | None = None,
     videos: list[Path] | None = None,
     title: str = "CRONOS report",
-    scene: str = "kitchen_2x2",
+    scene: str | None = None,
+    benchmark: str | None = None,
 ) -> Report:
     """Read run folders and pair evaluations before with those after.
+
+    Args:
+        runs: folders of runs, or above them.
+        before: of lerobot-eval, before a training.
+        after: the same after it.
+        videos: more to show.
+        title: of the page.
+        scene: of lerobot-eval's folders; by default that of `benchmark` or of the training runs.
+        benchmark: of the same; the package's by default.
 
     Raises:
         FileNotFoundError: a folder holds no run, or a video is missing.
         ValueError: there is no such scene, or nothing of lerobot-eval in `before` or `after`.
     """
-    from lerobot_env_cronos import get_scene
+    from lerobot.utils.import_utils import register_third_party_plugins
+    from lerobot_env_cronos import load_benchmark
+    from lerobot_env_cronos.scene.scenes import SCENES
 
     from cronos_lerobot.report.comparisons import at_their_end
     from cronos_lerobot.report.page import Report
     from cronos_lerobot.report.runs import FoundRuns, find_runs, group_runs
 
-    get_scene(scene)
+    if benchmark:
+        # Of a scene that a package of its own registers, perhaps.
+        register_third_party_plugins()
+    scene = scene or _find_scene(runs, benchmark)
+    if scene not in SCENES:
+        register_third_party_plugins()
+    load_benchmark(benchmark, scene)
     found, old, new = (
-        find_runs(folders, scene) if folders else FoundRuns([], [], [], []) for folders in (runs, before, after)
+        find_runs(folders, scene, benchmark) if folders else FoundRuns([], [], [], [])
+        for folders in (runs, before, after)
     )
     for flag, folders, read in (("--before", before, old), ("--after", after, new)):
         if folders and not read.evaluations:
@@ -103,6 +128,19 @@ def make_report(
     )
 
 
+def _find_scene(runs: list[Path], benchmark: str | None) -> str:
+    """The scene that nobody named."""
+    from lerobot_env_cronos.benchmark.load import benchmark_scene
+
+    from cronos_lerobot.report.runs import find_runs
+
+    if benchmark:
+        return benchmark_scene(benchmark)
+    trained = find_runs(runs).training if runs else ()
+    scenes = {str(env["scene"]) for run in trained if (env := run.config.get("env") or {}).get("scene")}
+    return scenes.pop() if len(scenes) == 1 else "kitchen_2x2"
+
+
 def main() -> None:
     """Entry point of `cronos-report`."""
     if sys.argv[1:2] == ["compare"]:
@@ -114,7 +152,13 @@ def main() -> None:
         parser.error("name at least one run folder; cronos-report --help has examples")
     try:
         report = make_report(
-            args.runs, before=args.before, after=args.after, videos=args.videos, title=args.title, scene=args.scene
+            args.runs,
+            before=args.before,
+            after=args.after,
+            videos=args.videos,
+            title=args.title,
+            scene=args.scene,
+            benchmark=args.benchmark,
         )
     except (FileNotFoundError, ValueError) as error:
         sys.exit(f"error: {error}")

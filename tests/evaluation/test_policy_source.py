@@ -25,6 +25,9 @@ def test_a_policy_is_known_by_its_files_and_not_by_its_folder(pocketvla, tmp_pat
     assert fingerprint_of(copy) == fingerprint_of(pocketvla)
     (copy / "train_config.json").write_text("{}")
     assert fingerprint_of(copy) == fingerprint_of(pocketvla)
+    config = json.loads((copy / "config.json").read_text())
+    (copy / "config.json").write_text(json.dumps(config | {"device": "cuda"}))
+    assert fingerprint_of(copy) == fingerprint_of(pocketvla), "a GPU loads the same policy"
     seen = {fingerprint_of(pocketvla)}
     for name in ("model.safetensors", "policy_preprocessor.json"):
         file = copy / name

@@ -299,6 +299,10 @@ def test_folders_that_say_nothing_are_refused(tmp_path, monkeypatch, capsys):
     write_evaluation(tmp_path / "two/2", "me/a", tasks=["11"], temperature=0)
     with pytest.raises(SystemExit, match=r"two evaluations of the same episodes \(temperature: 0.6 and 0\)"):
         compare(monkeypatch, a, tmp_path / "two")
+    write_evaluation(tmp_path / "other/1", "me/a", tasks=["10"])
+    write_evaluation(tmp_path / "other/2", "me/a", tasks=["11"], temperature=0, seed=2000)
+    with pytest.raises(SystemExit, match=r"evaluations that were not made alike \(temperature: 0.6 and 0\)"):
+        compare(monkeypatch, a, tmp_path / "other")
     (again / "parts/independent_held_out.json").unlink()
     with pytest.raises(SystemExit, match=r"has no parts/independent_held_out.json"):
         compare(monkeypatch, a, again)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cronos_lerobot.report.statistics import Gain, Rate, SeedRate, newcombe_interval
+from cronos_lerobot.report.statistics import ChainRate, Gain, Rate, SeedRate, newcombe_interval, sum_rates
 
 
 def test_newcombe_interval_of_the_paper():
@@ -28,6 +28,20 @@ def test_gain_of_nothing_covers_zero():
 def test_seeds_that_are_all_alike_do_not_say_that_every_training_is():
     # Wilson's of 18 of 20, (.9 + z^2 / 40 -+ z sqrt(.09 / 20 + z^2 / 1600)) / (1 + z^2 / 20).
     assert SeedRate.of([Rate(9, 10)] * 2).interval == pytest.approx((0.6990, 0.9721), abs=1e-4)
+
+
+def test_chains_from_one_configuration_go_together():
+    one = ChainRate.of([True, True, False, False], 4)
+    # One from each configuration: Wilson's of 2 of 4, .5 -+ z sqrt(.25 / 4 + z^2 / 64) / (1 + z^2 / 4).
+    assert one.interval == pytest.approx((0.1500, 0.8500), abs=1e-4)
+    # A second ordering that comes out alike. 2, 2, 0, 0 of the four vary by 4 / 3 * 4 / 8^2 = 1 / 12, where eight
+    # single chains would by .25 / 8: they say what 3 do, less by (1.96 / 3.182)^2 of four: Wilson's of 1.138.
+    both = sum_rates([one, one])
+    assert (both.successes, both.n) == (4, 8)
+    assert both.interval == pytest.approx((0.0608, 0.9392), abs=1e-3)
+    assert SeedRate.of([both]).interval == both.interval
+    # More chains than configurations begin anew with the first.
+    assert ChainRate.of([True, True, False, False] * 2, 4) == both
 
 
 def test_gains_that_are_all_alike_have_an_interval_of_their_evaluations():

@@ -9,6 +9,7 @@ from synthetic_runs import INSTRUCTIONS, read_csv
 
 from cronos_lerobot.report.page import write_report
 from cronos_lerobot.report.runs import find_runs
+from cronos_lerobot.report.suite_views import sequential_figure
 from cronos_lerobot.report.suites import policy_name
 from cronos_lerobot.scripts.report import make_report
 
@@ -110,6 +111,39 @@ def test_pictures_of_another_renderer_are_another_evaluation(tmp_path):
     assert [run.name for run in find_runs([tmp_path]).suites] == [
         "me/policy (renderer=classic)", "me/policy (renderer=filament)",
     ]  # fmt: skip
+
+
+def test_pictures_of_another_camera_are_another_evaluation(tmp_path):
+    names = {"observation.images.bridge": "observation.images.front"}
+    for name, successes, camera, renamed in (("a", [0.9], "front", {}), ("b", [0.1], "bridge", names)):
+        identity = {"env": {"camera_name": camera, "observation_width": 224}, "rename_map": renamed}
+        own = {"identity": identity, "obs_type": "pixels_agent_pos"}
+        write_results(tmp_path / name, "me/policy", {"sequential": {"train": chains(successes)}}, **own)
+    front, bridge = find_runs([tmp_path]).suites
+    assert front.name == "me/policy (camera_name=front, rename_map=None)"
+    assert bridge.name == f"me/policy (camera_name=bridge, rename_map={names})"
+    assert [run.results["sequential"]["train"]["positions"][0]["success"] for run in (front, bridge)] == [0.9, 0.1]
+
+
+def test_bars_of_chains_have_the_legends_colours_and_there_are_as_many_as_policies(tmp_path):
+    write_results(tmp_path / "0", "me/0", {"sequential": {"train": chains([0.9])}})
+    for i in range(1, 9):
+        write_results(tmp_path / str(i), f"me/{i}", {"sequential": {"held_out": chains([i / 10])}})
+    figure = sequential_figure(find_runs([tmp_path]).suites)
+    train, held_out = figure.axes
+    told = {text.get_text(): patch for text, patch in zip(*legend_of(figure), strict=True)}
+    assert list(told) == [f"me/{i}" for i in range(9)]
+    assert [bar.get_height() for bar in train.patches] == [0.9]
+    assert [bar.get_height() for bar in held_out.patches] == [i / 10 for i in range(1, 9)]
+    bars = [*train.patches, *held_out.patches]
+    looks = [(patch.get_facecolor(), patch.get_hatch()) for patch in told.values()]
+    assert [(bar.get_facecolor(), bar.get_hatch()) for bar in bars] == looks
+    assert len(set(looks)) == 9
+
+
+def legend_of(figure):
+    (legend,) = figure.legends
+    return legend.get_texts(), legend.get_patches()
 
 
 def test_columns_of_scenes_with_more_tasks_stay_in_their_place(tmp_path):

@@ -1,0 +1,52 @@
+"""The tasks that `lerobot-eval` numbers are those of the benchmark and scene that it ran."""
+
+import json
+from dataclasses import replace
+from types import MappingProxyType
+
+import pytest
+from lerobot_env_cronos import load_benchmark
+from lerobot_env_cronos.benchmark.files import write_benchmark
+from lerobot_env_cronos.scene.scenes import SCENES
+from synthetic_runs import INSTRUCTIONS, write_evaluation, write_training_run
+
+from cronos_lerobot.scripts.report import make_report
+
+
+def tasks_of(report):
+    (compared,) = [one for one in report.comparisons if one.label == "lerobot-eval"]
+    return list(compared.tasks)
+
+
+@pytest.fixture
+def evaluations(tmp_path):
+    before = write_evaluation(tmp_path / "before", successes=(1, 2, 3, 4))
+    return {"before": [before], "after": [write_evaluation(tmp_path / "after", successes=(2, 3, 4, 5))]}
+
+
+def test_tasks_are_named_as_in_the_benchmark(evaluations, tmp_path):
+    package = load_benchmark(None, "playroom_2x2")
+    turned = {
+        split: tuple(
+            replace(group, number=i) for i, group in enumerate(package.groups("independent", split)[::-1])
+        )
+        for split in package.configurations
+    }
+    write_benchmark(replace(package, independent=MappingProxyType(turned)), tmp_path / "mine")
+    report = make_report([], **evaluations, benchmark=str(tmp_path / "mine"))
+    assert tasks_of(report) == [task.instruction for task in SCENES["playroom_2x2"].tasks][::-1]
+    with pytest.raises(ValueError, match="is of playroom_2x2, not of kitchen_2x2"):
+        make_report([], **evaluations, benchmark=str(tmp_path / "mine"), scene="kitchen_2x2")
+
+
+def test_the_scene_is_that_of_the_runs_beside_them_unless_it_is_named(evaluations, tmp_path):
+    assert tasks_of(make_report([], **evaluations)) == list(INSTRUCTIONS)
+    run = write_training_run(tmp_path / "run")
+    manifest = json.loads((run / "manifest.json").read_text())
+    manifest["starts"][0]["config"]["env"] = {"scene": "playroom_2x2"}
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    playroom = [task.instruction for task in SCENES["playroom_2x2"].tasks]
+    assert tasks_of(make_report([run], **evaluations)) == playroom
+    assert tasks_of(make_report([run], **evaluations, scene="kitchen_2x2")) == list(INSTRUCTIONS)
+    with pytest.raises(ValueError, match="unknown scene 'nowhere'"):
+        make_report([run], **evaluations, scene="nowhere")
