@@ -12,10 +12,12 @@ from draccus import cfgparsing
 from draccus.utils import DecodingError, ParsingError, deflatten
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot_env_cronos import CronosEnvConfig
 
 from cronos_lerobot.agents.registry import check_agent, check_settings
 from cronos_lerobot.experiments.flags import read_flags
 from cronos_lerobot.experiments.jobs import Job
+from cronos_lerobot.experiments.scales import PIXELS
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.resume import allow_single_file
 
@@ -23,6 +25,8 @@ BASE_POLICY = "pocketvla"
 """Type of the base policies that experiments make."""
 WHICH_RUN = ("seed", "output_dir", "policy.path")
 """Flags whose values cannot be wrong: runs that differ in nothing else are read once."""
+PICTURES = ("camera_name", "observation_height", "observation_width", "renderer")
+"""Flags of `--env.*` that decide what pictures look like."""
 
 
 def check_commands(jobs: Iterable[Job], policy_type: str | None = BASE_POLICY) -> None:
@@ -32,8 +36,8 @@ def check_commands(jobs: Iterable[Job], policy_type: str | None = BASE_POLICY) -
 
     Args:
         jobs: of which those of `cronos-train` are looked at.
-        policy_type: of the policy that the runs begin with, for the names of `--policy.*`; None if it is not known
-            before it is loaded, and they are not looked at.
+        policy_type: of the base policy that is made, for the names of `--policy.*` and what it has seen; None if
+            it is one of the user's, of which nothing is known before it is loaded.
 
     Raises:
         ValueError: a run has a flag that does not exist, or a value that is none; it names the run.
@@ -76,12 +80,27 @@ def _check(given: dict[str, str], policy_type: str | None) -> None:
     config = draccus.decode(CronosTrainConfig, deflatten(values, sep="."))
     if config.env is not None:
         config.check_env(config.env)
+        if policy_type is not None:
+            _check_base(config.env)
         # A recording's folder is looked at when its run begins, or goes on.
         if config.record.repo_id is None:
             folder, length = Path(config.output_dir or ""), config.protocol.task_switch_interval
             config.record.check(folder, config.num_envs, config.env, length, resume=False)
     settings = [name.removeprefix("algorithm.") for name in given if name.startswith("algorithm.")]
     check_settings(config.algorithm, settings, resume=False)
+
+
+def _check_base(env: CronosEnvConfig) -> None:
+    """Refuse to show the runs what a base policy that is made, without their flags, has not seen.
+
+    Not `--env.benchmark`: other configurations are what a policy may go on to.
+    """
+    for name in ("task_observation", *(PICTURES if env.obs_type == PIXELS else ())):
+        if (value := getattr(env, name)) != getattr(CronosEnvConfig, name):
+            raise ValueError(
+                f"--env.{name}={value} is of the runs alone, and their base policy is cloned without it: give "
+                "--policy.path, a policy that was cloned with it"
+            )
 
 
 def _reason(error: Exception) -> str:

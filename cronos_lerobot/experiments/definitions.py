@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 INTERACTION_STEPS, INTERVENTIONS = "interaction_steps", "interventions"
+SUITES, BOTH = ("independent", "sequential"), ("train", "held_out")
+"""Suites and splits of the environment's package, which takes seconds to import."""
 
 NARROW = "narrow"
 """The base policy whose demonstrations begin in the scene's 64 training configurations, as the paper's do."""
@@ -19,6 +22,19 @@ Sections 6.5 and 6.7."""
 
 PACED = "--protocol.scene_reset=critic"
 """With it a budget is paced over the whole run and does not end it."""
+
+
+def _check_tuple(name: str, value: Any, valid: list[str] | None = None) -> None:
+    """Raise a ValueError, if `value` is neither tuple nor list, or is not of what is `valid`."""
+    # ("held_out") is a word, whose letters would be taken one by one.
+    if not isinstance(value, (tuple, list)):
+        raise ValueError(f"{name} must be a tuple, such as ({value!r},), got {value!r}.")
+    if valid is not None and not (value and set(value) <= set(valid)):
+        raise ValueError(f"{name} must be some of {valid}, got {value!r}.")
+
+
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, (tuple, list)) and len(value) == 2
 
 
 @dataclass(frozen=True)
@@ -54,6 +70,9 @@ class Row:
     def __post_init__(self) -> None:
         if wrong := [flag for flag in self.flags if not flag.startswith("--") or "=" not in flag]:
             raise ValueError(f"flags of a row are --name=value, one word each, got {wrong[0]!r}.")
+        for name in ("stages", "budgets"):
+            if wrong := [pair for pair in getattr(self, name) if not _is_pair(pair)]:
+                raise ValueError(f"{name} of a row are pairs, each in a tuple of its own, got {wrong[0]!r}.")
         if self.curriculum and self.stages:
             raise ValueError(f"a row has the paper's curriculum or stages of its own, {self.stages}, not both.")
         if self.num_configurations != 64 and self.base != NARROW:
@@ -134,6 +153,11 @@ class CheckpointEvaluation:
     every_checkpoint: bool = False
     """Every checkpoint of a run, for curves, or its last one only."""
 
+    def __post_init__(self) -> None:
+        if self.suite not in SUITES:
+            raise ValueError(f"suite of an evaluation must be one of {list(SUITES)}, got {self.suite!r}.")
+        _check_tuple(f"splits of the {self.suite} evaluation", self.splits, list(BOTH))
+
 
 @dataclass(frozen=True)
 class Experiment:
@@ -163,6 +187,28 @@ class Experiment:
     """Of that figure: what a line joins the ends of, as its label and the names of its rows."""
 
     def __post_init__(self) -> None:
+        for name, valid in (("axes", [INTERACTION_STEPS, INTERVENTIONS]), ("splits", list(BOTH))):
+            _check_tuple(f"{name} of {self.name}", getattr(self, name), valid)
+        for name in ("rows", "evaluations", "budgets", "joined"):
+            _check_tuple(f"{name} of {self.name}", getattr(self, name))
+        if self.steps not in (SHORT, LONG):
+            raise ValueError(f"steps of {self.name} must be SHORT={SHORT} or LONG={LONG}, got {self.steps}.")
+        for line in self.joined:
+            if not _is_pair(line):
+                raise ValueError(f"joined of {self.name} are pairs, (label, names of rows), got {line!r}.")
+            label, names = line
+            _check_tuple(f"joined {label!r} of {self.name}", names, [row.name for row in self.rows])
+        self._check_evaluations()
+
+    def _check_evaluations(self) -> None:
+        has_held_out = any(e.suite == "independent" and "held_out" in e.splits for e in self.evaluations)
+        # A row may have its runs evaluated there while they train.
+        has_held_out |= any("--eval.split=held_out" in row.flags for row in self.rows)
+        if "held_out" in self.splits and not has_held_out:
+            raise ValueError(
+                f"splits of {self.name} have 'held_out', and no evaluation measures it: give evaluations="
+                "(CheckpointEvaluation('independent', ('held_out',), every_checkpoint=True),)."
+            )
         early = [row.name for row in self.rows if row.has_budget]
         if early and any(evaluation.every_checkpoint for evaluation in self.evaluations):
             raise ValueError(
@@ -189,7 +235,6 @@ BUDGET_ROWS = (EPISODIC, PERIODIC, BEST, Row(2560, True, True, heuristic_reset=T
 CONFIGURATION_ROWS = (EPISODIC, PERIODIC, Row(80, num_configurations=1), Row(320, True, num_configurations=1))
 
 HELD_OUT_CURVE = CheckpointEvaluation("independent", ("held_out",), every_checkpoint=True)
-BOTH = ("train", "held_out")
 
 _ALL = (
     Experiment(

@@ -196,10 +196,13 @@ def changed_flags(job: Job) -> list[str]:
     another root, or on another machine.
     """
     record = read_record(job)
-    if not record or not job.output.exists():
-        return []
+    return differing_flags(job, record["command"]) if record and job.output.exists() else []
+
+
+def differing_flags(job: Job, noted: list[str]) -> list[str]:
+    """How a noted command differs from the job's; see `changed_flags`."""
     new = list(job.command)
-    old = _in_root_of(job, record["command"])
+    old = _in_root_of(job, noted)
     if old == new:
         return []
     only_old, only_new = [flag for flag in old if flag not in new], [flag for flag in new if flag not in old]

@@ -20,6 +20,7 @@ from cronos_lerobot.experiments.definitions import (
     Experiment,
     Row,
 )
+from cronos_lerobot.experiments.flags import read_flags
 from cronos_lerobot.experiments.jobs import BASE, EVALUATION, PLUGIN_FLAG, Job
 from cronos_lerobot.experiments.progress import train_progress
 from cronos_lerobot.experiments.scales import ALGORITHM_FLAGS, OBS_NAMES
@@ -111,14 +112,10 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
     episodes = min(wanted, spec.row.num_configurations)
     # From few configurations as many episodes as from all.
     repetitions = wanted // episodes if options.temperature else 1
-    flags = ALGORITHM_FLAGS[options.obs_type]
-    if options.policy_path:
-        # Those of a policy are PocketVLA's.
-        flags = [flag for flag in flags if not flag.startswith("--policy.")]
     command = [
         "cronos-train",
         f"--policy.path={base_policy(spec.base, options)}",
-        *flags,
+        *_recipe_flags(spec),
         "--env.type=cronos",
         f"--env.scene={spec.scene}",
         f"--env.obs_type={options.obs_type}",
@@ -151,6 +148,14 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
         work=spec.steps,
         root=options.root,
     )
+
+
+def _recipe_flags(spec: RunSpec) -> list[str]:
+    """Those of `ALGORITHM_FLAGS` that a run follows: its agent may be another than PPO, its policy any."""
+    given = dict(read_flags((*spec.row.flags, *spec.options.extra)))
+    others = [] if given.get("algorithm.type", "ppo") == "ppo" else ["--algorithm."]
+    others += ["--policy."] if spec.options.policy_path else []
+    return [flag for flag in ALGORITHM_FLAGS[spec.options.obs_type] if not flag.startswith(tuple(others))]
 
 
 def _eval_episodes(options: Options) -> tuple[list[str], int]:
@@ -212,11 +217,13 @@ def base_evaluation_jobs(base: Base, options: Options, evaluation: CheckpointEva
     if not evaluation.every_checkpoint:
         return []
     jobs, policy = [], base_policy(base, options)
+    # Checkpoints of the runs have these in their config.
+    settings = [flag for flag in options.extra if options.policy_path and flag.startswith("--policy.")]
     needed = None if options.policy_path else (base_jobs(base, options)[-1].name, policy)
     for split in evaluation.splits:
         folder = base_evaluation_folder(base, evaluation.suite, split, options)
         command = eval_command(policy, base.scene, evaluation.suite, split, folder, options)
-        command = _with_flags(command, _env_flags(options.extra))
+        command = _with_flags(command, _env_flags(options.extra), settings)
         name = f"base/{folder.parent.name}/{folder.name}"
         jobs.append(_eval_job(name, command, folder, needed, base.scene, options.root))
     return jobs

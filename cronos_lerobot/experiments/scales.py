@@ -141,15 +141,17 @@ ALGORITHM_FLAGS = {
     STATE: ("--algorithm.type=ppo",),
     PIXELS: ("--policy.freeze_encoder=true", "--algorithm.type=ppo", "--algorithm.policy_lr=1e-4"),
 }
-"""Flags of `cronos-train` that learn from each kind of observation."""
+"""Flags of `cronos-train` that learn from each kind of observation; PPO's go where another agent is chosen."""
 
 
 def base_recipe(scale: Scale, scene: str, obs_type: str, *, clean: bool = False, kind: str = NARROW) -> BaseRecipe:
     """The recipe of a scene's base policy of a kind, the narrow one on request from clean demonstrations.
 
     Raises:
-        ValueError: there is none; one can be given with --policy.path.
+        ValueError: there is no such kind, or no recipe; a policy can be given with --policy.path.
     """
+    if kind not in BASE_KINDS:
+        raise ValueError(f"the base of a row must be one of {list(BASE_KINDS)}, got {kind!r}")
     clean = clean and kind == NARROW
     if scale.smoke:
         return replace(SMOKE_RECIPE, clean=clean, kind=kind)

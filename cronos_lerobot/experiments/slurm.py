@@ -8,8 +8,6 @@ both may work on one root.
 from __future__ import annotations
 
 import getpass
-import json
-import os
 import re
 import shutil
 import signal
@@ -23,6 +21,7 @@ from typing import Any, NoReturn
 from cronos_lerobot.experiments.display import LineDisplay
 from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job, changes, continuation, is_done, read_record
 from cronos_lerobot.experiments.runner import DONE, FAILED, Runner
+from cronos_lerobot.experiments.submitted import Submission, other_flags, read_submissions, write_submissions
 from cronos_lerobot.locks import FolderLock
 
 PENDING = "PENDING"
@@ -257,10 +256,16 @@ class Cluster:
 
         Returns:
             The id of the element that has each job, by name.
+
+        Raises:
+            SlurmError: a job is in the queue with other flags, or the cluster refuses an array.
         """
         with FolderLock(self.folder):
-            known, queue = read_submitted(self.folder), squeue()
-            queued = {name: number for name, number in known.items() if number in queue}
+            known, queue = read_submissions(self.folder), squeue()
+            in_queue = {name: what for name, what in known.items() if what.element in queue}
+            if text := other_flags(jobs, in_queue):
+                raise SlurmError(text)
+            queued = {name: what.element for name, what in in_queue.items()}
             waiting = _to_be_made([job for job in jobs if job.name not in queued])
             bases, runs, evaluations = plan_arrays(jobs, waiting)
             made = {job.name: job for job in jobs}
@@ -286,7 +291,8 @@ class Cluster:
                 array("evaluation", evaluations, _after_each(numbers, len(evaluations)))
             finally:
                 # What the cluster has taken is remembered, also where it refused the rest.
-                self._write(known | submitted)
+                new = {name: Submission(number, list(made[name].command)) for name, number in submitted.items()}
+                write_submissions(self.folder, known | new)
         return {name: number for name, number in (queued | submitted).items() if name in made}
 
     def _submit_array(self, name: str, tasks: list[Task], parameters: dict[str, Any]) -> list[str]:
@@ -308,21 +314,9 @@ class Cluster:
             raise SlurmError(f"sbatch: {error}") from None
         return [job.job_id for job in jobs]
 
-    def _write(self, submitted: dict[str, str]) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        partial = self.folder / ".submitted.json"
-        partial.write_text(json.dumps(submitted, indent=2))
-        os.replace(partial, self.folder / "submitted.json")
-
     def log(self, number: str) -> Path:
         """What an element printed."""
         return self.logs / f"{number}_0_log.out"
-
-
-def read_submitted(folder: Path) -> dict[str, str]:
-    """The id of the element that had each job last, by name; {} if nothing was ever submitted from there."""
-    path = folder / "submitted.json"
-    return json.loads(path.read_text()) if path.is_file() else {}
 
 
 def _needs(element: list[Job], made: dict[str, Job]) -> list[Job]:

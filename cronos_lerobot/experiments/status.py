@@ -13,7 +13,8 @@ from cronos_lerobot.experiments.display import duration
 from cronos_lerobot.experiments.jobs import RUNNING, STOPPED, Job, status
 from cronos_lerobot.experiments.progress import train_progress
 from cronos_lerobot.experiments.runner import DONE
-from cronos_lerobot.experiments.slurm import PENDING, SlurmError, read_submitted, slurm_folder, squeue
+from cronos_lerobot.experiments.slurm import PENDING, SlurmError, slurm_folder, squeue
+from cronos_lerobot.experiments.submitted import read_submitted
 
 NOTES = ("base/*/*.job.json", "runs/*/*/seed*/*.job.json", "runs/*/*/seed*/eval/*.job.json")
 """Where the notes of jobs lie in a root."""

@@ -140,6 +140,23 @@ def test_what_is_wrong_is_named_and_nothing_registered(scene, bodies, message):
     assert before == (SCENES, BODIES)
 
 
+def test_a_scene_may_be_written_with_lists():
+    scene = Scene("study_lists", ["toy bear"], ["newspaper"], spawn_low=[0.2, -0.15])
+    assert scene == Scene("study_lists", ("toy bear",), ("newspaper",))
+    register_scene(scene)
+    gym.registry.pop(gymnasium_id("study_lists"))
+    assert load_configurations("study_lists", "train").shape == (64, 2, 7)
+
+
+@pytest.mark.parametrize("name", ["objects", "receptacles"])
+def test_a_name_in_place_of_a_tuple_of_names_is_refused(name):
+    given = {"objects": ("ketchup bottle",), "receptacles": ("cloth",)} | {name: ("toy bear")}
+    with pytest.raises(
+        ValueError, match=rf"^{name} of the scene 's' must be a tuple, \('toy bear',\), got 'toy bear'"
+    ):
+        Scene("s", **given)
+
+
 @pytest.mark.parametrize(
     ("bodies", "n", "message"), [(("cloth",), 64, "is v0 of bodies.*needs v0"), (SCENE.bodies, 9, r"\(64, 3, 7\)")]
 )

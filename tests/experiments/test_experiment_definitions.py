@@ -2,16 +2,16 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
+from planned_jobs import jobs_of, options
 
 from cronos_lerobot.experiments.command_check import check_commands
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, CheckpointEvaluation, Experiment, Row, find_rows
 from cronos_lerobot.experiments.plan import make_jobs, train_flags
 from cronos_lerobot.experiments.results import paper_results
 from cronos_lerobot.experiments.scales import PIXELS, SCALES, STATE, base_recipe
-from cronos_lerobot.experiments.specs import Options, run_specs
+from cronos_lerobot.experiments.specs import run_specs
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.task_orders import TASK_ORDERS
 
@@ -40,17 +40,6 @@ PAPER = {
     "figure13": (1.3, "kitchen_2x2", [(80, 0, 0, 0, 0), (320, 1, 0, 0, 0)] * 2, ["train", "held_out"]),
     "figure14": (1.3, "kitchen_2x2", [(1280, 1, 1, 0, 1)] * 2, ["train", "held_out"]),
 }
-
-
-def options(scale="paper", obs_type=STATE, root="out", **changes):
-    recipes = {e.scene: base_recipe(SCALES[scale], e.scene, obs_type) for e in EXPERIMENTS.values()}
-    seeds = tuple(range(1, SCALES[scale].seeds + 1))
-    return Options(SCALES[scale], obs_type, seeds, Path(root), recipes=recipes, **changes)
-
-
-def jobs_of(name, rows=(), **changes):
-    experiment = EXPERIMENTS[name]
-    return {j.name: j for j in make_jobs([(experiment, find_rows(experiment, list(rows)))], options(**changes))}
 
 
 def test_every_table_and_figure_with_results_is_there():

@@ -11,6 +11,7 @@ from cronos_lerobot.experiments import follow, status
 from cronos_lerobot.experiments.follow import Follower
 from cronos_lerobot.experiments.jobs import EVALUATION, Job, write_record
 from cronos_lerobot.experiments.slurm import Cluster, SlurmError, SlurmOptions, slurm_folder
+from cronos_lerobot.experiments.submitted import read_submitted
 from cronos_lerobot.scripts import reproduce
 
 
@@ -146,6 +147,56 @@ def test_what_was_done_and_is_made_again_is_done_when_it_has_left_the_queue(job,
     assert follower.states == {"a": "done"}
 
 
+def cluster_of(folder, monkeypatch, queue):
+    """A cluster with this queue, and the jobs of each element of each array that it takes."""
+    cluster = Cluster.__new__(Cluster)
+    cluster.folder, cluster.options = folder / "slurm", SlurmOptions()
+    monkeypatch.setattr("cronos_lerobot.experiments.slurm.squeue", lambda: queue)
+    taken = []
+
+    def submit_array(self, name, tasks, parameters):
+        taken.append([[made.name for made in task.jobs] for task in tasks])
+        return [f"{len(taken)}_{i}" for i in range(len(tasks))]
+
+    monkeypatch.setattr(Cluster, "_submit_array", submit_array)
+    return cluster, taken
+
+
+def run_job(root, name, *flags):
+    return Job(name, ("cronos-train", *flags, f"--output_dir={root / name}"), root / name, root=root)
+
+
+def test_what_is_in_the_queue_with_other_flags_is_refused(tmp_path, monkeypatch):
+    """An element runs what it was submitted with: it would be shown as this command's until its end."""
+    queue = {}
+    cluster, taken = cluster_of(tmp_path, monkeypatch, queue)
+    jobs = [run_job(tmp_path, name, "--algorithm.target_kl=0.01") for name in ("a", "b", "c")]
+    submitted = cluster.submit(jobs, threads=1, parallel=None)
+    assert submitted == {"a": "2_0", "b": "2_1", "c": "2_2"}
+    queue |= dict.fromkeys(("2_1", "2_2"), ("PENDING", "Resources"))
+    others = [run_job(tmp_path, name, "--algorithm.target_kl=0.02") for name in ("a", "b", "c")]
+    with pytest.raises(SlurmError) as refused:
+        cluster.submit(others, threads=1, parallel=None)
+    assert str(refused.value) == (
+        "b is in the queue with other flags (--algorithm.target_kl=0.01 there, --algorithm.target_kl=0.02 here), "
+        "and so are 1 more: give those, or another --root, or take it out of the queue: scancel 2_1 2_2"
+    )
+    # The same command follows them, from wherever their root is called; only what has left the queue is new.
+    moved = tmp_path / "elsewhere/.."
+    jobs = [run_job(moved, name, "--algorithm.target_kl=0.01") for name in ("a", "b", "c")]
+    assert cluster.submit(jobs, threads=1, parallel=None) == {"a": "5_0", "b": "2_1", "c": "2_2"}
+    assert taken[-3:] == [[], [["a"]], []]
+
+
+def test_a_queue_from_before_commands_were_noted_is_followed(tmp_path, monkeypatch):
+    cluster, _ = cluster_of(tmp_path, monkeypatch, {"7_0": ("RUNNING", "None")})
+    cluster.folder.mkdir()
+    (cluster.folder / "submitted.json").write_text(json.dumps({"a": "7_0", "b": "6_0"}))
+    jobs = [run_job(tmp_path, name, "--seed=1") for name in ("a", "b")]
+    assert cluster.submit(jobs, threads=1, parallel=None) == {"a": "7_0", "b": "2_0"}
+    assert read_submitted(cluster.folder) == {"a": "7_0", "b": "2_0"}
+
+
 def test_what_was_made_of_a_run_that_is_begun_anew_is_submitted_with_it(tmp_path, job, monkeypatch):
     """Its evaluations are removed with it, and those of others stay as they are."""
     run = Job("run", ("python",), tmp_path / "run/train", made_from_it=(tmp_path / "run/eval",))
@@ -157,16 +208,7 @@ def test_what_was_made_of_a_run_that_is_begun_anew_is_submitted_with_it(tmp_path
     for made in (evaluation, other):
         made.output.mkdir(parents=True)
         note(made, "done")
-    cluster = Cluster.__new__(Cluster)
-    cluster.folder, cluster.options = tmp_path / "slurm", SlurmOptions()
-    monkeypatch.setattr("cronos_lerobot.experiments.slurm.squeue", dict)
-    taken = []
-
-    def submit_array(self, name, tasks, parameters):
-        taken.append([[made.name for made in task.jobs] for task in tasks])
-        return [f"{len(taken)}_{i}" for i in range(len(tasks))]
-
-    monkeypatch.setattr(Cluster, "_submit_array", submit_array)
+    cluster, taken = cluster_of(tmp_path, monkeypatch, {})
     jobs = [run, evaluation, replace(other, needs=())]
     assert cluster.submit(jobs, threads=1, parallel=None) == {"run": "2_0", "run/eval": "3_0"}
     assert taken == [[], [["run"]], [["run/eval"]]]

@@ -12,7 +12,8 @@ from slurm_cluster import SlurmCluster, missing
 from cronos_lerobot.experiments.follow import Follower
 from cronos_lerobot.experiments.jobs import BASE, EVALUATION, RUN, Job, read_record, write_record
 from cronos_lerobot.experiments.runner import ENDING_SIGNALS
-from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, Task, plan_arrays, read_submitted
+from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, Task, plan_arrays
+from cronos_lerobot.experiments.submitted import read_submitted
 
 needs_slurm = pytest.mark.skipif(
     bool(missing()), reason=f"no Slurm here ({', '.join(missing())}): Debian has it in slurm-wlm and munge"

@@ -59,6 +59,14 @@ class Scene:
     spawn_low: tuple[float, float] = (0.20, -0.15)
     spawn_high: tuple[float, float] = (0.40, 0.15)
 
+    def __post_init__(self) -> None:
+        for name in ("objects", "receptacles", "spawn_low", "spawn_high"):
+            value = getattr(self, name)
+            if isinstance(value, str):
+                raise ValueError(f"{name} of the scene {self.name!r} must be a tuple, ({value!r},), got {value!r}")
+            # Scenes are keys of caches, which lists cannot be.
+            object.__setattr__(self, name, tuple(value))
+
     @property
     def bodies(self) -> tuple[str, ...]:
         """All free bodies, objects first; the order of the state vector."""

@@ -1,0 +1,105 @@
+"""Experiments of one's own: what their fields may be is told when they are declared, not after their runs."""
+
+import pytest
+from lerobot_env_cronos.benchmark.benchmark import SUITES
+from lerobot_env_cronos.benchmark.configurations import SPLITS
+
+from cronos_lerobot.experiments import definitions
+from cronos_lerobot.experiments.definitions import CheckpointEvaluation, Experiment, Row
+from cronos_lerobot.experiments.scales import SCALES, STATE, base_recipe
+
+BOTH = ("train", "held_out")
+CHAINS = CheckpointEvaluation("sequential", BOTH)
+
+
+def own_experiment(rows=None, **fields):
+    return Experiment("mine", "", (Row(80), Row(320)) if rows is None else rows, **fields)
+
+
+@pytest.mark.parametrize(
+    ("suite", "splits", "message"),
+    [
+        ("sequentiel", BOTH, r"suite .* must be one of \['independent', 'sequential'\], got 'sequentiel'"),
+        # A comma is missing: a job for each letter.
+        (
+            "sequential",
+            ("held_out"),
+            r"splits of the sequential .* a tuple, such as \('held_out',\), got 'held_out'",
+        ),
+        (
+            "independent",
+            ("train", "heldout"),
+            r"must be some of \['train', 'held_out'\], got \('train', 'heldout'\)",
+        ),
+        ("independent", (), r"must be some of \['train', 'held_out'\], got \(\)"),
+    ],
+)
+def test_evaluations_that_there_are_not(suite, splits, message):
+    with pytest.raises(ValueError, match=message):
+        CheckpointEvaluation(suite, splits)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (
+            {"axes": ("interactions",)},
+            r"axes of mine must be some of \['interaction_steps', 'interventions'\], got \('interactions',\)",
+        ),
+        ({"axes": ()}, r"axes of mine must be some of .*, got \(\)"),
+        ({"splits": ("heldout",)}, r"splits of mine must be some of .*, got \('heldout',\)"),
+        ({"splits": "train"}, r"splits of mine must be a tuple, such as \('train',\), got 'train'"),
+        ({"rows": Row(80)}, r"rows of mine must be a tuple, such as \(Row\(interval=80"),
+        ({"evaluations": CHAINS}, r"evaluations of mine must be a tuple, such as \(CheckpointEvaluation\("),
+        ({"budgets": 1000}, r"budgets of mine must be a tuple, such as \(1000,\), got 1000"),
+        ({"steps": 500_000}, "steps of mine must be SHORT=1300000 or LONG=2900000, got 500000"),
+        (
+            {"joined": (("a", ("t80", "t81")),)},
+            r"joined 'a' of mine must be some of \['t80', 't320'\], got \('t80', 't81'\)",
+        ),
+        ({"joined": (("a", ("t80")),)}, r"joined 'a' of mine must be a tuple, such as \('t80',\), got 't80'"),
+        ({"joined": ("a", ("t80",))}, r"joined of mine are pairs, \(label, names of rows\), got 'a'"),
+        (
+            {"splits": BOTH, "evaluations": (CHAINS,)},
+            r"splits of mine have 'held_out', .*: give .*CheckpointEvaluation\('independent', \('held_out',\)",
+        ),
+    ],
+)
+def test_fields_that_mean_nothing(fields, message):
+    with pytest.raises(ValueError, match=message):
+        own_experiment(**fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"stages": (10_000, 80)}, "stages of a row are pairs, .*, got 10000"),
+        ({"budgets": ("--protocol.reset_budget", 9)}, "budgets of a row are pairs, .*, got '--protocol.reset_b"),
+    ],
+)
+def test_a_comma_that_is_missing_in_a_row(fields, message):
+    with pytest.raises(ValueError, match=message):
+        Row(80, tag="mine", **fields)
+
+
+def test_lists_will_do():
+    evaluation = CheckpointEvaluation("independent", ["held_out"])
+    own_experiment([Row(80)], splits=["train", "held_out"], evaluations=[evaluation], joined=[["a", ["t80"]]])
+
+
+def test_where_held_out_curves_come_from():
+    both = {"splits": BOTH}
+    for every_checkpoint in (True, False):
+        evaluation = CheckpointEvaluation("independent", ("held_out",), every_checkpoint)
+        own_experiment(**both, evaluations=(evaluation,))
+    # A row whose runs are evaluated there while they train has its curve from them.
+    own_experiment((Row(80), Row(80, tag="held", flags=("--eval.split=held_out",))), **both)
+
+
+def test_suites_and_splits_are_the_environments():
+    assert (definitions.SUITES, definitions.BOTH) == (SUITES, SPLITS)
+
+
+def test_an_unknown_base_is_named():
+    with pytest.raises(ValueError, match=r"one of \['narrow', 'wide', 'wide_resets'\], got 'wid'"):
+        base_recipe(SCALES["small"], "kitchen_2x2", STATE, kind="wid")
