@@ -21,7 +21,12 @@ from lerobot_env_cronos.hub_config import is_of_this_package
 
 from cronos_lerobot.data.video import check_video_size
 from cronos_lerobot.evaluation.plan import Part, make_parts
-from cronos_lerobot.evaluation.policy_env import check_observations, observations_of, trained_scene
+from cronos_lerobot.evaluation.policy_env import (
+    check_observations,
+    observations_of,
+    trained_renderer,
+    trained_scene,
+)
 from cronos_lerobot.evaluation.policy_source import (
     PolicySource,
     files_fingerprint,
@@ -86,7 +91,7 @@ class CronosEvalConfig:
 
     env: EnvConfig = field(default_factory=CronosEnvConfig)
     """Scene, benchmark and observations. What is not given follows from the benchmark, if there is one, and from
-    the policy: the scene that it was trained in, and the images or the state that it takes."""
+    the policy: the scene and the renderer that it was trained with, and the images or the state that it takes."""
     policy: PreTrainedConfig | None = None
     """The policy: --policy.path=<checkpoint, or Hub id[@revision]>."""
     eval: SuitesConfig = field(default_factory=SuitesConfig)
@@ -206,7 +211,7 @@ class CronosEvalConfig:
             raise ValueError("choose a policy: --policy.path=<checkpoint or Hub id> (or --expert=true)")
 
     def _derive_env(self, given: set[str]) -> None:
-        """Set what no flag of --env gives: the scene of the training, and what the policy observes."""
+        """Set what no flag of --env gives: the training's scene and renderer, and what the policy observes."""
         env = self.env
         assert isinstance(env, CronosEnvConfig)
         if "--config_path" in {argument.split("=")[0] for argument in sys.argv[1:]}:
@@ -216,6 +221,9 @@ class CronosEvalConfig:
             derived["obs_type"] = "environment_state_agent_pos"
         else:
             derived = observations_of(self.policy.input_features or {})
+            # Of one that takes no pictures it would draw the videos alone.
+            if "observation_height" in derived:
+                derived |= trained_renderer(self.policy.pretrained_path)
             if env.benchmark is None and "scene" not in given:
                 derived |= trained_scene(self.policy.pretrained_path)
         for name, value in derived.items():

@@ -17,7 +17,7 @@ from lerobot_env_cronos.scene.model import CAMERAS
 from lerobot_env_cronos.scene.scenes import SCENES, get_scene
 from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS
 
-from cronos_lerobot.data.origin import read_origin
+from cronos_lerobot.data.origin import Origin, read_origin
 
 EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
 """How pictures begin that a policy with `--policy.empty_cameras` fills in by itself."""
@@ -48,10 +48,7 @@ def trained_scene(path: Path | None) -> dict[str, str]:
     Raises:
         ValueError: its config is damaged, or `cronos-train` had a scene that is not registered here.
     """
-    file = Path(path or "") / TRAIN_CONFIG_NAME
-    if not file.is_file():
-        return {}
-    config = json.loads(file.read_text())
+    config = _train_config(path)
     env = config.get("env") or {}
     scene = env.get("scene")
     if scene is not None and env.get("type") == "cronos":
@@ -65,12 +62,40 @@ def trained_scene(path: Path | None) -> dict[str, str]:
     return {"scene": scene} if scene in SCENES else {}
 
 
+def trained_renderer(path: Path | None) -> dict[str, str]:
+    """The renderer of the pictures that a checkpoint learned from: of its dataset, or of `cronos-train`.
+
+    Empty if it does not say, or if its dataset is not on this machine.
+
+    Raises:
+        ValueError: its config is damaged.
+    """
+    config = _train_config(path)
+    env, dataset = config.get("env") or {}, config.get("dataset") or {}
+    renderer = env.get("renderer") if env.get("type", "cronos") == "cronos" else None
+    if isinstance(repo_id := dataset.get("repo_id"), str):
+        # The environment beside it is that of LeRobot's evaluations alone.
+        origin = _origin_of_dataset(repo_id, dataset.get("root"))
+        renderer = (origin.flags if origin else {}).get("env.renderer", renderer)
+    return {"renderer": renderer} if renderer else {}
+
+
+def _train_config(path: Path | None) -> dict[str, Any]:
+    file = Path(path or "") / TRAIN_CONFIG_NAME
+    return json.loads(file.read_text()) if file.is_file() else {}
+
+
 def scene_of_dataset(repo_id: str, root: Path | str | None) -> str | None:
     """The scene of a dataset on this machine, in `root` or LeRobot's cache; None if there is none that says it."""
+    origin = _origin_of_dataset(repo_id, root)
+    return origin.scene if origin else None
+
+
+def _origin_of_dataset(repo_id: str, root: Path | str | None) -> Origin | None:
     folder = Path(root or HF_LEROBOT_HOME / repo_id)
     try:
         features = json.loads((folder / INFO_PATH).read_text())["features"]
-        return read_origin(folder, features, f"dataset {repo_id}").scene
+        return read_origin(folder, features, f"dataset {repo_id}")
     except (OSError, ValueError, KeyError):
         # Not here, of another version, or not of these scenes at all.
         return None

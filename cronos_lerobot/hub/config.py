@@ -157,8 +157,8 @@ class ResultsConfig(PublishConfig):
     suites: str = "independent,sequential"
     """Suites to publish, comma-separated."""
     partial: bool = False
-    """Publish an evaluation of fewer episodes than the benchmark has, or with other options than its own; the
-    entry says so."""
+    """Publish an evaluation of fewer episodes than the benchmark has, with other options than its own, or of a
+    policy that flags changed; the entry says so."""
     source_url: str | None = None
     """Page with the details of the evaluation, such as its log."""
 

@@ -16,16 +16,20 @@ from cronos_lerobot.evaluation.policy_env import observations_of, task_observati
 DEFAULTS = {field.name: field.default for field in fields(CronosEnvConfig)}
 
 
-def lerobot_eval_flags(policy: dict[str, Any], env: dict[str, Any], scene: str | None) -> list[str]:
+def lerobot_eval_flags(
+    policy: dict[str, Any], env: dict[str, Any], scene: str | None, renderer: str | None = None
+) -> list[str]:
     """For `lerobot-eval`, which knows nothing of the training.
 
     Args:
         policy: its config.json.
         env: what it was trained in, of its train_config.json; empty if no environment was.
         scene: of the training, if it is known.
+        renderer: of the pictures that it learned from, if it is known.
     """
     features = _features(policy)
     wanted = _observations(features, env) | {"task_observation": _task_observation(features, env, scene)}
+    wanted |= {"renderer": renderer} if renderer and "observation_height" in wanted else {}
     changed = {name: value for name, value in wanted.items() if value != DEFAULTS[name]}
     shown = ({"scene": scene} if scene else {}) | {"obs_type": wanted["obs_type"]} | changed
     return ["--env.type=cronos", *(_flag(name, value) for name, value in shown.items())]

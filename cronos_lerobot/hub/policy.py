@@ -14,16 +14,20 @@ from safetensors import SafetensorError, safe_open
 
 from cronos_lerobot.agents.steering.steered import STEERING
 from cronos_lerobot.evaluation.config import EXPERT
+from cronos_lerobot.evaluation.policy_env import trained_renderer
 from cronos_lerobot.evaluation.policy_source import files_fingerprint
 from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.hub.cards import render_card
+from cronos_lerobot.hub.caveats import describe_caveats
 from cronos_lerobot.hub.config import PolicyConfig
 from cronos_lerobot.hub.eval_flags import cronos_eval_flags, lerobot_eval_flags
 from cronos_lerobot.hub.peft_base import find_base, name_base
 from cronos_lerobot.hub.runs import (
     Checkpoint,
+    config_facts,
     describe_source,
     find_checkpoint,
+    is_of_cronos_train,
     is_repository,
     read_run,
     run_facts,
@@ -134,12 +138,15 @@ def _card(
     results: dict[str, Any] | None,
 ) -> str:
     trained = json.loads(train_config_path(checkpoint.model).read_text()) if _has_config(checkpoint) else {}
+    copied = config_facts(trained) if is_of_cronos_train(trained) else None
+    training = run_facts(run) if run else copied
     base = (run.config.get("policy") or {}).get("pretrained_path") if run else None
     recorded = (trained.get("record") or trained.get("dataset") or {}).get("repo_id")
     # A folder may be none where the card is made; a run that began with one has noted its fingerprint.
     is_on_hub = run is not None and run.base is None and is_repository(base)
     base_model = config.base_policy or (str(base) if is_on_hub else None) or adapters_of
     env = trained.get("env") or {}
+    renderer = trained_renderer(checkpoint.model).get("renderer")
     if config.scene and env.get("scene") and config.scene != env["scene"]:
         raise ValueError(f"--scene={config.scene}, but the policy was trained in {env['scene']}")
     scene = env.get("scene") or config.scene or (results or {}).get("scene")
@@ -152,18 +159,19 @@ def _card(
         article="An" if policy["type"][0] in "aeiou" else "A",
         inputs=policy.get("input_features") or {},
         outputs=policy.get("output_features") or {},
-        run=run_facts(run) if run else None,
+        training=training,
+        run=training if run else None,
         dataset=config.dataset or recorded,
-        is_demonstrations=run is None,
         base_model=base_model,
         base_is_local=base is not None and base_model is None,
         adapters_of=adapters_of,
         is_steered=(checkpoint.model / STEERING).is_file(),
         scene=scene,
-        lerobot_eval_flags=lerobot_eval_flags(policy, env, scene),
+        lerobot_eval_flags=lerobot_eval_flags(policy, env, scene, renderer),
         cronos_eval_flags=cronos_eval_flags(policy, env, scene),
         curves=curves,
         results=results,
+        caveats=describe_caveats(results, policy, renderer) if results else [],
         results_source=describe_source(results["benchmark"]["source"]) if results else None,
     )
 

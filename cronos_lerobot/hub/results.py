@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import yaml
 from huggingface_hub import EvalResultEntry, HfApi, eval_result_entries_to_yaml
+from huggingface_hub.constants import CONFIG_NAME
 from huggingface_hub.errors import EntryNotFoundError
 from huggingface_hub.hf_api import RepoFile
 from lerobot_env_cronos import Benchmark, gymnasium_id, load_benchmark
@@ -17,6 +20,7 @@ from cronos_lerobot.evaluation.config import EXPERT
 from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.hub.benchmark import task_id
 from cronos_lerobot.hub.cards import describe_sampling
+from cronos_lerobot.hub.caveats import changes_of_policy
 from cronos_lerobot.hub.config import ResultsConfig
 from cronos_lerobot.hub.push import PublishError, explained
 
@@ -42,8 +46,9 @@ def write_results(config: ResultsConfig, folder: Path) -> str:
     with explained(config.target):
         revision = _revision(config)
         _check_commit(results, config.repo_id, revision)
+        policy = _read_policy(config.repo_id, results["policy_revision"])
     benchmark = _load(config, results)
-    entries = make_entries(results, benchmark, config)
+    entries = make_entries(results, benchmark, config, changes_of_policy(results, policy))
     content = merge(_published(config, revision), eval_result_entries_to_yaml(entries))
     path = folder / FILE
     path.parent.mkdir(parents=True)
@@ -92,6 +97,11 @@ def _policy_files(repo_id: str, revision: str | None) -> dict[str, str]:
     }
 
 
+def _read_policy(repo_id: str, revision: str) -> dict[str, Any]:
+    """config.json of the policy in a commit."""
+    return json.loads(Path(HfApi().hf_hub_download(repo_id, CONFIG_NAME, revision=revision)).read_text())
+
+
 def _revision(config: ResultsConfig) -> str | None:
     """The revision that the results are written onto."""
     branches = {branch.name for branch in HfApi().list_repo_refs(config.repo_id).branches}
@@ -118,11 +128,20 @@ def _load(config: ResultsConfig, results: dict[str, Any]) -> Benchmark:
     return benchmark
 
 
-def make_entries(results: dict[str, Any], benchmark: Benchmark, config: ResultsConfig) -> list[EvalResultEntry]:
+def make_entries(
+    results: dict[str, Any], benchmark: Benchmark, config: ResultsConfig, changes: Sequence[str] = ()
+) -> list[EvalResultEntry]:
     """An entry for each suite and split of results.json.
 
+    Args:
+        results: of results.json.
+        benchmark: that was evaluated on.
+        config: what to publish.
+        changes: that flags of the evaluation made to the policy, in words.
+
     Raises:
-        ValueError: there is nothing to publish, or an evaluation was partial and `config.partial` is not set.
+        ValueError: there is nothing to publish, or an evaluation was partial, or of a changed policy, and
+            `config.partial` is not set.
     """
     suites = [suite.strip() for suite in config.suites.split(",")]
     if unknown := set(suites) - set(SUITES):
@@ -131,7 +150,7 @@ def make_entries(results: dict[str, Any], benchmark: Benchmark, config: ResultsC
     entries = []
     for suite in suites:
         for split, scores in results.get(suite, {}).items():
-            caveat = _caveat(suite, split, scores["n"], benchmark.size(suite, split), results)
+            caveat = _caveat(suite, split, scores["n"], benchmark.size(suite, split), results, changes)
             if caveat and not config.partial:
                 raise ValueError(f"{task_id(suite, split)}: {caveat}; --partial=true publishes it all the same")
             entries.append(
@@ -150,8 +169,8 @@ def make_entries(results: dict[str, Any], benchmark: Benchmark, config: ResultsC
     return entries
 
 
-def _caveat(suite: str, split: str, n: int, size: int, results: dict[str, Any]) -> str:
-    """In which ways an evaluation is not the benchmark's own; empty if in none."""
+def _caveat(suite: str, split: str, n: int, size: int, results: dict[str, Any], changes: Sequence[str]) -> str:
+    """In which ways an evaluation is not the benchmark's own, or not of the policy; empty if in none."""
     caveats = []
     if n != size:
         whole = "chains" if suite == "sequential" else "episodes"
@@ -160,6 +179,8 @@ def _caveat(suite: str, split: str, n: int, size: int, results: dict[str, Any]) 
         caveats.append(f"every configuration was run {repetitions} times, the benchmark has each once")
     if renderer := (results.get("identity") or {}).get("renderer"):
         caveats.append(f"the policy saw pictures of the renderer {renderer}, the benchmark's are classic")
+    if changes:
+        caveats.append(f"flags changed the policy: {', '.join(changes)}")
     other = {name: results[name] for name, value in STANDARD.items() if results[name] != value}
     if suite == "sequential" and other:
         caveats.append(f"evaluated with {other}, the benchmark has {STANDARD}")

@@ -78,9 +78,13 @@ def read_run(folder: Path, step: int | None = None) -> TrainingRun:
     return run
 
 
-def run_facts(run: TrainingRun) -> dict[str, Any]:
-    """The facts of a run that cards show."""
-    config, last = run.config, run.last
+def is_of_cronos_train(config: dict[str, Any]) -> bool:
+    """Whether a training config, which lies beside a policy wherever that is copied to, is of cronos-train."""
+    return all(config.get(name) for name in ("env", "protocol", "algorithm"))
+
+
+def config_facts(config: dict[str, Any]) -> dict[str, Any]:
+    """The facts that cards show of a training config of cronos-train."""
     env, protocol = config["env"], config["protocol"]
     return {
         "scene": env["scene"],
@@ -94,10 +98,17 @@ def run_facts(run: TrainingRun) -> dict[str, Any]:
         "learned_tag": LEARNED.get(config["algorithm"]["type"], (None, None))[1],
         "num_envs": config["num_envs"],
         "seed": config["seed"],
+    }
+
+
+def run_facts(run: TrainingRun) -> dict[str, Any]:
+    """The facts of a run that cards show."""
+    last = run.last
+    return config_facts(run.config) | {
         "steps": last["interaction_steps"],
         "updates": last["updates"],
         "interventions": last["interventions"],
-        "by_kind": _by_kind(last["interventions_by_kind"], protocol.get("takeover_price", 1)),
+        "by_kind": _by_kind(last["interventions_by_kind"], run.config["protocol"].get("takeover_price", 1)),
         "evaluations": run.evaluations,
         "versions_then": run.starts[-1]["versions"],
         "commit_then": run.starts[-1]["git_commit"],

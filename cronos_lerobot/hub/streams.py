@@ -15,6 +15,7 @@ from lerobot_env_cronos.statistics import wilson_interval
 
 from cronos_lerobot.data.file_check import check_dataset
 from cronos_lerobot.data.origin import STREAMS, Origin
+from cronos_lerobot.data.stream_filter import PROVENANCE
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.hub.cards import render_card
 from cronos_lerobot.hub.config import StreamConfig
@@ -25,6 +26,8 @@ from cronos_lerobot.training.logging import MANIFEST, METRICS
 FOLDERS = ("data", "meta", "videos")
 """Of a LeRobotDataset; others, such as pictures that wait to be encoded, stay here."""
 REPLACES = [f"{folder}/*" for folder in FOLDERS]
+OUTCOMES = ("success", "found_complete")
+"""Fields of a filter that choose segments by how they went."""
 READ_ONLY = (errno.EACCES, errno.EPERM, errno.EROFS)
 """Errors of a folder that this process may only read."""
 
@@ -119,6 +122,8 @@ def _stream_card(config: StreamConfig, info: dict[str, Any], origin: Origin) -> 
     from cronos_lerobot.data.stream_statistics import statistics
 
     streams = StreamDataset(config.repo_id, root=config.root)
+    filtered, counts = _read_filter(config.root), statistics(streams)
+    chosen_by_outcome = any((filtered or {}).get("filter", {}).get(name) is not None for name in OUTCOMES)
     run = _find_run(config)
     if run and (scene := read_run(run).config["env"]["scene"]) != origin.scene:
         raise ValueError(f"{config.root} was recorded in {origin.scene}, the run {run} is of {scene}")
@@ -126,12 +131,40 @@ def _stream_card(config: StreamConfig, info: dict[str, Any], origin: Origin) -> 
         "streams",
         repo_id=config.repo_id,
         info=info,
-        statistics=statistics(streams),
+        statistics=counts,
         missing=_missing(streams),
+        filtered=filtered,
+        filter_flags=_filter_flags(filtered) if filtered else [],
+        chosen_by_outcome=chosen_by_outcome,
+        # There are none of the policy's own where an expert did all segments.
+        tells_success=not chosen_by_outcome and bool(counts["success_by_position"]),
         run=run_facts(read_run(run)) if run else None,
         interval=wilson_interval,
         **_common(info, origin),
     )
+
+
+def _read_filter(root: Path | None) -> dict[str, Any] | None:
+    """What `cronos-streams filter` says that it made a dataset of, and how; None of one that it did not make.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    assert root is not None
+    path = root / PROVENANCE
+    if not path.is_file():
+        return None
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def _filter_flags(filtered: dict[str, Any]) -> list[str]:
+    """Flags of `cronos-streams filter` that made a dataset."""
+    flags = {f"filter.{name}": value for name, value in filtered["filter"].items()}
+    flags["frames_after_success"] = filtered["frames_after_success"]
+    return [f"--{name}={json.dumps(value)}" for name, value in flags.items() if value is not None]
 
 
 def _missing(streams: StreamDataset) -> str | None:

@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+import shutil
 
 import draccus
 import numpy as np
@@ -14,13 +15,14 @@ from lerobot_env_cronos.config import CronosEnvConfig
 from lerobot_env_cronos.scene.scenes import SCENES
 from safetensors.numpy import save_file
 
-from cronos_lerobot.agents.imitation.config import ImitationConfig
+from cronos_lerobot.agents.imitation.config import DemosConfig, ImitationConfig
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.steering.config import SteeringConfig
 from cronos_lerobot.evaluation.policy_source import files_fingerprint
 from cronos_lerobot.evaluation.results import independent_results
 from cronos_lerobot.evaluation.store import FORMAT
 from cronos_lerobot.hub import policy as hub_policy
+from cronos_lerobot.hub.caveats import changes_of_policy
 from cronos_lerobot.hub.config import PolicyConfig
 from cronos_lerobot.hub.eval_flags import lerobot_eval_flags
 from cronos_lerobot.scripts.publish import publish_policy
@@ -47,7 +49,8 @@ def write_checkpoint(root, kind, env, algorithm, **files):
         "input_features": features_of(env),
         "output_features": {"action": {"type": "ACTION", "shape": [7]}},
     }
-    (model / "config.json").write_text(json.dumps({"type": kind} | features))
+    options = {"n_action_steps": 100, "temperature": 0.6}
+    (model / "config.json").write_text(json.dumps({"type": kind} | features | options))
     config = json.dumps(draccus.encode(CronosTrainConfig(env=env, algorithm=algorithm)))
     (model / "train_config.json").write_text(config)
     start = {"config": json.loads(config), "environment": "lerobot_env_cronos/kitchen_2x2-v1", "git_commit": None}
@@ -121,6 +124,44 @@ def test_a_cards_commands_are_right_for_every_policy(
         assert (front["base_model"], front["base_model_relation"]) == ("me/clone", "adapter")
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "learned"),
+    [
+        (PPOConfig(), "reinforcement learning (agent `ppo`)"),
+        (ImitationConfig(demos=DemosConfig("me/demos"), demos_share=0.5),
+         "imitation of its own successes (agent `imitation`)"),
+    ],
+)  # fmt: skip
+def test_a_checkpoint_without_its_run_is_still_of_cronos_train(tmp_path, algorithm, learned):
+    """What is recorded is the policy's own, also where the agent has demonstrations beside it."""
+    model = write_checkpoint(tmp_path, "pocketvla", CronosEnvConfig(**STATE), algorithm) / "pretrained_model"
+    file = model / "train_config.json"
+    config = json.loads(file.read_text())
+    config["record"]["repo_id"], config["protocol"]["end_effector_reset"] = "me/stream", True
+    file.write_text(json.dumps(config))
+    card = dry_run(shutil.copytree(model, tmp_path / "copy"), tmp_path / "out")
+    assert f"after {learned} with `cronos-train` in the CRONOS scene `kitchen_2x2` (T = 1280, EER):" in card
+    assert "interventions, evaluations and curves are in the folder of its run, which was not there" in card
+    assert "- What it did while it learned: [me/stream](" in card
+    assert "- Observation: privileged state" in card
+    for wrong in ("lerobot-train", "Demonstrations", "## Training", "Began"):
+        assert wrong not in card
+    tags = yaml.safe_load(card.split("---")[1])["tags"]
+    assert tags[-2:] == [learned.partition(" ")[0] + "-learning", "reset-free"]
+
+
+@pytest.mark.parametrize(
+    ("env", "flag"),
+    [({}, ["renderer=filament"]), (STATE, [])],
+    ids=["pictures", "state, of which it draws nothing"],
+)
+def test_a_cards_command_draws_as_the_training_did(tmp_path, monkeypatch, env, flag):
+    monkeypatch.setattr(hub_policy, "FIGURES", {})
+    env = CronosEnvConfig(**env, renderer="filament")
+    card = dry_run(write_checkpoint(tmp_path, "pocketvla", env, PPOConfig()), tmp_path / "out")
+    assert [word for word in commands(card)["lerobot-eval"] if "renderer" in word] == flag
+
+
 def test_a_card_says_how_actions_were_sampled(tmp_path, monkeypatch):
     monkeypatch.setattr(hub_policy, "FIGURES", {})
     checkpoint = write_checkpoint(tmp_path, "pocketvla", CronosEnvConfig(**STATE), PPOConfig())
@@ -134,6 +175,50 @@ def test_a_card_says_how_actions_were_sampled(tmp_path, monkeypatch):
         f"| 32 | {interventions} | 0.500 [0.100, 0.900] | 4 | held-out | {sampling} |"
         for interventions, sampling in enumerate(("temperature 0.6", "greedy", "the policy's own sampling"))
     ]
+
+
+PICTURES = {"obs_type": "pixels_agent_pos"}
+FILAMENT = "The renderer `filament` drew the policy's pictures"
+OTHERS = ", those that it learned from by"
+
+
+@pytest.mark.parametrize(
+    ("renderer", "changes", "told"),
+    [
+        ("classic", PICTURES | {"renderer": "classic"}, []),
+        ("classic", STATE | {"renderer": "filament"}, []),
+        ("classic", PICTURES | {"renderer": "filament"}, [f"{FILAMENT}{OTHERS} `classic`."]),
+        ("filament", PICTURES | {"renderer": "filament"}, [f"{FILAMENT}."]),
+        ("filament", PICTURES, [f"The renderer `classic` drew the policy's pictures{OTHERS} `filament`."]),
+        ("classic", {"repetitions": 4}, ["Every configuration of the independent suite was run 4 times."]),
+        ("classic", {"config": {"quick": True, "eval": {"n_episodes": None}}, "identity": {"n_episodes": 16}},
+         ["Evaluated on the first 16 configurations of each split."]),
+        ("classic", {"config": {"policy": {"type": "act", "n_action_steps": 1, "device": "cuda", "newer": 2}}},
+         ["Flags changed the policy: n_action_steps 1 in place of 100."]),
+    ],
+)  # fmt: skip
+def test_a_card_says_in_what_its_scores_are_of_something_else(tmp_path, monkeypatch, renderer, changes, told):
+    monkeypatch.setattr(hub_policy, "FIGURES", {})
+    env = CronosEnvConfig(renderer=renderer)
+    checkpoint = write_checkpoint(tmp_path, "act", env, ImitationConfig())
+    card = dry_run(checkpoint, tmp_path / "out", results=write_scores(tmp_path / "eval", **changes))
+    above, table = card.partition("## Results\n")[2].split("| suite and split |")
+    assert [line[2:] for line in above.splitlines() if line.startswith("- ")] == told
+    assert "| independent, train | success | 1.000 " in table
+
+
+def test_what_flags_changed_of_a_policy():
+    published = {"type": "pi0_fast", "temperature": 0.0, "device": "cpu", "push_to_hub": True, "dtype": "float32",
+                 "adapter": None, "use_peft": True}  # fmt: skip
+    assert changes_of_policy({}, published) == []
+    evaluated = {"type": "pi0_fast", "temperature": 0.5, "device": "cuda", "push_to_hub": False, "use_peft": False,
+                 "dtype": "bfloat16", "adapter": "/home/me/lora", "newer": 1}  # fmt: skip
+    results = {"config": {"policy": evaluated}, "temperature": 0.6}
+    others = ["dtype bfloat16 in place of float32", "adapter a folder in place of null"]
+    assert changes_of_policy(results, published) == others
+    # Of a policy that the evaluation gives no temperature its own one holds.
+    own = ["temperature 0.5 in place of 0.0"]
+    assert changes_of_policy(results | {"temperature": None}, published) == own + others
 
 
 def write_scores(folder, **changes):

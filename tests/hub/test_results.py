@@ -86,6 +86,15 @@ def test_pictures_of_another_renderer_are_refused_or_called_so():
     assert len(make_entries(make_results(identity={}), BENCHMARK, ResultsConfig())) == 2
 
 
+def test_a_policy_that_flags_changed_is_refused_or_called_so():
+    changes = ["n_action_steps 1 in place of 100", "temperature 0.5 in place of 0.0"]
+    with pytest.raises(ValueError, match="independent_train: flags changed the policy: n_action_steps 1 in place"):
+        make_entries(make_results(), BENCHMARK, ResultsConfig(), changes)
+    for entry in make_entries(make_results(), BENCHMARK, ResultsConfig(partial=True), changes):
+        assert entry.notes is not None
+        assert entry.notes.startswith(f"PARTIAL: flags changed the policy: {', '.join(changes)}; n=")
+
+
 def test_a_note_names_every_way_in_which_an_evaluation_is_another():
     results = make_results(identity={"renderer": "filament"}, advance="on_success")
     results["sequential"]["train"]["n"] = 3

@@ -252,6 +252,15 @@ HfApi().upload_file(path_or_fileobj={yaml.safe_dump([old, other]).encode()!r}, r
         assert "n=8" in entries[i]["notes"]
 
 
+def test_results_of_a_policy_that_flags_changed_are_refused(policy, commands, tmp_path):
+    commands.run("cronos-eval", f"--policy.path={policy}", "--policy.sigma_max=0.3", "--env.benchmark=me/bench",
+                 "--eval.suites=independent", "--eval.splits=train", "--eval.videos=0",
+                 f"--output_dir={tmp_path / 'eval'}")  # fmt: skip
+    refused = commands.try_("cronos-publish", "results", f"--results={tmp_path / 'eval'}", f"--repo_id={policy}")
+    assert refused.code == 1
+    assert "independent_train: flags changed the policy: sigma_max 0.3 in place of 0.6;" in refused.output
+
+
 def test_results_of_another_benchmark_are_refused(policy, evaluation, commands, tmp_path):
     commands.run("cronos-publish", *BENCHMARK, "--repo_id=me/other", "--seed=6", "--pictures=false")
     publish = ("cronos-publish", "results", f"--results={evaluation}", f"--repo_id={policy}")
