@@ -94,6 +94,21 @@ class SegmentFilter:
         )
 
 
+def read_filter(root: Path) -> dict[str, Any] | None:
+    """What `filter_streams` says that it made a dataset of, and how; None of one that it did not make.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    path = root / PROVENANCE
+    if not path.is_file():
+        return None
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
 def filter_streams(
     source: StreamDataset,
     wanted: SegmentFilter,
@@ -149,6 +164,7 @@ def filter_streams(
         "segments": len(segments),
         "filter": asdict(wanted),
         "frames_after_success": frames_after_success,
+        "filter_of_source": read_filter(source.meta.root),
     }
     (partial / PROVENANCE).write_text(json.dumps(provenance, indent=2))
     write_origin(partial, source.origin)

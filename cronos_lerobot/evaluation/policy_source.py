@@ -105,8 +105,8 @@ def load_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
 def fingerprint(policy: PreTrainedConfig) -> str:
     """A short hash of all that decides a policy's actions: its config, its weights and its processors.
 
-    Weights that the config names (`checkpoint`, `adapter`) count too: by their files, or the Hub's commit. It is the
-    same on every device.
+    Weights that the config names (`checkpoint`, `adapter`) count too: by their files, or the Hub's commit. It
+    is the same on every device.
     """
     config = {name: value for name, value in draccus.encode(policy).items() if name not in UNDECISIVE}
     if "device" in config:

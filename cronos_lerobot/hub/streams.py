@@ -15,7 +15,7 @@ from lerobot_env_cronos.statistics import wilson_interval
 
 from cronos_lerobot.data.file_check import check_dataset
 from cronos_lerobot.data.origin import STREAMS, Origin
-from cronos_lerobot.data.stream_filter import PROVENANCE
+from cronos_lerobot.data.stream_filter import read_filter
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.hub.cards import render_card
 from cronos_lerobot.hub.config import StreamConfig
@@ -121,9 +121,10 @@ def _find_run(config: StreamConfig) -> Path | None:
 def _stream_card(config: StreamConfig, info: dict[str, Any], origin: Origin) -> str:
     from cronos_lerobot.data.stream_statistics import statistics
 
+    assert config.root is not None
     streams = StreamDataset(config.repo_id, root=config.root)
-    filtered, counts = _read_filter(config.root), statistics(streams)
-    chosen_by_outcome = any((filtered or {}).get("filter", {}).get(name) is not None for name in OUTCOMES)
+    filters, counts = _filters(config.root), statistics(streams)
+    chosen_by_outcome = any(one["filter"].get(name) is not None for one in filters for name in OUTCOMES)
     run = _find_run(config)
     if run and (scene := read_run(run).config["env"]["scene"]) != origin.scene:
         raise ValueError(f"{config.root} was recorded in {origin.scene}, the run {run} is of {scene}")
@@ -133,8 +134,7 @@ def _stream_card(config: StreamConfig, info: dict[str, Any], origin: Origin) -> 
         info=info,
         statistics=counts,
         missing=_missing(streams),
-        filtered=filtered,
-        filter_flags=_filter_flags(filtered) if filtered else [],
+        filters=filters,
         chosen_by_outcome=chosen_by_outcome,
         # There are none of the policy's own where an expert did all segments.
         tells_success=not chosen_by_outcome and bool(counts["success_by_position"]),
@@ -144,20 +144,14 @@ def _stream_card(config: StreamConfig, info: dict[str, Any], origin: Origin) -> 
     )
 
 
-def _read_filter(root: Path | None) -> dict[str, Any] | None:
-    """What `cronos-streams filter` says that it made a dataset of, and how; None of one that it did not make.
-
-    Raises:
-        ValueError: the file is damaged.
-    """
-    assert root is not None
-    path = root / PROVENANCE
-    if not path.is_file():
-        return None
-    try:
-        return json.loads(path.read_text())
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+def _filters(root: Path) -> list[dict[str, Any]]:
+    """The filters that a dataset came through, the last one first; see `filter_streams`."""
+    found, last = [], read_filter(root)
+    while last:
+        found.append(last | {"flags": _filter_flags(last)})
+        # Notes of earlier releases do not have it.
+        last = last.get("filter_of_source")
+    return found
 
 
 def _filter_flags(filtered: dict[str, Any]) -> list[str]:

@@ -29,6 +29,7 @@ from cronos_lerobot.evaluation.policy_env import (
     check_observations,
     observations_of,
     task_observation_of,
+    trained_renderer,
     trained_scene,
 )
 from cronos_lerobot.evaluation.policy_source import find_policy
@@ -192,7 +193,10 @@ def make_spectator(
     policy_config = _read_policy(policy_path, device)
     features = policy_config.input_features or {}
     where = {"scene": scene} if scene else trained_scene(policy_config.pretrained_path)
-    env_config = CronosEnvConfig(**observations_of(features), **where)
+    observed = observations_of(features)
+    # One from the state sees no pictures.
+    drawn = trained_renderer(policy_config.pretrained_path) if "observation_height" in observed else {}
+    env_config = CronosEnvConfig(**observed, **where, **drawn)
     told = task_observation_of(features, env_config)
     env_config = dataclasses.replace(env_config, task_observation=told)
     return env_config, _spectator(policy_config, env_config)

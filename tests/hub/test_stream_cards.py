@@ -1,12 +1,8 @@
 """The card of a recording whose segments were chosen: by what, and no success where that is what chose them."""
 
 import json
-import sys
-from pathlib import Path
 
 import pytest
-
-sys.path.append(str(Path(__file__).parents[1] / "data"))
 from synthetic_streams import record
 
 from cronos_lerobot.data.stream_filter import PROVENANCE, SegmentFilter, filter_streams
@@ -63,6 +59,17 @@ def test_a_filter_is_told_and_what_it_chose_by_is_no_result(
     assert (FAILS in card, TABLE in card) == (tells, tells)
     # What they began after is none of their outcome.
     assert "| before a segment | times |" in card
+
+
+def test_filters_one_after_the_other_are_all_told(recorded, tmp_path):
+    won, two = tmp_path / "won", tmp_path / "two"
+    filter_streams(StreamDataset("me/stream", recorded), SegmentFilter(success=True), "me/won", won)
+    filter_streams(StreamDataset("me/won", won), SegmentFilter(streams=[0]), "me/two", two)
+    card = card_of(two, tmp_path / "out")
+    assert "of the 12 segments of `me/won`, by `--filter.streams=[0]`." in card
+    assert "kept 12 of the 24 segments of `me/stream`, by `--filter.success=true`." in card
+    assert "They were chosen by how they went" in card
+    assert (FAILS in card, TABLE in card) == (False, False)
 
 
 def test_a_filters_note_that_is_damaged_is_named(recorded, tmp_path):
