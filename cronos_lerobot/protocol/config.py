@@ -72,9 +72,10 @@ class ProtocolConfig:
     scene_reset_interval: int | None = 1280
     """T (H in Algorithm 1): control steps of one stream between two scene resets; a multiple of K.
     80 is episodic training, null never resets the scene."""
-    curriculum: list[tuple[int, int]] = field(default_factory=list)
-    """[[until_step, T], ...]: T up to and including that interaction step (summed over the streams), later
-    scene_reset_interval. The paper's curriculum of a 1.3 M step run is [[650000, 320]]."""
+    curriculum: list[tuple[int, int | None]] = field(default_factory=list)
+    """[[until_step, T], ...]: T up to and including that interaction step (summed over the streams), null
+    for no scene reset, later scene_reset_interval. The paper's curriculum of a 1.3 M step run is
+    [[650000, 320]]."""
     reset_phase: str = "together"
     """When a stream's scene reset is due: `together`, all streams at multiples of T, or `staggered`, each of them
     every T steps as well, but at times that are spread evenly over the streams."""
@@ -135,6 +136,16 @@ class ProtocolConfig:
         if not 1 <= self.num_configurations <= NUM_CONFIGURATIONS:
             raise ValueError(
                 f"protocol.num_configurations must be 1 to {NUM_CONFIGURATIONS}, got {self.num_configurations}."
+            )
+
+    def check_start(self) -> None:
+        """Raise a ValueError, if a run should not begin so; one that is resumed may have begun with it."""
+        if self.takeover_after is None or self.reset_budget is None:
+            return
+        if self.reset_budget < self.takeover_price:
+            raise ValueError(
+                f"protocol.reset_budget={self.reset_budget} pays for no takeover at "
+                f"protocol.takeover_price={self.takeover_price}: give at least as much, or null."
             )
 
     def scene_reset_interval_at(self, interaction_step: int) -> int | None:
@@ -241,8 +252,10 @@ class ProtocolConfig:
     def _check_curriculum(self) -> None:
         last = 0
         for until_step, interval in self.curriculum:
-            self._check_multiple_of_k("curriculum's T", interval)
-            if until_step <= last:
+            if interval is not None:
+                self._check_multiple_of_k("curriculum's T", interval)
+            # Draccus takes null for every number.
+            if until_step is None or until_step <= last:
                 raise ValueError(
                     f"protocol.curriculum must have increasing until_steps > 0, got {self.curriculum}."
                 )

@@ -127,7 +127,8 @@ class CriticSceneReset(SceneReset):
     Of the streams that have failed their last tasks, those come first whose best task has the lowest value, of
     equal ones (a critic that has learned nothing yet) those whose last reset is the longest ago. The budget is
     paced: after a share of the run's steps no more than that share of it is spent. What other kinds of
-    interventions cost is taken from it, too.
+    interventions cost is taken from it, too. Nothing is reset before a learned reset task, which would then have
+    nothing to put back: what may be spent is kept for the next switch.
 
     Raises:
         ValueError: in `bind`, of an agent without values.
@@ -147,6 +148,8 @@ class CriticSceneReset(SceneReset):
 
     def due(self, env: Any, loop: LoopState) -> np.ndarray:
         """Of the streams that are stuck those with the lowest best value, as many as may be spent by now."""
+        if loop.num_reset_tasks and loop.switches % 2:
+            return np.empty(0, np.int64)
         allowance = math.floor(self.budget * loop.n / self._total_steps - loop.b) if self._is_running(loop) else 0
         stuck = self.find_stuck(loop)
         if allowance < 1 or not len(stuck):

@@ -28,6 +28,8 @@ NOT_THE_EXPERIMENT = (
     "log_freq", "save_freq", "save_checkpoint", "keep_checkpoints",
 )  # fmt: skip
 """Top-level fields of a training config in which two runs of one experiment may differ."""
+NOT_THE_POLICY = ("push_to_hub", "repo_id", "private", "tags", "license")
+"""Fields of its policy, as well."""
 
 Evaluation = dict[str, Any]
 Update = dict[str, Any]
@@ -269,6 +271,8 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
     flat = {}
     for run in runs:
         mine = {name: value for name, value in run.config.items() if name not in NOT_THE_EXPERIMENT}
+        if policy := mine.get("policy"):
+            mine["policy"] = {name: value for name, value in policy.items() if name not in NOT_THE_POLICY}
         config = _below_root(_with_defaults(mine))
         key = json.dumps([config, run.changed], sort_keys=True) if config else str(run.folder)
         group = groups.setdefault(key, Group(run.name))

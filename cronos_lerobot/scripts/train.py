@@ -74,7 +74,7 @@ def train(config: CronosTrainConfig) -> None:
 
 
 def push_to_hub(config: CronosTrainConfig, agent: LearningAgent, preprocessor: Any, postprocessor: Any) -> None:
-    """Push what the agent trained to `--policy.repo_id`, if it is given and pushing is on."""
+    """Push what the agent trained to `--policy.repo_id`, if that was given and pushing is on."""
     assert config.policy is not None
     if config.policy.push_to_hub and config.policy.repo_id:
         repository, private = config.policy.repo_id, config.policy.private

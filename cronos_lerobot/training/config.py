@@ -15,7 +15,7 @@ from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.envs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
-from lerobot.utils.constants import OBS_ENV_STATE, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import CHECKPOINTS_DIR, OBS_ENV_STATE, PRETRAINED_MODEL_DIR
 from lerobot_env_cronos import CronosEnvConfig, load_benchmark
 from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
 from lerobot_env_cronos.hub_config import is_of_this_package
@@ -29,7 +29,12 @@ from cronos_lerobot.protocol.experts import check_expert
 from cronos_lerobot.protocol.resets import check_extra_resets
 from cronos_lerobot.protocol.task_orders import check_task_order
 from cronos_lerobot.training.record_config import RecordConfig
-from cronos_lerobot.training.resume import check_resumed, check_types, import_plugins
+from cronos_lerobot.training.resume import (
+    check_resumed,
+    check_types,
+    import_plugins,
+    was_never_told_where_to_push,
+)
 
 EVALUATION_ONLY = {
     "task": "a run trains every task of the scene",
@@ -39,6 +44,9 @@ EVALUATION_ONLY = {
     "end_effector_reset": "of training it is --protocol.end_effector_reset",
 }
 """Flags of the environment that only lerobot-eval reads, each with what holds in place of it."""
+
+HOW_MANY = ("n_episodes", "repetitions")
+"""What commands that are made for studies say of the periodic evaluation, whether or not there is one."""
 
 
 @dataclass
@@ -155,6 +163,13 @@ class CronosTrainConfig:
         """`steps` rounded up to whole policy updates."""
         return -(-self.steps // self.steps_per_update) * self.steps_per_update
 
+    @property
+    def weights_path(self) -> Path | None:
+        """Where the policy is loaded from: a folder or, of the Hub, a repository; None begins from scratch."""
+        if self.checkpoint_path is not None:
+            return self.checkpoint_path / PRETRAINED_MODEL_DIR
+        return None if self.policy is None else self.policy.pretrained_path
+
     def validate(self) -> None:
         """Resolve paths given on the command line, as LeRobot's own training config does.
 
@@ -170,6 +185,9 @@ class CronosTrainConfig:
             raise ValueError(f"--env.type must be cronos to train in, got {self.env.type!r}.")
         if not self.resume:
             self.check_env(self.env)
+            self.protocol.check_start()
+            self._check_unread()
+            self._check_base()
         check_agent(self.algorithm.type)
         given = (flag.removeprefix("--").split("=")[0] for flag in parser.get_cli_overrides("algorithm") or [])
         check_settings(self.algorithm, given, resume=self.resume)
@@ -177,8 +195,12 @@ class CronosTrainConfig:
         if not self.resume and (path := parser.get_path_arg("policy")):
             overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
             self.policy = load_policy_config(str(follow_last(Path(path))), overrides)
+            if not any(override.startswith("--repo_id") for override in overrides):
+                # That of the policy's own, which is not to be pushed over.
+                self.policy.repo_id = None
         if self.policy is None:
             raise ValueError("Choose a policy: --policy.path=<checkpoint or Hub id>, or --policy.type=<name>.")
+        self._check_pushed(self.policy)
         self._show_what_is_read(self.env, self.policy)
         self.job_name = self.job_name or f"{self.env.type}_{self.policy.type}"
         if self.output_dir is None:
@@ -197,6 +219,58 @@ class CronosTrainConfig:
         for name, why in EVALUATION_ONLY.items():
             if (value := getattr(env, name)) != getattr(CronosEnvConfig, name):
                 raise ValueError(f"--env.{name}={value} is of lerobot-eval: {why}.")
+
+    def _check_unread(self) -> None:
+        """Refuse what has no effect beside the others."""
+        if not (self.eval_freq or self.eval_at_interventions):
+            default = PeriodicEvaluationConfig()
+            for name, value in vars(self.eval).items():
+                if name not in HOW_MANY and value != getattr(default, name):
+                    raise ValueError(
+                        f"--eval.{name}={value} is of the periodic evaluation, and there is none with "
+                        "--eval_freq=0: leave it out."
+                    )
+        # What gives both one frequency gives it whether or not they are wanted, as cronos-reproduce does.
+        unread = {
+            "save_freq": self.save_freq not in (CronosTrainConfig.save_freq, self.eval_freq),
+            "keep_checkpoints": self.keep_checkpoints is not None,
+        }
+        for name, is_set in unread.items():
+            if is_set and not self.save_checkpoint:
+                raise ValueError(
+                    f"--{name}={getattr(self, name)} is of checkpoints, and there are none with "
+                    "--save_checkpoint=false: leave it out."
+                )
+
+    def _check_base(self) -> None:
+        """Refuse a config that names, as the policy to begin with, a checkpoint of the run that it is of.
+
+        Earlier versions wrote it when they resumed a run.
+        """
+        file, path = parser.parse_arg("config_path"), self.weights_path
+        if file is None or path is None or parser.get_path_arg("policy"):
+            return
+        checkpoints = _checkpoint_of(file).parent
+        if checkpoints.name == CHECKPOINTS_DIR and Path(path).resolve().is_relative_to(checkpoints):
+            raise ValueError(
+                f"--config_path={file} is of a run that was resumed from {path}, and a new run would begin with "
+                "that: give the policy that it is to begin with as --policy.path."
+            )
+
+    @staticmethod
+    def _check_pushed(policy: PreTrainedConfig) -> None:
+        """Push to a repository that is given; refuse to push nowhere, and what contradicts itself."""
+        overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
+        given = {override.removeprefix("--").split("=")[0] for override in overrides}
+        if "repo_id" in given and policy.repo_id:
+            if "push_to_hub" in given and not policy.push_to_hub:
+                raise ValueError(
+                    f"--policy.repo_id={policy.repo_id} is where the run is pushed to, and "
+                    "--policy.push_to_hub=false pushes nothing: leave one of the two out."
+                )
+            policy.push_to_hub = True
+        elif "push_to_hub" in given and policy.push_to_hub and not policy.repo_id:
+            raise ValueError("--policy.push_to_hub=true pushes nowhere without --policy.repo_id=<user>/<name>.")
 
     @staticmethod
     def _pin_benchmark(env: CronosEnvConfig) -> None:
@@ -228,9 +302,6 @@ class CronosTrainConfig:
                 )
             if self.output_dir is None or Path(self.output_dir).resolve() != run_folder:
                 self.output_dir = run_folder
-        assert self.checkpoint_path is not None
-        if self.policy is not None:
-            self.policy.pretrained_path = self.checkpoint_path / PRETRAINED_MODEL_DIR
 
     @classmethod
     def __get_path_fields__(cls) -> list[str]:
@@ -256,7 +327,17 @@ class CronosTrainConfig:
             config = draccus.parse(cls, file, args=cli_args or [])
         # The file of a resumed run may say it, which asks for nothing.
         config.resume = resume
+        if file.name == TRAIN_CONFIG_NAME:
+            config._forget_what_is_not_its_own(file, cli_args or [])
         return config
+
+    def _forget_what_is_not_its_own(self, file: Path, cli_args: list[str]) -> None:
+        """Of a config that a run has written: a new run is logged to W&B as one of its own."""
+        if not self.resume and parser.parse_arg("wandb.run_id", cli_args) is None:
+            self.wandb.run_id = None
+        is_given = parser.parse_arg("policy.repo_id", cli_args) is not None
+        if self.policy is not None and not is_given and was_never_told_where_to_push(_checkpoint_of(file)):
+            self.policy.repo_id = None
 
     def save_pretrained(self, folder: Path) -> None:
         """Write train_config.json into `folder`."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
-from contextlib import suppress
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -98,11 +99,12 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
         )
     if not config.resume:
         check_demonstrations(config.algorithm, env_config.scene)
-    path = policy_config.pretrained_path
+    path = config.weights_path
     if not (path or getattr(policy_config, "checkpoint", None)):
         logging.warning("Training a policy from scratch: its states are not normalised, its success starts at 0.")
     try:
-        loaded = make_policy(policy_config, env_cfg=env_config)
+        with _pretrained(policy_config, path):
+            loaded = make_policy(policy_config, env_cfg=env_config)
         if config.peft is not None and not config.resume:
             check_adapters(loaded, policy_config)
         policy = wrap(loaded, config.peft)
@@ -120,6 +122,16 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
         raise ValueError(f"a configuration of a processor in {path} is damaged: {error}") from error
 
 
+@contextmanager
+def _pretrained(policy: PreTrainedConfig, path: Path | str | None) -> Generator[None]:
+    """Load from `path`: what is saved of a resumed run names the policy that it began with, and no checkpoint."""
+    base, policy.pretrained_path = policy.pretrained_path, path  # ty: ignore[invalid-assignment]
+    try:
+        yield
+    finally:
+        policy.pretrained_path = base
+
+
 def check_adapters(loaded: Any, policy: PreTrainedConfig) -> None:
     """Check that a policy can get the adapters of `--peft.*`, and that they can go where they are to be pushed.
 
@@ -133,8 +145,8 @@ def check_adapters(loaded: Any, policy: PreTrainedConfig) -> None:
     if policy.push_to_hub and policy.repo_id and Path(str(policy.pretrained_path)).is_dir():
         raise ValueError(
             f"--policy.repo_id={policy.repo_id}: adapters name the policy that they go onto, which is the folder "
-            f"{policy.pretrained_path}. Give --policy.push_to_hub=false; `cronos-publish policy --base_policy=` "
-            "pushes them with the repository that has it."
+            f"{policy.pretrained_path}. Give --policy.push_to_hub=false in its place; `cronos-publish policy "
+            "--base_policy=` pushes them with the repository that has it."
         )
 
 

@@ -218,10 +218,8 @@ def write_manifest(config: CronosTrainConfig, num_processes: int = 1, interactio
 
 def _policy_fingerprint(config: CronosTrainConfig) -> str | None:
     """Of the policy in a folder that this start begins with: two machines may have made other clones of it."""
-    policy = config.policy
-    if policy is None or not policy.pretrained_path or not Path(policy.pretrained_path).is_dir():
-        return None
-    return files_fingerprint(Path(policy.pretrained_path))
+    path = config.weights_path
+    return files_fingerprint(Path(path)) if path is not None and Path(path).is_dir() else None
 
 
 def write_whole(path: Path, text: str) -> None:

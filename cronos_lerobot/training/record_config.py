@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from lerobot.datasets.utils import INFO_PATH
 from lerobot_env_cronos import CronosEnvConfig
 from lerobot_env_cronos.scene.scenes import CONTROL_HZ
 
@@ -79,8 +78,7 @@ class RecordConfig:
         Raises:
             ValueError: more streams are to be recorded than there are, or none; pictures that no video has, or
                 more in a segment than one has; or how is said, but not what.
-            OSError: a dataset cannot be made: it exists, or its folder cannot be written to; or it is not
-                there to be resumed.
+            OSError: a dataset cannot be made: it exists, or its folder cannot be written to.
         """
         if self.repo_id is None:
             # A resumed run keeps to what it began with, which once may have been this.
@@ -99,11 +97,10 @@ class RecordConfig:
                 f"protocol.task_switch_interval must be at most {longest} to be recorded, a video's "
                 f"{MAX_FILE_DURATION_S:.0f} s, got {segment_length}."
             )
-        root = self.root_in(output_dir)
         if resume:
-            if not (root / INFO_PATH).is_file():
-                raise FileNotFoundError(f"no recording to resume in {root}.")
+            # Only the checkpoint knows whether there is one to go on with, or it had stopped.
             return
+        root = self.root_in(output_dir)
         if env.obs_type == "pixels_agent_pos":
             size = (env.observation_height, env.observation_width)
             check_video_size("--env.observation_height and --env.observation_width", size)

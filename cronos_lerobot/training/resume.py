@@ -66,7 +66,7 @@ FLAGS = {
 """Every flag of cronos-train: FOLLOWED or REFUSED by a resumed run. `group.*` stands for the group's others."""
 
 _OWN_FOLDER = ("output_dir", "resume", "policy.pretrained_path")
-"""Always another one than the checkpoint's: the folder may have moved, the weights are the checkpoint's."""
+"""May be others than the checkpoint's: the folder may have moved, and the weights are the checkpoint's."""
 
 
 def rule_of(flag: str) -> str:
@@ -137,6 +137,26 @@ def read_starts(path: Path) -> list[dict[str, Any]]:
         return json.loads(path.read_text())["starts"]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def was_never_told_where_to_push(checkpoint: Path) -> bool:
+    """Whether a run has its policy's `repo_id` from the policy alone that it began with.
+
+    Earlier versions took it from there, and pushed the run over that policy.
+
+    Args:
+        checkpoint: of the run, whose manifest has its commands; without one it is not known.
+
+    Raises:
+        ValueError: the manifest is damaged.
+    """
+    manifest = checkpoint.parent.parent / MANIFEST
+    starts = read_starts(manifest) if manifest.is_file() else []
+    commands = [start.get("command", []) for start in starts]
+    if not commands or any(parser.parse_arg("policy.repo_id", command) for command in commands):
+        return False
+    path, file = (parser.parse_arg(name, commands[0]) for name in ("policy.path", "config_path"))
+    return path is not None and file is None
 
 
 def import_plugins(checkpoint: Path, arguments: Sequence[str]) -> None:

@@ -7,9 +7,16 @@ import pytest
 import torch
 from test_self_imitation import make_pocketvla
 
-from cronos_lerobot.agents.imitation.batches import segment_batch
+from cronos_lerobot.agents.imitation.batches import draw_batch, segment_batch
 from cronos_lerobot.agents.imitation.memory import Segment, SegmentMemory
-from cronos_lerobot.agents.imitation.weights import by_advantage, by_return, effective_share
+from cronos_lerobot.agents.imitation.weights import (
+    Remembered,
+    by_advantage,
+    by_return,
+    discounted_returns,
+    effective_share,
+)
+from cronos_lerobot.processes import Processes
 
 
 def segment(task, rewards):
@@ -22,24 +29,75 @@ def segment(task, rewards):
 
 # With a discount of 1/2 the returns are 1/4, 0 and 1.
 SEGMENTS = [segment("a", [0, 0, 1]), segment("a", [0, 0]), segment("b", [1])]
+RETURNS, TASKS = np.array([0.25, 0, 1]), np.array(["a", "a", "b"])
 
 
 def test_weights_by_hand():
     e = math.e
-    assert by_return(SEGMENTS, 0.5, 0.25) == pytest.approx([e**-3, e**-4, 1])
+    assert discounted_returns(SEGMENTS, 0.5).tolist() == RETURNS.tolist()
+    assert by_return(RETURNS, 0.25) == pytest.approx([e**-3, e**-4, 1])
     # The mean of task a is 1/8; b has one segment, which is as good as its mean.
-    assert by_advantage(SEGMENTS, 0.5, 0.125, 20.0) == pytest.approx([e, 1 / e, 1])
-    assert by_advantage(SEGMENTS, 0.5, 0.125, 2.0) == pytest.approx([2, 1 / e, 1])
-    assert by_advantage(SEGMENTS, 0.5, 1e-6, 20.0) == pytest.approx([20, 0, 1])
+    assert by_advantage(RETURNS, TASKS, 0.125, 20.0) == pytest.approx([e, 1 / e, 1])
+    assert by_advantage(RETURNS, TASKS, 0.125, 2.0) == pytest.approx([2, 1 / e, 1])
+    assert by_advantage(RETURNS, TASKS, 1e-6, 20.0) == pytest.approx([20, 0, 1])
     assert effective_share(np.ones(3), np.array([3, 2, 1])) == pytest.approx(1)
     assert effective_share(np.array([1, 0, 0]), np.array([3, 2, 1])) == pytest.approx(0.5)
+
+
+class BesideOneThatFailed(Processes):
+    """The first of two processes, the second of which has failed at task a once, in four frames."""
+
+    count = 2
+
+    def gather(self, value):
+        return [value, (np.array(["a"]), np.array([4]), np.zeros(1))]
+
+
+def test_processes_weigh_all_that_they_remember():
+    memory = SegmentMemory(2**20)
+    for kept in SEGMENTS:
+        memory.add(kept)
+    everyone = Remembered.of(memory, BesideOneThatFailed(), 0.5)
+    weights = by_return(everyone.returns, 0.25)
+    own, other = everyone.split(weights)
+    e = math.e
+    assert (own, other) == (pytest.approx([e**-3, e**-4, 1]), pytest.approx([e**-4]))
+    # By the frames that can be drawn.
+    assert everyone.masses(weights) == pytest.approx([3 * e**-3 + 2 * e**-4 + 1, 4 * e**-4])
+    # The mean of task a is 1/12 now.
+    advantages = by_advantage(everyone.returns, everyone.instructions, 0.25, 20.0)
+    assert advantages == pytest.approx([e ** (2 / 3), e ** (-1 / 3), 1, e ** (-1 / 3)])
+    # By itself it is a process like any other, and one with nothing has no weights.
+    assert by_return(Remembered.of(memory, Processes(), 0.5).returns, 0.25) == pytest.approx(own)
+    nothing = Remembered.of(SegmentMemory(2**20), BesideOneThatFailed(), 0.5)
+    assert [len(part) for part in nothing.split(by_return(nothing.returns, 0.25))] == [0, 1]
+    assert nothing.masses(np.ones(1)).tolist() == [0, 4]
+
+
+class Demos:
+    """Frames that tell themselves by their task."""
+
+    def batch(self, count, rng):
+        return {"task": ["shown"] * count}
+
+
+@pytest.mark.parametrize(
+    ("remembered", "has_success", "shown"), [(SEGMENTS, True, 3), (SEGMENTS, False, 12), ([], True, 12)]
+)
+def test_demonstrations_are_a_share_once_any_process_has_succeeded(remembered, has_success, shown):
+    memory = SegmentMemory(2**20)
+    for kept in remembered:
+        memory.add(kept)
+    config, rng = make_pocketvla("flow").config, np.random.default_rng(0)
+    batch = draw_batch(memory, Demos(), 0.25, 12, rng, config, has_success=has_success)
+    assert (batch["task"].count("shown"), len(batch["task"])) == (shown, 12)
 
 
 @pytest.mark.parametrize("head", ["gaussian", "flow"])
 def test_drawing_by_weight_is_the_weighted_loss(head):
     """sum w l / sum w with the policy's loss of each sample, as lerobot-train's sample weighting has it."""
     policy = make_pocketvla(head)
-    weights = by_advantage(SEGMENTS, 0.5, 0.125, 20.0)
+    weights = by_advantage(RETURNS, TASKS, 0.125, 20.0)
     memory = SegmentMemory(2**20)
     for kept in SEGMENTS:
         memory.add(kept)

@@ -84,19 +84,36 @@ def test_a_weighted_gradient_is_added_to_the_policys_and_to_no_other():
     assert metrics == pytest.approx({"clone_loss": loss.item(), "clone_grad_norm": expected}, rel=1e-5)
 
 
-class BesideOneWithNothing(Processes):
-    """The first of two processes, the second of which has no success."""
+class Beside(Processes):
+    """The first of two processes, the second of which remembers segments of these tasks and lengths."""
 
     count = 2
 
+    def __init__(self, *others):
+        self.others = others
+
     def concatenate(self, array, axis=0):
         return np.concatenate([array, np.zeros_like(array)], axis)
+
+    def gather(self, value):
+        tasks, lengths = ([other[i] for other in self.others] for i in (0, 1))
+        return [value, (np.array(tasks, str), np.array(lengths, int), np.zeros(len(tasks)))]
+
+
+def test_instructions_count_alike_over_all_processes():
+    """Of task a six frames of eight are here, of task b all elsewhere: three quarters of one of two tasks."""
+    cloning = make_cloning(CloneablePolicy(), [segment("a", 6)])
+    cloning._processes = Beside(("a", 2), ("b", 4))
+    cloning.begin_update(3)
+    assert cloning._weights == pytest.approx([1 / 8])
+    # The mean of both processes' losses, 0.75 / 2 times this one and 1.25 / 2 times the other's.
+    assert cloning._share == pytest.approx(0.75)
 
 
 def test_the_weight_is_that_of_the_processes_with_something_to_clone():
     policy = CloneablePolicy()
     cloning = make_cloning(policy, [segment(TASKS[0].instruction, 6)])
-    cloning._processes = BesideOneWithNothing()
+    cloning._processes = Beside()
     cloning.begin_update(3)
     cloning.add_gradients([*policy.actor.parameters()])
     twin = copy.deepcopy(policy)
@@ -109,11 +126,12 @@ def test_the_weight_is_that_of_the_processes_with_something_to_clone():
 def test_tasks_are_drawn_equally_often_and_their_frames_alike():
     # Of 20 frames 15 are of task a, 5 of task b.
     segments = [segment("a", 5), segment("a", 10), segment("b", 5)]
-    assert by_task(segments, np.array([5, 10, 5])).tolist() == pytest.approx([1 / 15, 1 / 15, 1 / 5])
+    tasks = np.array(["a", "a", "b"])
+    assert by_task(tasks, np.array([5, 10, 5])).tolist() == pytest.approx([1 / 15, 1 / 15, 1 / 5])
     memory = SegmentMemory(max_bytes=2**20)
     for kept in segments:
         memory.add(kept)
-    weights = by_task(memory.segments, memory.lengths)
+    weights = by_task(tasks, memory.lengths)
     drawn = [(s.instruction, len(s), f) for s, f in memory.draw(6000, np.random.default_rng(0), weights)]
     frames = [("a", 5, i) for i in range(5)] + [("a", 10, i) for i in range(10)] + [("b", 5, i) for i in range(5)]
     assert set(drawn) == set(frames)

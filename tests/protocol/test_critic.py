@@ -324,6 +324,17 @@ def test_learned_reset_tasks_say_nothing_about_being_stuck():
     assert ages == [0, 1, 2, 3] * 3
 
 
+def test_nothing_is_reset_before_a_learned_reset_task():
+    """One more reset for three segments of twelve: what falls due after the third and the ninth waits for one."""
+    env, loop, events = critic_resets(48, 4, np.zeros(4), num_streams=2, failures=1, learned_reset=True)
+    assert scene_resets(env) == [[0], [1], [0]]
+    ends = [event for event in events if isinstance(event, SegmentEnd)]
+    assert [int(end.segments_since_reset[0]) for end in ends] == [0, 1, 2, 3, 0, 1, 2, 3, 4, 5, 0, 1]
+    assert [int(end.segments_since_reset[1]) for end in ends] == [0, 1, 2, 3, 4, 5, 0, 1, 2, 3, 4, 5]
+    assert all(end.task[i] < len(TASKS) for end in ends for i in (0, 1) if end.segments_since_reset[i] == 0)
+    assert loop.b == 3
+
+
 def test_best_value_leaves_out_what_is_complete():
     env = Still(2, [[True, True, False, False], [True] * 4])
     loop = TaskSet(TASKS).new_loop(2)

@@ -183,6 +183,23 @@ def test_curriculum_spends_its_resets_early():
     assert loop.b == 64 * (early + late)
 
 
+@pytest.mark.parametrize(
+    ("interval", "curriculum", "resets"),
+    [
+        (4, [(16, None)], [12, 16, 20]),  # two streams: n = 16 is t = 8
+        (None, [(16, 4)], [4, 8]),
+        (4, [(8, 4), (24, None)], [4, 16, 20]),
+    ],
+)
+def test_a_curriculum_may_reset_never_for_a_while(interval, curriculum, resets):
+    config = protocol(scene_reset_interval=interval, curriculum=curriculum)
+    _, _, loop, events = run(config, 40)
+    begins = [e.t for e in events if isinstance(e, Step) and (e.preceded_by == Intervention.SCENE_RESET).all()]
+    # The one after the last segment has no step that follows.
+    assert begins + [20] * (20 in resets) == resets
+    assert loop.interventions[:, Intervention.SCENE_RESET].tolist() == [len(resets)] * 2
+
+
 def test_budget_stops_the_run():
     _, _, loop, _ = run(protocol(reset_budget=3), steps=1000)
     assert loop.b == 4  # two streams are reset together
@@ -242,6 +259,7 @@ def test_loop_state_survives_json():
         ({"scene_reset_interval": 5}, "scene_reset_interval must be a positive multiple"),
         ({"curriculum": [(100, 3)]}, "curriculum"),
         ({"curriculum": [(100, 4), (50, 8)]}, "increasing"),
+        ({"curriculum": [(None, 4)]}, "increasing"),
         ({"reset_budget": 0}, "reset_budget"),
         ({"reward": "dense"}, "difference"),
         ({"num_configurations": 0}, "num_configurations must be 1 to 64"),

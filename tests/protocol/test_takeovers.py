@@ -228,6 +228,15 @@ def test_settings_that_nothing_reads_are_refused(options, message):
     protocol(takeover_after=1, takeover_budget=3, takeover_price=3)
 
 
+def test_a_run_does_not_begin_with_a_budget_that_pays_for_no_takeover():
+    """One that is resumed may have it."""
+    with pytest.raises(ValueError, match=r"reset_budget=2 pays for no takeover at protocol\.takeover_price=3"):
+        protocol(takeover_after=1, takeover_price=3, reset_budget=2).check_start()
+    protocol(takeover_after=1, takeover_price=3, reset_budget=3).check_start()
+    protocol(takeover_after=1, takeover_price=3).check_start()
+    protocol(reset_budget=1).check_start()
+
+
 def test_unknown_experts_and_taken_names_are_refused():
     with pytest.raises(ValueError, match=r"must be one of \['guide', 'scripted', 'single guide'\], got 'nobody'"):
         check_expert("nobody")

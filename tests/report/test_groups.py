@@ -29,6 +29,16 @@ def test_resumed_run_stays_in_its_group(tmp_path):
     assert len(group_runs(find_runs([tmp_path]).training)) == 1
 
 
+def test_where_a_policy_is_pushed_to_is_not_the_experiment(tmp_path):
+    for seed, pushed in enumerate((None, "me/first")):
+        manifest = write_training_run(tmp_path / str(seed), seed=seed) / "manifest.json"
+        content = json.loads(manifest.read_text())
+        content["starts"][0]["config"]["policy"] = {"repo_id": pushed, "push_to_hub": bool(pushed), "hidden": 8}
+        manifest.write_text(json.dumps(content))
+    (group,) = group_runs(find_runs([tmp_path]).training)
+    assert len(group.runs) == 2
+
+
 def test_a_run_from_before_a_flag_is_a_seed_of_those_that_have_its_default(tmp_path):
     for seed, starts in enumerate((None, "random", "learnable")):
         manifest = write_training_run(tmp_path / str(seed), seed=seed, interval=160) / "manifest.json"

@@ -13,6 +13,7 @@ from dummies import DummyEnv, DummyPolicy, DummyPolicyConfig, identity_processor
 from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from safetensors.torch import load_file
+from test_cronos_train import OBSERVATIONS, SMALL
 
 from cronos_lerobot.agents.base import ActionSample
 from cronos_lerobot.agents.ppo.config import PPOConfig
@@ -112,12 +113,21 @@ def test_a_failed_recording_keeps_what_was_flushed_and_is_not_resumed(tmp_path, 
     for name, tensor in weights(tmp_path / "whole").items():
         assert (tensor == weights(tmp_path / "run")[name]).all()
 
-    resumed = config(tmp_path / "run", steps=6 * 8 * STREAMS)
-    resumed.checkpoint_path = (tmp_path / "run/checkpoints/last").resolve()
-    with caplog.at_level(logging.WARNING):
-        train(resumed)
-    assert "ended before the checkpoint and is not resumed" in caplog.text
+    def resume(steps):
+        resumed = config(tmp_path / "run", steps=steps)
+        resumed.checkpoint_path = (tmp_path / "run/checkpoints/last").resolve()
+        resumed.record.check(tmp_path / "run", STREAMS, CronosEnvConfig(), 4, resume=True)
+        with caplog.at_level(logging.WARNING):
+            train(resumed)
+        assert "ended before the checkpoint and is not resumed" in caplog.text
+        caplog.clear()
+
+    resume(6 * 8 * STREAMS)
     assert len(StreamDataset("me/stream", tmp_path / "run/streams", streaming=True).segments) == 2 * STREAMS
+    # Somebody has made room.
+    shutil.rmtree(tmp_path / "run/streams")
+    resume(8 * 8 * STREAMS)
+    assert not (tmp_path / "run/streams").exists()
 
 
 def cronos_train(monkeypatch, *arguments):
@@ -190,9 +200,17 @@ def test_pictures_that_no_video_has_are_refused_before_anything_is_made(tmp_path
     assert not (tmp_path / "run").exists()
 
 
-def test_resuming_without_the_recording_is_told(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no recording to resume in"):
-        RecordConfig("me/stream").check(tmp_path, 4, CronosEnvConfig(), 80, resume=True)
+def test_resuming_without_the_recording_is_told(tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    flags = (*SMALL, *OBSERVATIONS["state"], "--record.repo_id=me/stream", f"--output_dir={run}")
+    cronos_train(monkeypatch, *flags, "--steps=16")
+    metrics = (run / "metrics.jsonl").read_bytes()
+    shutil.rmtree(run / "streams")
+    file = run / "checkpoints/last/pretrained_model/train_config.json"
+    with pytest.raises(SystemExit, match=rf"^error: no LeRobotDataset to resume in {run / 'streams'}$"):
+        cronos_train(monkeypatch, "--resume=true", f"--config_path={file}", "--steps=32")
+    assert (run / "metrics.jsonl").read_bytes() == metrics
+    assert not (run / "streams").exists()
 
 
 def test_filmed_streams_are_a_dataset_of_their_own(tmp_path):

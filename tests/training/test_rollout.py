@@ -59,6 +59,7 @@ def test_statistics_go_on_from_a_checkpoint():
         ({"scene_reset_interval": 12}, 3),  # 24 steps are two periods and three updates
         ({"scene_reset_interval": None}, 2),  # a cycle of four tasks
         ({"scene_reset_interval": 4, "curriculum": [(1000, 16)]}, 2),
+        ({"scene_reset_interval": 4, "curriculum": [(1000, None)]}, 2),
     ],
 )
 def test_the_consoles_success_is_that_of_whole_reset_periods(options, updates):

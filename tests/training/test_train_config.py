@@ -11,7 +11,7 @@ from cronos_lerobot.agents.ppo.config import PaperPPOConfig, PPOConfig
 from cronos_lerobot.evaluation.policy_source import load_policy_config
 from cronos_lerobot.scripts import train as script
 from cronos_lerobot.training import config
-from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.config import CronosTrainConfig, PeriodicEvaluationConfig
 
 
 def parse(*arguments):
@@ -31,6 +31,8 @@ def test_flags_of_the_protocol_and_the_algorithm():
     assert cfg.protocol.scene_reset_interval is None
     assert cfg.protocol.scene_reset_interval_at(650_000) == 320
     assert cfg.protocol.scene_reset_interval_at(650_001) is None
+    without_at_first = parse("--protocol.curriculum=[[650000,null]]").protocol
+    assert [without_at_first.scene_reset_interval_at(n) for n in (650_000, 650_001)] == [None, 1280]
     assert isinstance(cfg.algorithm, PaperPPOConfig)
     assert (cfg.algorithm.policy_lr, cfg.algorithm.minibatch_size) == (0.5, 8)
     assert cfg.record.num_streams == "all"
@@ -76,6 +78,7 @@ def test_steps_are_rounded_up_to_whole_updates():
         (["--eval.n_episodes=65"], "1 to 64"),
         (["--eval.split=test"], "held_out"),
         (["--protocol.update_interval=100"], "multiple of protocol.task_switch_interval=80"),
+        (["--protocol.curriculum=[[null,320]]"], "must have increasing until_steps > 0"),
         (["--protocol.extra_resets=[nobody]"], "registered"),
         (["--protocol.task_order=sorted"], "heuristic"),
         (["--record.streams=some"], "number or 'all'"),
@@ -96,6 +99,28 @@ def test_steps_are_rounded_up_to_whole_updates():
         (
             ["--env.type=cronos", "--env.task=put the ketchup bottle on the cloth"],
             "--env.task=put the ketchup bottle on the cloth is of lerobot-eval: a run trains every task",
+        ),
+        (
+            ["--env.type=cronos", "--eval_freq=0", "--eval.split=held_out"],
+            "--eval.split=held_out is of the periodic evaluation, and there is none with --eval_freq=0: leave",
+        ),
+        (["--env.type=cronos", "--eval_freq=0", "--eval.seed=3"], "--eval.seed=3 is of the periodic evaluation"),
+        (
+            ["--env.type=cronos", "--save_checkpoint=false", "--save_freq=1000"],
+            "--save_freq=1000 is of checkpoints, and there are none with --save_checkpoint=false: leave it out",
+        ),
+        (
+            ["--env.type=cronos", "--save_checkpoint=false", "--keep_checkpoints=2"],
+            "--keep_checkpoints=2 is of checkpoints",
+        ),
+        (
+            [
+                "--env.type=cronos",
+                "--protocol.takeover_after=2",
+                "--protocol.takeover_price=20",
+                "--protocol.reset_budget=10",
+            ],
+            "reset_budget=10 pays for no takeover at protocol.takeover_price=20",
         ),
         (["--resume=true"], "Resuming needs --config_path="),
         (["--resume=true", "--config_path=/nowhere/train_config.json"], "--config_path=/nowhere/.*: no such file"),
@@ -143,6 +168,22 @@ def test_what_is_missing_is_asked_for(tmp_path):
         CronosTrainConfig(env=CronosEnvConfig(), resume=True).validate()
     with pytest.raises(FileExistsError, match="--resume=true"):
         CronosTrainConfig(env=CronosEnvConfig(), policy=DummyPolicyConfig(), output_dir=tmp_path).validate()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"eval_freq": 0, "eval": PeriodicEvaluationConfig(n_episodes=16, repetitions=2)},
+        {"eval_freq": 0, "eval_at_interventions": [1000], "eval": PeriodicEvaluationConfig(split="held_out")},
+        {"save_checkpoint": False},
+        {"save_checkpoint": False, "save_freq": 51_200, "eval_freq": 51_200},
+        {"save_freq": 1000, "keep_checkpoints": 2},
+    ],
+)
+def test_what_has_an_effect_or_is_given_by_every_command_of_a_study_is_taken(options):
+    """They end at the policy, which is missing."""
+    with pytest.raises(ValueError, match="Choose a policy"):
+        CronosTrainConfig(env=CronosEnvConfig(), **options).validate()
 
 
 def test_help_teaches(monkeypatch, capsys):

@@ -26,7 +26,7 @@ from cronos_lerobot.agents.history import observation_steps
 from cronos_lerobot.agents.imitation.batches import Demonstrations, draw_batch
 from cronos_lerobot.agents.imitation.config import ImitationConfig
 from cronos_lerobot.agents.imitation.memory import OpenSegments, SegmentMemory, own_share
-from cronos_lerobot.agents.imitation.weights import by_advantage, by_return, effective_share
+from cronos_lerobot.agents.imitation.weights import Remembered, by_advantage, by_return, effective_share
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.agents.registry import AgentContext, register_agent
 from cronos_lerobot.agents.state import to_arrays, to_tensors
@@ -69,7 +69,8 @@ class ImitationAgent(LearningAgent):
         drop_last = getattr(policy_config, "drop_n_last_frames", 0) or 0
         self.memory = SegmentMemory(int(self.config.memory_gib * 2**30), drop_last)
         self._weights: np.ndarray | None = None
-        self._is_warm = False
+        self._masses: np.ndarray | None = None
+        self._has_success = self._is_warm = False
         self._demos = None
         if self.config.demos_share:
             beside = context.observation_shapes if self.config.demos_share < 1 else None
@@ -118,18 +119,19 @@ class ImitationAgent(LearningAgent):
         metrics |= self._weigh()
         # Failed segments that are remembered may push successes out again.
         self._is_warm |= bool(found[:, 0].sum() >= self.config.warmup_segments)
+        self._has_success = bool(found[:, 0].any())
         # All processes take a step, or none; one that has nothing to clone takes that of the others.
-        has_batch = (found[:, 2] > 0) & found[:, 0].any() if self._demos is None else np.ones(len(found), bool)
-        if not self._is_warm or not has_batch.any():
+        shares = self._shares(found[:, 2] > 0)
+        if not self._is_warm or not shares.any():
             return metrics | {"optimizer_steps": 0.0}
         with self._stopwatch("update"):
             self._learner.train()
-            own, share = bool(has_batch[self._processes.rank]), 1 / has_batch.mean()
-            steps = [self._step(share if own else None) for _ in range(self.config.steps_per_update)]
+            own = float(shares[self._processes.rank])
+            steps = [self._step(own) for _ in range(self.config.steps_per_update)]
             self._learner.eval()
             # Running means, as those of batch normalization, are each process's own of the batches that it had.
             for module in dict.fromkeys((self._learner, self.policy)):
-                self._processes.copy_from(int(has_batch.argmax()), module.buffers())
+                self._processes.copy_from(int(shares.argmax()), module.buffers())
         means = np.nanmean(self._processes.concatenate(np.array([steps])), axis=(0, 1))
         metrics |= {"loss": float(means[0]), "grad_norm": float(means[1])}
         return metrics | {"optimizer_steps": float(len(steps))}
@@ -211,43 +213,58 @@ class ImitationAgent(LearningAgent):
         return {name: column for name, column in observation_columns(observation).items() if name in inputs}
 
     def _weigh(self) -> dict[str, float]:
-        """Weigh what is remembered; returns metrics of all processes, none of memory that is not weighted."""
+        """Weigh what all processes remember; returns metrics of it, none of memory that is not weighted."""
         config, memory = self.config, self.memory
         if config.weighting == "none":
             return {}
-        failed, share = sum(not segment.success for segment in memory.segments), 0.0
-        self._weights = None
-        if len(memory):
+        failed = sum(not segment.success for segment in memory.segments)
+        metrics = {"failed_segments": float(sum(self._processes.gather(failed))), "effective_share": 0.0}
+        everyone = Remembered.of(memory, self._processes, config.gamma)
+        self._weights = self._masses = None
+        if len(everyone.returns):
             if config.weighting == "return":
-                self._weights = by_return(memory.segments, config.gamma, config.weighting_beta)
+                weights = by_return(everyone.returns, config.weighting_beta)
             else:
-                self._weights = by_advantage(
-                    memory.segments, config.gamma, config.weighting_beta, config.max_weight
+                weights = by_advantage(
+                    everyone.returns, everyone.instructions, config.weighting_beta, config.max_weight
                 )
-            share = effective_share(self._weights, memory.lengths)
-        found = self._processes.concatenate(np.array([[float(failed), share]]))
-        return {"failed_segments": float(found[:, 0].sum()), "effective_share": float(found[:, 1].mean())}
+            self._weights = everyone.split(weights)[self._processes.rank]
+            self._masses = everyone.masses(weights)
+            metrics["effective_share"] = effective_share(weights, everyone.lengths)
+        return metrics
+
+    def _shares(self, has_segments: np.ndarray) -> np.ndarray:
+        """(processes,) by how much the loss of each counts, 1 in the mean; 0 of one that has nothing to clone.
+
+        A batch of a process is drawn by the weights of its own segments, which may be small beside the others'.
+        """
+        if self._masses is not None and self._has_success:
+            return self._masses / self._masses.mean()
+        if self._demos is not None:
+            return np.ones(len(has_segments))
+        has_batch = has_segments & self._has_success
+        return has_batch / has_batch.mean() if has_batch.any() else np.zeros(len(has_batch))
 
     def _batch(self) -> Batch:
         config = self.config
         batch = draw_batch(
             self.memory, self._demos, config.demos_share, config.batch_size, self._rng, self.policy.config,
-            self._weights,
+            self._weights, has_success=self._has_success,
         )  # fmt: skip
         assert batch is not None
         return batch
 
-    def _step(self, share: float | None) -> tuple[float, float]:
+    def _step(self, share: float) -> tuple[float, float]:
         """One optimizer step, as `lerobot-train` takes it, with the mean gradient of the processes with a batch.
 
         Args:
-            share: all processes by those with a batch; None if this one has none.
+            share: by how much this process's loss counts, see `_shares`; one of 0 takes no batch.
 
         Returns:
             The loss, NaN without a batch, and the gradient's norm.
         """
         value = float("nan")
-        if share is not None:
+        if share:
             loss, _ = self._learner.forward(self._processors.preprocessor(self._batch()))
             if not torch.isfinite(loss):
                 raise FloatingPointError(f"The loss is {loss.item()}.")

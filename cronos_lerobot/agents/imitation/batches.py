@@ -183,10 +183,12 @@ def draw_batch(
     rng: np.random.Generator,
     config: PreTrainedConfig,
     weights: np.ndarray | None = None,
+    *,
+    has_success: bool = True,
 ) -> Batch | None:
     """Return `size` frames of a memory and, by a share, of demonstrations; None if there is nothing to draw.
 
-    As long as no success is remembered, all of them are of the demonstrations.
+    As long as nothing is remembered, or no success, all of them are of the demonstrations.
 
     Args:
         memory: own segments.
@@ -196,11 +198,11 @@ def draw_batch(
         rng: draws them.
         config: of the policy.
         weights: see `SegmentMemory.draw`.
+        has_success: whether a success is remembered, by any process.
     """
     num_demos, parts = 0, []
     if demos is not None:
-        has_success = any(segment.success for segment in memory.segments)
-        num_demos = round(demos_share * size) if has_success else size
+        num_demos = round(demos_share * size) if has_success and len(memory) else size
     if demos is not None and num_demos:
         parts.append(demos.batch(num_demos, rng))
     if num_demos < size and len(memory):

@@ -12,7 +12,7 @@ from torch import Tensor
 from cronos_lerobot.agents.base import Columns
 from cronos_lerobot.agents.imitation.batches import Demonstrations, draw_batch
 from cronos_lerobot.agents.imitation.memory import OpenSegments, Segment, SegmentMemory, own_share
-from cronos_lerobot.agents.imitation.weights import by_task
+from cronos_lerobot.agents.imitation.weights import Remembered, by_task
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.processes import Processes
@@ -34,7 +34,7 @@ class SelfImitation:
         config: see PPOConfig; its `self_imitation.coef` is above 0.
         num_streams: N of this process.
         rng: draws what is cloned.
-        processes: each clones the successes of its own streams.
+        processes: each clones the successes of its own streams, by weights of all of them.
         shapes: of what the run observes.
 
     Raises:
@@ -97,12 +97,14 @@ class SelfImitation:
         """Forget what is too old; returns what all processes have: segments, frames, mean age [updates]."""
         memory = self.memory
         memory.forget(num_updates - self.config.max_age)
-        self._weights = by_task(memory.segments, memory.lengths) if len(memory) else None
+        everyone = Remembered.of(memory, self._processes)
+        weights = by_task(everyone.instructions, everyone.lengths)
+        self._weights = everyone.split(weights)[self._processes.rank] if len(memory) else None
+        # Of an instruction that all succeed under each has a part; one that has nothing adds nothing.
+        masses = everyone.masses(weights)
+        self._share = float(masses[self._processes.rank] / masses.mean()) if masses.any() else 1.0
         ages = sum(num_updates - segment.update for segment in memory.segments)
         each = self._processes.concatenate(np.array([[len(memory), memory.num_frames, ages]]))
-        # The mean of all processes' gradients is that of those with a batch.
-        if self._demos is None and each[:, 0].any():
-            self._share = 1 / float((each[:, 0] > 0).mean())
         found = each.sum(axis=0)
         metrics = {"memory_segments": float(found[0]), "memory_frames": float(found[1])}
         return metrics | ({"memory_age": float(found[2] / found[0])} if found[0] else {})
