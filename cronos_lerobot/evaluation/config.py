@@ -21,12 +21,7 @@ from lerobot_env_cronos.hub_config import is_of_this_package
 
 from cronos_lerobot.data.video import check_video_size
 from cronos_lerobot.evaluation.plan import Part, make_parts
-from cronos_lerobot.evaluation.policy_env import (
-    check_observations,
-    observations_of,
-    trained_renderer,
-    trained_scene,
-)
+from cronos_lerobot.evaluation.policy_env import check_observations, trained_observations, trained_scene
 from cronos_lerobot.evaluation.policy_source import (
     PolicySource,
     files_fingerprint,
@@ -220,10 +215,7 @@ class CronosEvalConfig:
         if self.policy is None:
             derived["obs_type"] = "environment_state_agent_pos"
         else:
-            derived = observations_of(self.policy.input_features or {})
-            # Of one that takes no pictures it would draw the videos alone.
-            if "observation_height" in derived:
-                derived |= trained_renderer(self.policy.pretrained_path)
+            derived = trained_observations(self.policy.input_features or {}, self.policy.pretrained_path)
             if env.benchmark is None and "scene" not in given:
                 derived |= trained_scene(self.policy.pretrained_path)
         for name, value in derived.items():

@@ -80,6 +80,13 @@ def trained_renderer(path: Path | None) -> dict[str, str]:
     return {"renderer": renderer} if renderer else {}
 
 
+def trained_observations(features: Features, path: Path | None) -> dict[str, Any]:
+    """`observations_of`, and of a policy that takes pictures the renderer of those that it learned from."""
+    observations = observations_of(features)
+    # Of one that takes none it would draw the videos alone.
+    return observations | (trained_renderer(path) if "observation_height" in observations else {})
+
+
 def _train_config(path: Path | None) -> dict[str, Any]:
     file = Path(path or "") / TRAIN_CONFIG_NAME
     return json.loads(file.read_text()) if file.is_file() else {}

@@ -24,7 +24,7 @@ class EvaluationRun:
     """By instruction, or ordering of a sequential suite: one flag for each episode."""
     videos: dict[str, list[Path]]
     """By instruction: the videos of the first episodes, in their order."""
-    num_configurations: int = 64
+    num_configurations: int
     """Of the split. Episodes begin with one after the other, and anew with the first."""
 
     @property

@@ -13,7 +13,8 @@ from typing import Any
 import draccus
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
-from lerobot_env_cronos import check_environment_id
+from lerobot_env_cronos import check_environment_id, load_benchmark
+from lerobot_env_cronos.config import DEFAULT_SCENE
 
 from cronos_lerobot.evaluation.store import RESULTS
 from cronos_lerobot.protocol.config import ProtocolConfig
@@ -138,21 +139,22 @@ class FoundRuns:
     the evaluations of runs that are not `alike`."""
 
 
-def find_runs(folders: Iterable[Path], scene: str = "kitchen_2x2", benchmark: str | None = None) -> FoundRuns:
+def find_runs(folders: Iterable[Path], scene: str | None = None, benchmark: str | None = None) -> FoundRuns:
     """Read the runs of cronos-train, lerobot-eval and cronos-eval in `folders` and below them, each once.
 
     Args:
         folders: where to look.
-        scene: of the evaluations of lerobot-eval, whose files do not name it.
+        scene: of the evaluations of lerobot-eval, whose files do not name it; that of the runs by default.
         benchmark: of the same; the package's by default.
 
     Raises:
         FileNotFoundError: a folder is missing or holds no run.
-        ValueError: of all that they hold nothing can be read.
+        ValueError: of all that they hold nothing can be read, or there is no such scene or benchmark.
     """
     training: dict[Path, TrainingRun] = {}
     evaluation: dict[Path, list[EvaluationRun]] = {}
     suites: dict[Path, None] = {}
+    numbered: list[Path] = []
     left_out: dict[Path, str] = {}
 
     def keep(table: dict[Path, Any], path: Path, read: Callable[[], Any]) -> None:
@@ -170,8 +172,7 @@ def find_runs(folders: Iterable[Path], scene: str = "kitchen_2x2", benchmark: st
         }
         for path in files[METRICS]:
             keep(training, path, lambda path=path: read_training_run(path.parent))
-        for path in files[EVAL_INFO]:
-            keep(evaluation, path, lambda path=path: read_evaluation_runs(path.parent, scene, benchmark))
+        numbered += files[EVAL_INFO]
         results = [path for path in files[RESULTS] if is_results(path)]
         for path in results:
             keep(suites, path, lambda path=path: check_results(path))
@@ -180,11 +181,23 @@ def find_runs(folders: Iterable[Path], scene: str = "kitchen_2x2", benchmark: st
                 f"{folder} has no {METRICS} of cronos-train, no {RESULTS} of cronos-eval and no {EVAL_INFO} of"
                 " lerobot-eval."
             )
+    scene = scene or scene_of(training.values())
+    if numbered:
+        # What is wrong with it is not the folders' fault.
+        load_benchmark(benchmark, scene)
+    for path in numbered:
+        keep(evaluation, path, lambda path=path: read_evaluation_runs(path.parent, scene, benchmark))
     if left_out and not (training or evaluation or suites):
         raise ValueError("; ".join(left_out.values()))
     evaluations = [run for runs in evaluation.values() for run in runs]
     said = [*left_out.values(), *(run.left_out for run in training.values() if run.left_out)]
     return FoundRuns(list(training.values()), evaluations, read_suite_runs(suites), said)
+
+
+def scene_of(runs: Iterable[TrainingRun]) -> str:
+    """The scene of all of them; the default one if they are of several, or say none."""
+    scenes = {str(env["scene"]) for run in runs if (env := run.config.get("env") or {}).get("scene")}
+    return scenes.pop() if len(scenes) == 1 else DEFAULT_SCENE
 
 
 def files_called(folder: Path, name: str) -> Iterator[Path]:

@@ -27,9 +27,8 @@ from cronos_lerobot.evaluation.actors import Actor, load_actor
 from cronos_lerobot.evaluation.config import SuitesConfig
 from cronos_lerobot.evaluation.policy_env import (
     check_observations,
-    observations_of,
     task_observation_of,
-    trained_renderer,
+    trained_observations,
     trained_scene,
 )
 from cronos_lerobot.evaluation.policy_source import find_policy
@@ -193,10 +192,7 @@ def make_spectator(
     policy_config = _read_policy(policy_path, device)
     features = policy_config.input_features or {}
     where = {"scene": scene} if scene else trained_scene(policy_config.pretrained_path)
-    observed = observations_of(features)
-    # One from the state sees no pictures.
-    drawn = trained_renderer(policy_config.pretrained_path) if "observation_height" in observed else {}
-    env_config = CronosEnvConfig(**observed, **where, **drawn)
+    env_config = CronosEnvConfig(**trained_observations(features, policy_config.pretrained_path), **where)
     told = task_observation_of(features, env_config)
     env_config = dataclasses.replace(env_config, task_observation=told)
     return env_config, _spectator(policy_config, env_config)

@@ -90,25 +90,20 @@ def make_report(
         FileNotFoundError: a folder holds no run, or a video is missing.
         ValueError: there is no such scene, or nothing of lerobot-eval in `before` or `after`.
     """
-    from lerobot.utils.import_utils import register_third_party_plugins
-    from lerobot_env_cronos import load_benchmark
-    from lerobot_env_cronos.scene.scenes import SCENES
+    from lerobot_env_cronos.benchmark.load import benchmark_scene, load_benchmark
 
     from cronos_lerobot.report.comparisons import at_their_end
     from cronos_lerobot.report.page import Report
-    from cronos_lerobot.report.runs import FoundRuns, find_runs, group_runs
+    from cronos_lerobot.report.runs import FoundRuns, find_runs, group_runs, scene_of
 
-    if benchmark:
-        # Of a scene that a package of its own registers, perhaps.
-        register_third_party_plugins()
-    scene = scene or _find_scene(runs, benchmark)
-    if scene not in SCENES:
-        register_third_party_plugins()
-    load_benchmark(benchmark, scene)
-    found, old, new = (
-        find_runs(folders, scene, benchmark) if folders else FoundRuns([], [], [], [])
-        for folders in (runs, before, after)
-    )
+    if benchmark and scene is None:
+        scene = benchmark_scene(benchmark)
+    if scene is not None:
+        load_benchmark(benchmark, scene)
+    nothing = FoundRuns([], [], [], [])
+    found = find_runs(runs, scene, benchmark) if runs else nothing
+    scene = scene or scene_of(found.training)
+    old, new = (find_runs(folders, scene, benchmark) if folders else nothing for folders in (before, after))
     for flag, folders, read in (("--before", before, old), ("--after", after, new)):
         if folders and not read.evaluations:
             raise ValueError(
@@ -128,19 +123,6 @@ def make_report(
     )
 
 
-def _find_scene(runs: list[Path], benchmark: str | None) -> str:
-    """The scene that nobody named."""
-    from lerobot_env_cronos.benchmark.load import benchmark_scene
-
-    from cronos_lerobot.report.runs import find_runs
-
-    if benchmark:
-        return benchmark_scene(benchmark)
-    trained = find_runs(runs).training if runs else ()
-    scenes = {str(env["scene"]) for run in trained if (env := run.config.get("env") or {}).get("scene")}
-    return scenes.pop() if len(scenes) == 1 else "kitchen_2x2"
-
-
 def main() -> None:
     """Entry point of `cronos-report`."""
     if sys.argv[1:2] == ["compare"]:
@@ -150,6 +132,10 @@ def main() -> None:
     args = parser.parse_args()
     if not args.runs + args.before + args.after:
         parser.error("name at least one run folder; cronos-report --help has examples")
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    # Scenes that are installed by themselves.
+    register_third_party_plugins()
     try:
         report = make_report(
             args.runs,

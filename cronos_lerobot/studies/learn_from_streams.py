@@ -81,7 +81,8 @@ def make_steps(
 def _train(scale: Scale, base: Path, run: Path) -> Step:
     step = train_step(scale, base, run)
     changed = {"--record.streams": "all", "--record.repo_id": STREAMS, "--eval_freq": 0}
-    return replace(step, command=_with(step.command, changed))
+    command = [flag for flag in step.command if not flag.startswith("--eval.")]
+    return replace(step, command=_with(command, changed))
 
 
 def _filter(streams: Path, output: Path) -> Step:

@@ -45,9 +45,6 @@ EVALUATION_ONLY = {
 }
 """Flags of the environment that only lerobot-eval reads, each with what holds in place of it."""
 
-HOW_MANY = ("n_episodes", "repetitions")
-"""What commands that are made for studies say of the periodic evaluation, whether or not there is one."""
-
 
 @dataclass
 class PeriodicEvaluationConfig:
@@ -225,7 +222,7 @@ class CronosTrainConfig:
         if not (self.eval_freq or self.eval_at_interventions):
             default = PeriodicEvaluationConfig()
             for name, value in vars(self.eval).items():
-                if name not in HOW_MANY and value != getattr(default, name):
+                if value != getattr(default, name):
                     raise ValueError(
                         f"--eval.{name}={value} is of the periodic evaluation, and there is none with "
                         "--eval_freq=0: leave it out."
@@ -318,15 +315,15 @@ class CronosTrainConfig:
         file = Path(path) / TRAIN_CONFIG_NAME if Path(path).is_dir() else Path(path)
         if not file.is_file():
             raise FileNotFoundError(f"No training config at {file}.")
-        resume = parser.parse_arg("resume", cli_args or []) == "true"
-        if resume:
+        asked = parser.parse_arg("resume", cli_args or [])
+        if asked == "true":
             # LeRobot's parser keeps the plugins of the command line from `cli_args`.
             import_plugins(_checkpoint_of(file), sys.argv[1:])
             check_types(_checkpoint_of(file), cli_args or [])
         with draccus.config_type("json" if file.suffix == ".json" else "yaml"):
             config = draccus.parse(cls, file, args=cli_args or [])
         # The file of a resumed run may say it, which asks for nothing.
-        config.resume = resume
+        config.resume = config.resume and asked is not None
         if file.name == TRAIN_CONFIG_NAME:
             config._forget_what_is_not_its_own(file, cli_args or [])
         return config

@@ -49,4 +49,4 @@ def test_the_scene_is_that_of_the_runs_beside_them_unless_it_is_named(evaluation
     assert tasks_of(make_report([run], **evaluations)) == playroom
     assert tasks_of(make_report([run], **evaluations, scene="kitchen_2x2")) == list(INSTRUCTIONS)
     with pytest.raises(ValueError, match="unknown scene 'nowhere'"):
-        make_report([run], **evaluations, scene="nowhere")
+        make_report([run], scene="nowhere")

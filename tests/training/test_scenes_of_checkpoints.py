@@ -1,6 +1,5 @@
 """What was learned or demonstrated in another scene is told from the run's: its sizes may be the same."""
 
-import json
 import logging
 from types import SimpleNamespace
 
@@ -9,12 +8,11 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.utils.constants import OBS_STATE
 from lerobot_env_cronos import CronosEnvConfig
 from lerobot_policy_pocketvla import PocketVLAConfig
-from tiny_checkpoints import STATE, save_policy
+from tiny_checkpoints import STATE, record_one, save_policy, write_train_config
 
 from cronos_lerobot.agents.imitation.config import DemosConfig, ImitationConfig
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.evaluation.policy_env import trained_scene
-from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig, record_demos
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.factory import (
     check_demonstrations,
@@ -27,33 +25,27 @@ from cronos_lerobot.training.factory import (
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory):
     """Demonstrations in the playroom."""
-    root = tmp_path_factory.mktemp("demos") / "playroom"
-    env = CronosEnvConfig(scene="playroom_2x2", obs_type="environment_state_agent_pos", num_threads=1)
-    record_demos(RecordDemosConfig(env=env, dataset=DemoDatasetConfig("me/demos", root, 1), num_envs=1))
-    return root
-
-
-def checkpoint(folder, **config):
-    (folder / "train_config.json").write_text(json.dumps(config))
-    return folder
+    return record_one(tmp_path_factory.mktemp("demos") / "playroom", scene="playroom_2x2")
 
 
 def test_the_scene_is_the_runs_or_that_of_the_cloned_demonstrations(demos, tmp_path):
     dataset = {"repo_id": "me/demos", "root": str(demos)}
-    assert trained_scene(checkpoint(tmp_path, env=None, dataset=dataset)) == {"scene": "playroom_2x2"}
+    assert trained_scene(write_train_config(tmp_path, env=None, dataset=dataset)) == {"scene": "playroom_2x2"}
     env = {"type": "cronos", "scene": "kitchen_3x3"}
-    assert trained_scene(checkpoint(tmp_path, env=env, dataset=dataset)) == {"scene": "kitchen_3x3"}
-    assert trained_scene(checkpoint(tmp_path, env=None, dataset=dataset | {"root": str(tmp_path)})) == {}
-    assert trained_scene(checkpoint(tmp_path, env=None, dataset=None)) == {}
+    assert trained_scene(write_train_config(tmp_path, env=env, dataset=dataset)) == {"scene": "kitchen_3x3"}
+    assert trained_scene(write_train_config(tmp_path, env=None, dataset=dataset | {"root": str(tmp_path)})) == {}
+    assert trained_scene(write_train_config(tmp_path, env=None, dataset=None)) == {}
     assert trained_scene(tmp_path / "none") == {}
     # In the default scene the policy would be another task's; what is not of this package is not its business.
     with pytest.raises(ValueError, match=r"was trained in .* scene 'study'.* --env\.discover_packages_path="):
-        trained_scene(checkpoint(tmp_path, env={"type": "cronos", "scene": "study"}, dataset=None))
-    assert trained_scene(checkpoint(tmp_path, env={"type": "libero", "scene": "study"}, dataset=None)) == {}
+        trained_scene(write_train_config(tmp_path, env={"type": "cronos", "scene": "study"}, dataset=None))
+    assert (
+        trained_scene(write_train_config(tmp_path, env={"type": "libero", "scene": "study"}, dataset=None)) == {}
+    )
 
 
 def test_a_policy_of_another_scene_is_told(tmp_path, caplog):
-    folder = checkpoint(tmp_path, env={"scene": "playroom_2x2"})
+    folder = write_train_config(tmp_path, env={"scene": "playroom_2x2"})
     with caplog.at_level(logging.WARNING):
         warn_of_other_scene(SimpleNamespace(pretrained_path=folder), "playroom_2x2")
         # No name of a repository, so that nothing is looked for.
@@ -79,7 +71,7 @@ def test_a_run_looks_at_both(demos, tmp_path, caplog):
     policy_config = PreTrainedConfig.from_pretrained(
         save_policy(tmp_path, "pocketvla", STATE, hidden_width=16, hidden_depth=1)
     )
-    policy_config.pretrained_path = checkpoint(tmp_path, env={"scene": "playroom_2x2"})
+    policy_config.pretrained_path = write_train_config(tmp_path, env={"scene": "playroom_2x2"})
     config = CronosTrainConfig(CronosEnvConfig(**STATE), policy_config)
     make_policy_and_processors(config)
     assert "was trained in --env.scene=playroom_2x2" in caplog.text

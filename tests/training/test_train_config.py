@@ -173,7 +173,6 @@ def test_what_is_missing_is_asked_for(tmp_path):
 @pytest.mark.parametrize(
     "options",
     [
-        {"eval_freq": 0, "eval": PeriodicEvaluationConfig(n_episodes=16, repetitions=2)},
         {"eval_freq": 0, "eval_at_interventions": [1000], "eval": PeriodicEvaluationConfig(split="held_out")},
         {"save_checkpoint": False},
         {"save_checkpoint": False, "save_freq": 51_200, "eval_freq": 51_200},
