@@ -23,7 +23,9 @@ from lerobot.utils.constants import LAST_CHECKPOINT_LINK
 FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 """What a policy is loaded from: configs, weights, tokenizers."""
 
-UNDECISIVE = ("pretrained_path", "pretrained_revision", "push_to_hub", "repo_id", "private", "tags", "license")
+PUSHED = ("push_to_hub", "repo_id", "private", "tags", "license")
+"""Fields of a policy's config that say where it is pushed to, and how."""
+UNDECISIVE = ("pretrained_path", "pretrained_revision", *PUSHED)
 """Fields of a policy's config that say where it is and not what it does."""
 
 ADAPTER_CONFIG, BASE, REVISION = "adapter_config.json", "base_model_name_or_path", "revision"

@@ -16,6 +16,7 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETR
 from lerobot_env_cronos import check_environment_id, load_benchmark
 from lerobot_env_cronos.config import DEFAULT_SCENE
 
+from cronos_lerobot.evaluation.policy_source import PUSHED
 from cronos_lerobot.evaluation.store import RESULTS
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.report.lerobot_evaluations import EVAL_INFO, EvaluationRun, read_evaluation_runs
@@ -29,8 +30,6 @@ NOT_THE_EXPERIMENT = (
     "log_freq", "save_freq", "save_checkpoint", "keep_checkpoints",
 )  # fmt: skip
 """Top-level fields of a training config in which two runs of one experiment may differ."""
-NOT_THE_POLICY = ("push_to_hub", "repo_id", "private", "tags", "license")
-"""Fields of its policy, as well."""
 
 Evaluation = dict[str, Any]
 Update = dict[str, Any]
@@ -285,7 +284,7 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
     for run in runs:
         mine = {name: value for name, value in run.config.items() if name not in NOT_THE_EXPERIMENT}
         if policy := mine.get("policy"):
-            mine["policy"] = {name: value for name, value in policy.items() if name not in NOT_THE_POLICY}
+            mine["policy"] = {name: value for name, value in policy.items() if name not in PUSHED}
         config = _below_root(_with_defaults(mine))
         key = json.dumps([config, run.changed], sort_keys=True) if config else str(run.folder)
         group = groups.setdefault(key, Group(run.name))
