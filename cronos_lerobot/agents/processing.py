@@ -13,6 +13,8 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_LANGUAGE, OBS
 
 from cronos_lerobot.agents.base import Batch, Columns
 
+EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
+"""How the names of pictures begin that a policy with `--policy.empty_cameras` fills in by itself."""
 VECTOR_KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
 """Vector observations by LeRobot's names."""
 

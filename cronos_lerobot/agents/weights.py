@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import torch
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.configs.default import PeftConfig
 from safetensors.torch import load_model
 
 ADAPTER_FILE = "adapter_model.safetensors"
 """PEFT's name of what it saves."""
+MIXED = ("smolvla",)
+"""Types of policies whose layers turn what they read into the format of their own weights."""
 
 
 def is_wrapped(policy: Any) -> bool:
@@ -31,7 +35,42 @@ def wrap(policy: Any, config: PeftConfig | None) -> Any:
     """
     if config is None or is_wrapped(policy):
         return policy
-    return policy.wrap_with_peft(peft_cli_overrides=vars(config).copy())
+    wrapped = policy.wrap_with_peft(peft_cli_overrides=vars(config).copy())
+    for adapters in wrapped.peft_config.values():
+        # Of the Hub's policy that they go onto, which LeRobot's own wrapping leaves out.
+        adapters.revision = policy.config.pretrained_revision
+    return wrapped
+
+
+def train_in_float32(policy: Any) -> None:
+    """Give what is trained of a policy float32, where the other layers bear it: SmolVLA's is made in bfloat16.
+
+    What its network is built around is frozen, and stays as it is.
+    """
+    if policy.config.type in MIXED:
+        for param in policy.parameters():
+            if param.requires_grad:
+                param.data = param.data.float()
+
+
+def check_precision(params: Iterable[torch.Tensor], config: Any, algorithm: str) -> None:
+    """Check that weights can hold the small steps of fine-tuning, and of an average.
+
+    Args:
+        params: those that are trained.
+        config: the policy's.
+        algorithm: its `--algorithm.type`.
+
+    Raises:
+        ValueError: some have fewer bits than float32.
+    """
+    if coarse := sorted({str(param.dtype) for param in params if param.dtype.itemsize < 4}):
+        how = " (--policy.dtype=float32)" if hasattr(config, "dtype") else ""
+        raise ValueError(
+            f"--algorithm.type={algorithm} would learn next to nothing: {', '.join(coarse)} cannot hold the"
+            f" small steps of the weights that are trained. Load them in float32{how}, or train adapters"
+            " (--peft.method_type=LORA)."
+        )
 
 
 def save_policy(policy: Any, folder: Path) -> None:

@@ -17,10 +17,8 @@ from lerobot_env_cronos.scene.model import CAMERAS
 from lerobot_env_cronos.scene.scenes import SCENES, get_scene
 from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS
 
+from cronos_lerobot.agents.processing import EMPTY_CAMERA
 from cronos_lerobot.data.origin import Origin, read_origin
-
-EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
-"""How pictures begin that a policy with `--policy.empty_cameras` fills in by itself."""
 
 Features = Mapping[str, PolicyFeature]
 

@@ -7,7 +7,7 @@ import io
 import json
 import sys
 from collections.abc import Iterator
-from contextlib import redirect_stderr
+from contextlib import redirect_stderr, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,9 @@ FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 
 PUSHED = ("push_to_hub", "repo_id", "private", "tags", "license")
 """Fields of a policy's config that say where it is pushed to, and how."""
-UNDECISIVE = ("pretrained_path", "pretrained_revision", *PUSHED)
+PINNED = "pretrained_revision"
+"""Field of a policy's config that says which commit of the Hub's it is."""
+UNDECISIVE = ("pretrained_path", PINNED, *PUSHED)
 """Fields of a policy's config that say where it is and not what it does."""
 
 ADAPTER_CONFIG, BASE, REVISION = "adapter_config.json", "base_model_name_or_path", "revision"
@@ -75,20 +77,49 @@ def follow_last(folder: Path) -> Path:
     return folder
 
 
+def pin_policy(name: str, overrides: list[str]) -> tuple[str, list[str]]:
+    """Hold a policy of the Hub at the commit that it is at now, or at the revision that is given.
+
+    Args:
+        name: a folder, which stays as it is, or `<owner>/<repository>[@<revision>]`.
+        overrides: flags of the policy's config; `--pretrained_revision` says the revision, too.
+
+    Returns:
+        The name without its revision, and the flags with that of the commit.
+
+    Raises:
+        ValueError: two revisions are given.
+    """
+    if Path(name).is_dir():
+        return str(follow_last(Path(name))), overrides
+    repository, _, revision = name.partition("@")
+    flag = f"--{PINNED}="
+    given = [override.removeprefix(flag) for override in overrides if override.startswith(flag)]
+    if revision and any(other != revision for other in given):
+        raise ValueError(f"--policy.path={name} and --policy.{PINNED}={given[-1]} are two revisions: give one.")
+    revision = revision or (given[-1] if given else "")
+    # What cannot be asked may be in the cache; who loads it says what is wrong.
+    with suppress(OSError, HFValidationError):
+        revision = HfApi().model_info(repository, revision=revision or None).sha or revision
+    others = [override for override in overrides if not override.startswith(flag)]
+    return repository, [*others, f"{flag}{revision}"] if revision else others
+
+
 def load_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
-    """Return the config of the policy that `--policy.path` names.
+    """Return the config of the policy that `--policy.path` names, of its `--pretrained_revision` if there is one.
 
     Raises:
         ValueError: there is no such folder or repository, or what it has is damaged.
     """
-    folder = Path(path)
+    folder, flag = Path(path), f"--{PINNED}="
+    revision = next((text.removeprefix(flag) for text in overrides if text.startswith(flag)), None)
     if folder.is_dir() and not (folder / CONFIG_NAME).is_file():
         raise ValueError(f"--policy.path={path} has no {CONFIG_NAME}: give a checkpoint's pretrained_model.")
     said = io.StringIO()
     try:
         # What argparse says of a flag that the policy does not have is its whole usage.
         with redirect_stderr(said):
-            config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+            config = PreTrainedConfig.from_pretrained(path, revision=revision, cli_overrides=overrides)
     except SystemExit as error:
         why = said.getvalue().strip().rpartition("error: ")[2].replace("--", "--policy.")
         raise ValueError(f"--policy.path={path}: {why}") from error

@@ -108,32 +108,30 @@ class BaseRecipe:
         return max(1, self.clone_steps // 4)
 
 
+MODEL = "kitchen_2x2"
+"""The scene whose recipes others take, with as much for each of their tasks."""
 BASE_RECIPES: dict[tuple[str, str], BaseRecipe] = {
-    ("kitchen_2x2", STATE): BaseRecipe(400, 320, checkpoint=320),
+    (MODEL, STATE): BaseRecipe(400, 320, checkpoint=320),
     ("playroom_2x2", STATE): BaseRecipe(400, 640, checkpoint=480),
-    ("kitchen_3x3", STATE): BaseRecipe(900, 720, checkpoint=720),
-    ("kitchen_2x2", PIXELS): BaseRecipe(3200, 1600, checkpoint=1600),
-    ("playroom_2x2", PIXELS): BaseRecipe(3200, 1600, checkpoint=1600),
-    ("kitchen_3x3", PIXELS): BaseRecipe(7200, 3600, checkpoint=3600),
+    (MODEL, PIXELS): BaseRecipe(3200, 1600, checkpoint=1600),
 }
-"""By scene and kind of observation. Measured (docs/experiments.md), but for those from pixels of the other
-scenes, which have as many demonstrations and gradient steps for each task as kitchen_2x2. From pixels 800
-demonstrations are learned by heart (docs/trials.md); more of them cost minutes, and no gradient step."""
+"""By scene and kind of observation; scenes that are not here take `MODEL`'s. Measured (docs/experiments.md), with
+`kitchen_3x3` from the state. From pixels 800 demonstrations are learned by heart (docs/trials.md); more of them
+cost minutes, and no gradient step."""
 CLEAN_RECIPES: dict[tuple[str, str], BaseRecipe] = {
-    ("kitchen_2x2", STATE): BaseRecipe(400, 640, checkpoint=480, clean=True),
+    (MODEL, STATE): BaseRecipe(400, 640, checkpoint=480, clean=True),
 }
-"""The same from clean demonstrations, where that is measured."""
+"""The same from clean demonstrations."""
 WIDE_RECIPES: dict[tuple[str, str], BaseRecipe] = {
-    ("kitchen_2x2", STATE): BaseRecipe(1200, 1920, checkpoint=1920, kind=WIDE),
-    ("playroom_2x2", STATE): BaseRecipe(1200, 1920, checkpoint=1920, kind=WIDE),
-    ("kitchen_3x3", STATE): BaseRecipe(2700, 4320, checkpoint=4320, kind=WIDE),
-    ("kitchen_2x2", PIXELS): BaseRecipe(3200, 2400, checkpoint=2400, kind=WIDE),
+    (MODEL, STATE): BaseRecipe(1200, 1920, checkpoint=1920, kind=WIDE),
+    (MODEL, PIXELS): BaseRecipe(3200, 2400, checkpoint=2400, kind=WIDE),
 }
 """The same over the whole reach. What may lie anywhere takes more demonstrations: `kitchen_2x2`'s clone of 400
 came to .43 and stayed there, of 1,200 to .82 (docs/trials.md); the other scenes have as many for each task."""
 WIDE_RESETS_RECIPES: dict[tuple[str, str], BaseRecipe] = {
-    key: replace(recipe, kind=WIDE_RESETS) for key, recipe in WIDE_RECIPES.items()
-} | {("kitchen_2x2", STATE): BaseRecipe(3600, 3840, checkpoint=3840, kind=WIDE_RESETS)}
+    (MODEL, STATE): BaseRecipe(3600, 3840, checkpoint=3840, kind=WIDE_RESETS),
+    (MODEL, PIXELS): BaseRecipe(3200, 2400, checkpoint=2400, kind=WIDE_RESETS),
+}
 """The same with reset tasks, of each as many as of any other task: learned resets have to succeed."""
 SMOKE_RECIPE = BaseRecipe(8, 5, checkpoint=5, clone_batch=32)
 
@@ -147,8 +145,10 @@ ALGORITHM_FLAGS = {
 def base_recipe(scale: Scale, scene: str, obs_type: str, *, clean: bool = False, kind: str = NARROW) -> BaseRecipe:
     """The recipe of a scene's base policy of a kind, the narrow one on request from clean demonstrations.
 
+    A scene without one of its own has that of `MODEL`, by the number of their tasks.
+
     Raises:
-        ValueError: there is no such kind, or no recipe; a policy can be given with --policy.path.
+        ValueError: there is no such kind, no such scene, or no recipe; a policy can be given with --policy.path.
     """
     if kind not in BASE_KINDS:
         raise ValueError(f"the base of a row must be one of {list(BASE_KINDS)}, got {kind!r}")
@@ -160,10 +160,27 @@ def base_recipe(scale: Scale, scene: str, obs_type: str, *, clean: bool = False,
         WIDE: WIDE_RECIPES,
         WIDE_RESETS: WIDE_RESETS_RECIPES,
     }[kind]
-    if (scene, obs_type) not in recipes:
-        known = ", ".join(f"{s}/{OBS_NAMES[o]}" for s, o in recipes)
+    if (scene, obs_type) in recipes:
+        return replace(recipes[scene, obs_type], kind=kind)
+    if (MODEL, obs_type) not in recipes:
+        known = ", ".join(OBS_NAMES[o] for _, o in recipes)
         name = "clean base policy" if clean else "base policy" if kind == NARROW else f"{kind} base policy"
         raise ValueError(
-            f"no recipe for a {name} of {scene}/{OBS_NAMES[obs_type]}; there are {known}: use --policy.path"
+            f"no recipe for a {name} from {OBS_NAMES[obs_type]}; from {known} there is: use --policy.path"
         )
-    return replace(recipes[scene, obs_type], kind=kind)
+    return replace(_for_tasks(recipes[MODEL, obs_type], scene), kind=kind)
+
+
+def _for_tasks(recipe: BaseRecipe, scene: str) -> BaseRecipe:
+    """A recipe of `MODEL` with as many demonstrations and gradient steps for each task of another scene."""
+    from lerobot_env_cronos.scene.scenes import get_scene
+
+    tasks, of = len(get_scene(scene).tasks), len(get_scene(MODEL).tasks)
+    more = replace(
+        recipe,
+        demos=recipe.demos * tasks // of,
+        clone_steps=recipe.clone_steps * tasks // of,
+        checkpoint=recipe.clone_steps * tasks // of,
+    )
+    quarters = 4 * recipe.checkpoint // recipe.clone_steps
+    return more if quarters == 4 else replace(more, checkpoint=quarters * more.save_freq)

@@ -113,20 +113,20 @@ class BenchmarkConfig(PublishConfig):
 
 @dataclass
 class StreamConfig(PublishConfig):
-    """Publish recorded training streams as a LeRobotDataset."""
+    """Publish recorded streams or demonstrations, a LeRobotDataset."""
 
     root: Path | None = None
-    """Folder of the dataset: --record.root of cronos-train, by default <run>/streams."""
+    """Folder of the dataset: of cronos-train --record.root, by default <run>/streams, or of cronos-record-demos."""
     run: Path | None = None
     """Folder of the training run, for the card; by default the one that the dataset lies in, if it does."""
 
 
 @dataclass
 class PolicyConfig(PublishConfig):
-    """Publish a policy that cronos-train made, with what it was trained with."""
+    """Publish a policy that cronos-train or lerobot-train made, with what it was trained with."""
 
     path: Path | None = None
-    """Run folder of cronos-train (its last checkpoint), or one of its checkpoints."""
+    """Its run folder (the last checkpoint), one of its checkpoints, or a pretrained_model folder."""
     dataset: str | None = None
     """Dataset repository of its recorded streams; by default the --record.repo_id of the run."""
     base_policy: str | None = None

@@ -80,8 +80,9 @@ class ProtocolConfig:
     """When a stream's scene reset is due: `together`, all streams at multiples of T, or `staggered`, each of them
     every T steps as well, but at times that are spread evenly over the streams."""
     scene_reset: str = "periodic"
-    """Who asks for scene resets: `periodic`, every T steps, or `critic`, for streams in which the agent's values
-    see nothing left to learn, as many at a switch as `reset_budget`, spread evenly over the run, has by then."""
+    """Who asks for scene resets: `periodic`, every T steps, or `critic`, for streams that have failed their last
+    tasks, those first of which the agent's values expect least, as many at a switch as `reset_budget`, spread
+    evenly over the run, has by then."""
     reset_starts: str = "random"
     """Where scene resets put a stream: `random`, any training configuration, the next task being the order's, or
     `learnable`, a configuration and a first task of which the policy neither always succeeds nor always fails."""

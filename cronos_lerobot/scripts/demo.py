@@ -1,4 +1,4 @@
-"""`cronos-demo`: the whole of CRONOS in one command, in about twelve minutes on two CPU cores.
+"""`cronos-demo`: the whole of CRONOS in one command, in 12 to 16 minutes on two CPU cores.
 
 The scripted expert demonstrates four tasks in a shared kitchen scene, a small policy is cloned from it, that
 policy goes on learning by itself in 64 streams that are hardly ever reset, and both are evaluated on layouts of

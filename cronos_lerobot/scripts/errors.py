@@ -7,8 +7,10 @@ import sys
 from argparse import ArgumentError
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager, redirect_stderr
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from types import NoneType
+from typing import Any, NoReturn, get_args, get_type_hints
 
 from draccus.utils import ParsingError
 from httpx import HTTPError, TransportError
@@ -88,8 +90,10 @@ def parse_command_line(
     try:
         with redirect_stderr(said):
             config = parser.wrap()(keep)()  # ty: ignore[missing-argument]  (it reads the command line)
-    except ParsingError:
+    except ParsingError as error:
         # What configs log, because draccus drops the reason of an error, `reason` finds without it.
+        if isinstance(error.__cause__, TypeError) and (flags := _null_flags(given[1:])):
+            raise ValueError(f"null is no value of {' or '.join(f'--{flag}' for flag in flags)}") from error
         raise
     except SystemExit as exit_:
         _, _, wrong = said.getvalue().rpartition(": error: ")
@@ -108,7 +112,27 @@ def parse_command_line(
     finally:
         sys.argv = given
     sys.stderr.write(said.getvalue())
+    for flag in _null_flags(given[1:]):
+        if not _takes_null(config, flag):
+            raise ValueError(f"null is no value of --{flag}")
     return config
+
+
+def _null_flags(arguments: list[str]) -> list[str]:
+    """The flags that are given as null, without their dashes."""
+    pairs = (argument.removeprefix("--").split("=", 1) for argument in arguments if argument.startswith("--"))
+    return [name for name, *value in pairs if value and value[0].lower() in ("null", "none", "~")]
+
+
+def _takes_null(config: Any, flag: str) -> bool:
+    """Whether a field of a config may be None; draccus gives it to numbers and booleans, too."""
+    *groups, name = flag.split(".")
+    for group in groups:
+        config = getattr(config, group, None)
+    field = next((f for f in fields(config) if f.name == name), None) if is_dataclass(config) else None
+    if field is None or field.default is None:
+        return True
+    return NoneType in get_args(get_type_hints(type(config))[name])
 
 
 def _missing_types(arguments: list[str], types: Mapping[str, str]) -> list[str]:

@@ -23,7 +23,7 @@ from lerobot_env_cronos.hub_config import is_of_this_package
 from cronos_lerobot.agents import builtin  # noqa: F401  (registers the agents)
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.registry import check_agent, check_settings
-from cronos_lerobot.evaluation.policy_source import follow_last, load_policy_config
+from cronos_lerobot.evaluation.policy_source import load_policy_config, pin_policy
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.experts import check_expert
 from cronos_lerobot.protocol.resets import check_extra_resets
@@ -191,7 +191,7 @@ class CronosTrainConfig:
         self._pin_benchmark(self.env)
         if not self.resume and (path := parser.get_path_arg("policy")):
             overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
-            self.policy = load_policy_config(str(follow_last(Path(path))), overrides)
+            self.policy = load_policy_config(*pin_policy(path, overrides))
             if not any(override.startswith("--repo_id") for override in overrides):
                 # That of the policy's own, which is not to be pushed over.
                 self.policy.repo_id = None
@@ -333,6 +333,9 @@ class CronosTrainConfig:
         if not self.resume and parser.parse_arg("wandb.run_id", cli_args) is None:
             self.wandb.run_id = None
         is_given = parser.parse_arg("policy.repo_id", cli_args) is not None
+        if self.policy is not None and self.peft is not None and not self.resume:
+            # Earlier versions wrote that the policy to begin with has the adapters already.
+            self.policy.use_peft = False
         if self.policy is not None and not is_given and was_never_told_where_to_push(_checkpoint_of(file)):
             self.policy.repo_id = None
 

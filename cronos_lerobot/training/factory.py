@@ -6,6 +6,7 @@ import json
 import logging
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +23,15 @@ from lerobot_env_cronos.simulation.simulation import num_cores
 from safetensors import SafetensorError
 
 from cronos_lerobot.agents.imitation.config import DemosConfig
+from cronos_lerobot.agents.processing import EMPTY_CAMERA
 from cronos_lerobot.agents.steering.steered import STEERING
-from cronos_lerobot.agents.weights import is_wrapped, wrap
+from cronos_lerobot.agents.weights import is_wrapped, train_in_float32, wrap
 from cronos_lerobot.evaluation.policy_env import (
-    EMPTY_CAMERA,
     check_task_observation,
     scene_of_dataset,
     trained_scene,
 )
+from cronos_lerobot.evaluation.policy_source import UNDECISIVE, load_policy_config
 from cronos_lerobot.training.config import CronosTrainConfig
 
 
@@ -88,8 +90,8 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
         ValueError: the policy was made for other observations or actions, or its files are damaged; or
             demonstrations are of another scene.
     """
-    policy_config, env_config = config.policy, _cronos(config)
-    assert policy_config is not None
+    env_config, path = _cronos(config), config.weights_path
+    policy_config = _config_to_build(config)
     check_task_observation(policy_config, env_config)
     check_features(policy_config, env_config)
     if policy_config.use_amp:
@@ -99,14 +101,18 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
         )
     if not config.resume:
         check_demonstrations(config.algorithm, env_config.scene)
-    path = config.weights_path
     if not (path or getattr(policy_config, "checkpoint", None)):
         logging.warning("Training a policy from scratch: its states are not normalised, its success starts at 0.")
     try:
         with _pretrained(policy_config, path):
             loaded = make_policy(policy_config, env_cfg=env_config)
+        assert config.policy is not None
+        config.policy.input_features = policy_config.input_features
+        config.policy.output_features = policy_config.output_features
         if config.peft is not None and not config.resume:
             check_adapters(loaded, policy_config)
+        if config.peft is None:
+            train_in_float32(loaded)
         policy = wrap(loaded, config.peft)
         if path is None:
             return policy, *make_pre_post_processors(policy_config)
@@ -115,11 +121,30 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
             warn_of_other_scene(policy_config, env_config.scene)
         # Like lerobot-train: the checkpoint's processors, on the device of this run.
         device = {"device_processor": {"device": policy_config.device}}
-        return policy, *make_pre_post_processors(policy_config, str(path), preprocessor_overrides=device)
+        # It is of the policy that the run begins with, and no revision of where this one will be pushed to.
+        revision, policy_config.pretrained_revision = policy_config.pretrained_revision, None
+        return policy, *make_pre_post_processors(
+            policy_config, str(path), pretrained_revision=revision, preprocessor_overrides=device
+        )
     except SafetensorError as error:
         raise ValueError(f"{path}/{SAFETENSORS_SINGLE_FILE} or a processor's file is damaged: {error}") from error
     except json.JSONDecodeError as error:
         raise ValueError(f"a configuration of a processor in {path} is damaged: {error}") from error
+
+
+def _config_to_build(config: CronosTrainConfig) -> PreTrainedConfig:
+    """The config to build the policy from, which resolves it: the run's own stays as it was given.
+
+    A resumed run has it, resolved, beside its weights.
+    """
+    given = config.policy
+    assert given is not None
+    if not config.resume:
+        return deepcopy(given)
+    saved = load_policy_config(str(config.weights_path), [])
+    for name in ("device", *UNDECISIVE):
+        setattr(saved, name, getattr(given, name))
+    return saved
 
 
 @contextmanager

@@ -264,3 +264,12 @@ def test_a_dataset_that_is_not_there_is_named(dataset_root, monkeypatch):
 def test_bad_values_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         ImitationConfig(**options)
+
+
+def test_a_camera_that_no_dataset_has_is_not_asked_for(dataset_root):
+    """LeRobot adds it to the features of a policy with `empty_cameras`, whose picture the policy makes itself."""
+    config = policy_config("act")
+    config.input_features["observation.images.empty_camera_0"] = PolicyFeature(FeatureType.VISUAL, (3, 480, 640))
+    batch = Demonstrations(DemosConfig("me/demos", dataset_root), config).batch(2, np.random.default_rng(0))
+    assert "observation.images.front" in batch
+    assert "observation.images.empty_camera_0" not in batch

@@ -120,6 +120,13 @@ def test_untrainable_policy_is_named():
         PPO(torch.nn.Linear(1, 1), processors, PPOConfig(), np.random.default_rng(0))
 
 
+def test_weights_too_coarse_for_its_steps_are_refused():
+    message = r"type=ppo would learn next to nothing: torch\.bfloat16 cannot hold .* float32, or train adapters"
+    with pytest.raises(ValueError, match=message):
+        make_ppo(policy=DummyPolicy().bfloat16())
+    make_ppo(policy=DummyPolicy().double())
+
+
 def test_a_critic_that_is_frozen_is_told_and_not_trained_without():
     policy = DummyPolicy()
     policy.critic.requires_grad_(False)

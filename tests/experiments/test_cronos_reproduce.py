@@ -201,8 +201,8 @@ def test_a_clean_base_policy_has_a_recipe_and_a_folder_of_its_own(tmp_path):
     assert not [flag for flag in demos.command if flag.startswith(("--noise", "--misses", "--steps_after"))]
     assert "--steps=640" in clone.command
     assert base_policy(Base("kitchen_2x2"), options).endswith("checkpoints/000480/pretrained_model")
-    args = script.make_parser().parse_args(["figure7", "--base.clean"])
-    with pytest.raises(ValueError, match="clean base policy of kitchen_3x3/state; there are kitchen_2x2/state"):
+    args = script.make_parser().parse_args(["figure7", "--base.clean", "--obs_type=pixels"])
+    with pytest.raises(ValueError, match="no recipe for a clean base policy from pixels; from state there is"):
         script.make_options(args, [], [Base("kitchen_3x3")])
 
 

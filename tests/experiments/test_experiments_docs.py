@@ -17,6 +17,7 @@ from cronos_lerobot.experiments.scales import (
     SCALES,
     WIDE_RECIPES,
     WIDE_RESETS_RECIPES,
+    base_recipe,
 )
 from cronos_lerobot.scripts.reproduce import make_parser
 
@@ -67,19 +68,20 @@ def test_scales():
 
 
 def test_recipes():
-    recipes = {
-        (scene, OBS_NAMES[obs], recipe.clean, recipe.kind): recipe
-        for table in (BASE_RECIPES, CLEAN_RECIPES, WIDE_RECIPES, WIDE_RESETS_RECIPES)
-        for (scene, obs), recipe in table.items()
+    tables = (BASE_RECIPES, CLEAN_RECIPES, WIDE_RECIPES, WIDE_RESETS_RECIPES)
+    unseen = {
+        (scene, obs, recipe.clean, recipe.kind) for table in tables for (scene, obs), recipe in table.items()
     }
-    section = DOCS[DOCS.index("| | demonstrations") :].split("\n\n")[0].splitlines()[2:]
-    assert len(section) == len(recipes)
-    for line in section:
+    kinds = {name: obs for obs, name in OBS_NAMES.items()}
+    for line in DOCS[DOCS.index("| | demonstrations") :].split("\n\n")[0].splitlines()[2:]:
         name, *numbers = (cell.strip() for cell in line.strip("|").split("|")[:4])
         scene, obs = re.findall(r"\w+", name)[:2]
         kind = "wide_resets" if "reset tasks" in name else "wide" if "wide" in name else "narrow"
-        recipe = recipes[scene, obs, "--base.clean=true" in name, kind]
+        clean = "--base.clean=true" in name
+        recipe = base_recipe(SCALES["small"], scene, kinds[obs], clean=clean, kind=kind)
         assert [int(number) for number in numbers] == [recipe.demos, recipe.clone_steps, recipe.checkpoint]
+        unseen.discard((scene, kinds[obs], clean, kind))
+    assert not unseen
 
 
 def test_every_flag_is_there():

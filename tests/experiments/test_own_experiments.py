@@ -3,10 +3,11 @@
 import pytest
 from lerobot_env_cronos.benchmark.benchmark import SUITES
 from lerobot_env_cronos.benchmark.configurations import SPLITS
+from lerobot_env_cronos.scene.scenes import SCENES, Scene
 
 from cronos_lerobot.experiments import definitions
 from cronos_lerobot.experiments.definitions import CheckpointEvaluation, Experiment, Row
-from cronos_lerobot.experiments.scales import SCALES, STATE, base_recipe
+from cronos_lerobot.experiments.scales import PIXELS, SCALES, STATE, base_recipe
 
 BOTH = ("train", "held_out")
 CHAINS = CheckpointEvaluation("sequential", BOTH)
@@ -103,3 +104,18 @@ def test_suites_and_splits_are_the_environments():
 def test_an_unknown_base_is_named():
     with pytest.raises(ValueError, match=r"one of \['narrow', 'wide', 'wide_resets'\], got 'wid'"):
         base_recipe(SCALES["small"], "kitchen_2x2", STATE, kind="wid")
+
+
+def test_a_scene_of_ones_own_has_as_much_for_each_task(monkeypatch):
+    """kitchen_2x2 has 100 demonstrations and 80 gradient steps of 320 for each of its four tasks."""
+    scene = Scene("desk_1x2", objects=("toy bear",), receptacles=("cloth", "carpet"))
+    monkeypatch.setitem(SCENES, scene.name, scene)
+    recipe = base_recipe(SCALES["small"], "desk_1x2", STATE)
+    assert (recipe.demos, recipe.clone_steps, recipe.checkpoint) == (200, 160, 160)
+    # That from clean demonstrations is taken after three quarters of its steps.
+    recipe = base_recipe(SCALES["paper"], "desk_1x2", STATE, clean=True)
+    assert (recipe.demos, recipe.clone_steps, recipe.checkpoint, recipe.clean) == (200, 320, 240, True)
+    recipe = base_recipe(SCALES["small"], "desk_1x2", PIXELS, kind="wide_resets")
+    assert (recipe.demos, recipe.clone_steps, recipe.kind) == (1600, 1200, "wide_resets")
+    with pytest.raises(ValueError, match="unknown scene 'nowhere'"):
+        base_recipe(SCALES["small"], "nowhere", STATE)

@@ -5,6 +5,7 @@ import re
 
 import pytest
 import yaml
+from hub_repositories import File
 from huggingface_hub.utils import filter_repo_objects
 from lerobot_env_cronos import CronosEnvConfig
 from lerobot_policy_pocketvla import PocketVLAConfig
@@ -259,6 +260,36 @@ def test_results_of_a_policy_that_flags_changed_are_refused(policy, commands, tm
     refused = commands.try_("cronos-publish", "results", f"--results={tmp_path / 'eval'}", f"--repo_id={policy}")
     assert refused.code == 1
     assert "independent_train: flags changed the policy: sigma_max 0.3 in place of 0.6;" in refused.output
+
+
+def test_a_training_begins_with_one_commit_of_a_policy(hub, bench, policy, commands, tmp_path):
+    """All of it is of the revision that is given, or of what `main` is when the run begins."""
+    repository = hub.repositories["models", policy]
+    first = repository.branches["main"]
+    old = hub.tree("models", policy)
+    config = json.loads(old["config.json"]) | {"sigma_init": 0.3}
+    processor = old["policy_preprocessor.json"].replace(b'"name": "', b'"name": "new_')
+    assert processor != old["policy_preprocessor.json"]
+    changed = {"config.json": json.dumps(config).encode(), "policy_preprocessor.json": processor}
+    repository.commit("main", "trained on", {name: File(text, False) for name, text in changed.items()}, [])
+    flags = [flag for flag in TRAINING if not flag.startswith(("--policy.", "--record."))]
+    for name, revision, sigma in ((f"{policy}@{first}", first, 0.2), (policy, repository.branches["main"], 0.3)):
+        folder = tmp_path / revision
+        commands.run("cronos-train", f"--policy.path={name}", *flags, "--env.benchmark=me/bench",
+                     f"--output_dir={folder}")  # fmt: skip
+        saved = folder / "checkpoints/last/pretrained_model"
+        began_with = json.loads((saved / "train_config.json").read_text())["policy"]
+        assert (began_with["pretrained_path"], began_with["pretrained_revision"]) == (policy, revision)
+        own = json.loads((saved / "config.json").read_text())
+        assert own["sigma_init"] == sigma
+        # It would be looked for where this policy is pushed to.
+        assert own["pretrained_revision"] is None
+        # A processor is saved under its name.
+        assert (saved / "new_policy_preprocessor.json").exists() == (revision != first)
+    two = commands.try_(
+        "cronos-train", f"--policy.path={policy}@{first}", "--policy.pretrained_revision=main", *flags
+    )
+    assert "are two revisions: give one" in two.output
 
 
 def test_results_of_another_benchmark_are_refused(policy, evaluation, commands, tmp_path):

@@ -13,6 +13,8 @@ from cronos_lerobot.scripts.subcommands import run_subcommand
 @dataclass
 class Inner:
     size: int = 1
+    depth: float = 1.0
+    share: float | None = 0.5
 
     def __post_init__(self):
         if self.size < 1:
@@ -22,6 +24,8 @@ class Inner:
 @dataclass
 class Config:
     name: str = "a"
+    fast: bool = False
+    most: int | None = None
     inner: Inner = field(default_factory=Inner)
 
 
@@ -32,7 +36,7 @@ def parse(monkeypatch, *arguments):
 
 
 def test_a_right_command_line_is_read(monkeypatch):
-    assert parse(monkeypatch, "--name=b", "--inner.size=3") == Config("b", Inner(3))
+    assert parse(monkeypatch, "--name=b", "--inner.size=3") == Config("b", inner=Inner(3))
 
 
 def test_a_plugin_may_be_one_file(monkeypatch, tmp_path):
@@ -61,6 +65,14 @@ def test_a_value_of_another_type_is_one_line(monkeypatch, capsys):
         parse(monkeypatch, "--inner.size=big")
     assert ended.value.code == 1
     assert capsys.readouterr().err == "error: `inner.size`: Couldn't parse 'big' into an int\n"
+
+
+def test_null_is_refused_where_it_is_no_value(monkeypatch):
+    """draccus gives it to numbers and booleans, too, and what reads them later would not know the flag."""
+    assert parse(monkeypatch, "--most=null", "--inner.share=null") == Config(inner=Inner(share=None))
+    for flag in ("name", "fast", "inner.size", "inner.depth"):
+        with pytest.raises(SystemExit, match=rf"^error: null is no value of --{flag}$"):
+            parse(monkeypatch, f"--{flag}=null")
 
 
 def test_bugs_keep_their_traceback():

@@ -238,6 +238,11 @@ def test_lora_learns_saves_resumes_and_is_a_lerobot_policy(clone, tmp_path, monk
     assert all(torch.equal(after[0][name], after[1][name]) for name in before)
     assert any(not torch.equal(before[name], after[0][name]) for name in before)
     assert not (whole / model / "model.safetensors").exists()
+    # The run's config is that of a run which begins without them.
+    new = (f"--config_path={whole / model}/train_config.json", "--steps=20", f"--output_dir={tmp_path / 'new'}")
+    cronos_train(monkeypatch, *new)
+    begun = load_file(tmp_path / "new" / model / "adapter_model.safetensors")
+    assert all(torch.equal(begun[name], tensor) for name, tensor in before.items())
 
     config = PreTrainedConfig.from_pretrained(whole / model)
     config.pretrained_path = whole / model

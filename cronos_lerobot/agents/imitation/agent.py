@@ -30,6 +30,7 @@ from cronos_lerobot.agents.imitation.weights import Remembered, by_advantage, by
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.agents.registry import AgentContext, register_agent
 from cronos_lerobot.agents.state import to_arrays, to_tensors
+from cronos_lerobot.agents.weights import check_precision
 
 FINE_TUNING = 0.1
 """Of the learning rate of cloning from scratch. The whole of it unlearns what the few successes do not show."""
@@ -190,17 +191,7 @@ class ImitationAgent(LearningAgent):
                 group["lr"] *= factor
         self._max_grad_norm = preset.grad_clip_norm
         self._trained = [param for param in self._learner.parameters() if param.requires_grad]
-        # Steps of such a rate, and those of an average, are smaller than what a half of the bits can hold.
-        if coarse := sorted({str(param.dtype) for param in self._trained} - {"torch.float32"}):
-            # SmolVLA's is that of the network whose weights it is built around.
-            flags = {"dtype": "dtype=float32", "load_vlm_weights": "load_vlm_weights=false"}
-            config = self.policy.config
-            how = next((f" (--policy.{flag})" for name, flag in flags.items() if hasattr(config, name)), "")
-            raise ValueError(
-                f"--algorithm.type=imitation would learn next to nothing: {', '.join(coarse)} cannot hold the"
-                f" small steps of the weights that are trained. Load them in float32{how}, or train adapters"
-                " (--peft.method_type=LORA)."
-            )
+        check_precision(self._trained, self.policy.config, self.config.type)
 
     @property
     def _optimizers(self) -> list[torch.optim.Optimizer]:

@@ -18,6 +18,7 @@ from torch.utils.data import default_collate
 from cronos_lerobot.agents.base import Batch
 from cronos_lerobot.agents.imitation.config import DemosConfig
 from cronos_lerobot.agents.imitation.memory import Segment, SegmentMemory
+from cronos_lerobot.agents.processing import EMPTY_CAMERA
 
 
 def segment_batch(draws: Sequence[tuple[Segment, int]], config: PreTrainedConfig) -> Batch:
@@ -120,7 +121,12 @@ def _check_columns(config: DemosConfig, policy: PreTrainedConfig, features: Mapp
 
     Images may have another size than the policy's own: policies scale them.
     """
-    taken = policy.input_features or {}
+    # LeRobot adds a camera that no dataset has, and the policy makes its picture.
+    taken = {
+        name: feature
+        for name, feature in (policy.input_features or {}).items()
+        if not name.startswith(EMPTY_CAMERA)
+    }
     wanted = {*taken, ACTION}
     if policy.reward_delta_indices is not None:
         wanted.add(REWARD)

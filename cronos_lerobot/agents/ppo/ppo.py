@@ -31,6 +31,7 @@ from cronos_lerobot.agents.ppo.metrics import UpdateMetrics
 from cronos_lerobot.agents.ppo.rollout_buffer import Minibatch, RolloutBuffer
 from cronos_lerobot.agents.ppo.self_imitation import SelfImitation
 from cronos_lerobot.agents.processing import PolicyProcessors
+from cronos_lerobot.agents.weights import check_precision
 from cronos_lerobot.processes import Processes
 
 
@@ -106,7 +107,9 @@ class PPO:
                 f"PPO has nothing to train: all of {type(policy).__name__} that decides is frozen, as adapters of"
                 " --peft.* leave what they do not name."
             )
-        _freeze_all_but(self._params["policy"] + self._params["value"], policy)
+        trained = self._params["policy"] + self._params["value"]
+        check_precision(trained, getattr(policy, "config", None), config.type)
+        _freeze_all_but(trained, policy)
         self.self_imitation = self_imitation
         if self_imitation is not None:
             self_imitation.check(self._params["policy"])
