@@ -31,7 +31,7 @@ demo: setup ## Record, clone, learn with a reset for every fourth task, evaluate
 
 test: setup ## Run the whole test suite, one worker a core
 	@sh .ci/system-packages tests
-	OMP_NUM_THREADS=1 $(RUN) pytest -n auto --dist loadfile --durations=40 --durations-min=5
+	OMP_NUM_THREADS=1 $(RUN) pytest -n auto --dist loadfile --no-loadscope-reorder --durations=40 --durations-min=5
 
 check: lint type ## What CI checks besides the tests
 

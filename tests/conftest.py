@@ -14,3 +14,10 @@ from draccus.wrappers import docstring, field_wrapper
 docstring.get_attribute_docstring = cache(docstring.get_attribute_docstring)
 field_wrapper.inspect = SimpleNamespace(getfullargspec=cache(inspect.getfullargspec))
 metadata.email = SimpleNamespace(message_from_string=cache(email.message_from_string))
+
+LONGEST = ("test_wheels.py", "test_demo.py", "test_cronos_reproduce.py", "test_slurm.py", "test_distributed.py")
+
+
+def pytest_collection_modifyitems(items):
+    """Files whose few tests take longest begin, so that no worker is left with one of them at the end."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
