@@ -84,10 +84,11 @@ def with_resets(row: Row) -> Row:
 
 
 PLAIN = Row(INTERVAL, end_effector_reset=True)
+CURRICULUM = Row(INTERVAL, end_effector_reset=True, curriculum=True)
 AIDS = (
     EPISODIC,
     PLAIN,
-    Row(INTERVAL, end_effector_reset=True, curriculum=True),
+    CURRICULUM,
     Row(INTERVAL, end_effector_reset=True, curriculum=True, learned_reset=True),
     BEST,
 )
@@ -136,7 +137,7 @@ for _experiment in (
     Experiment(
         "few_resets",
         "Learning with few resets",
-        (*SCREENED, *map(wide, SCREENED)),
+        (*SCREENED, *map(wide, SCREENED), *map(with_resets, (EPISODIC, CURRICULUM))),
         budgets=_BUDGETS,
         by_base=True,
     ),

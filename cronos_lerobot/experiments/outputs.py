@@ -148,11 +148,11 @@ def markdown(
 
 NOTES = (
     "Numbers are mean ± standard deviation (ddof = 1) over the seeds that are finished; in brackets the 95 %"
-    " t-interval of the mean over seeds, of one seed alone, or of several that came to the same, the Wilson interval"
-    " of one evaluation. n: episodes of one seed's evaluation. D and C are the areas between the curve and 1.0 over"
-    " interaction steps and over interventions (Equations 3 and 4), divided by the length of the axis: smaller is"
-    " better. Found complete, never grasped: of the successes at the end, all seeds together, those for which"
-    " nothing had to be done, and others without a grasp."
+    " t-interval of the mean over seeds, of one seed alone, or of several that came to the same, the Wilson"
+    " interval of one evaluation. n: episodes of one seed's evaluation. D and C are the areas between the curve"
+    " and 1.0 over interaction steps and over interventions (Equations 3 and 4), divided by the length of the"
+    " axis: smaller is better. Found complete, never grasped: of the successes at the end, all seeds together,"
+    " those for which nothing had to be done, and others without a grasp."
 )
 GAIN_NOTES = (
     "Success at the end of each run minus that of the base policy it began with, on the same episodes; 95 %"

@@ -116,7 +116,8 @@ class StreamConfig(PublishConfig):
     """Publish recorded streams or demonstrations, a LeRobotDataset."""
 
     root: Path | None = None
-    """Folder of the dataset: of cronos-train --record.root, by default <run>/streams, or of cronos-record-demos."""
+    """Folder of the dataset: that of cronos-record-demos, or of cronos-train --record.root, by default
+    <run>/streams."""
     run: Path | None = None
     """Folder of the training run, for the card; by default the one that the dataset lies in, if it does."""
 
