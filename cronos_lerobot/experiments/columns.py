@@ -35,7 +35,7 @@ def main_columns(result: ExperimentResult) -> Columns:
     if any(row.row.tag for row in result.rows):
         columns["row"] = [row.row.tag or MISSING for row in result.rows]
     for split in result.experiment.splits:
-        suffix = "" if len(result.experiment.splits) == 1 else f", {split.replace('_', '-')}"
+        suffix = "" if result.experiment.splits == ("train",) else f", {split.replace('_', '-')}"
         summaries = [row.success(split) for row in result.rows]
         columns[f"success{suffix}"] = [_cell(summary) for summary in summaries]
         columns[f"95 %{suffix}"] = [_interval(summary) for summary in summaries]
@@ -49,12 +49,14 @@ def main_columns(result: ExperimentResult) -> Columns:
     columns["seeds"] = [f"{row['seeds']}/{row['seeds_wanted']}" for row in rows]
     if any(row["paper_mean"] is not None for row in rows):
         columns["paper"] = [f"{row['paper_mean']:.3f} ± {row['paper_std']:.3f}" for row in rows]
-    columns["base"] = [_number(row["base_success_mean"], 3) for row in rows]
+    # The curve and its areas are of the training configurations, whatever the experiment is about.
+    trained = "" if "train" in result.experiment.splits else ", train"
+    columns[f"base{trained}"] = [_number(row["base_success_mean"], 3) for row in rows]
     columns["interventions"] = [_number(row["interventions_mean"], 0) for row in rows]
     if any(row.takeovers[0] for row in result.rows):
         columns["takeovers"] = [_takeovers(row) for row in result.rows]
-    columns["D / steps"] = [_cell(row.gap("interaction_steps")) for row in result.rows]
-    columns["C / interventions"] = [_cell(row.gap("interventions")) for row in result.rows]
+    columns[f"D / steps{trained}"] = [_cell(row.gap("interaction_steps")) for row in result.rows]
+    columns[f"C / interventions{trained}"] = [_cell(row.gap("interventions")) for row in result.rows]
     shared = rows[0]["shared_budget"] if rows else None
     if shared:
         title = f"C up to {shared:,}"

@@ -156,7 +156,9 @@ def row_styles(result: ExperimentResult) -> dict[str, Style]:
             plugs = sum(style.color in PLUG_COLORS for style in styles.values())
             number = plugs if row.row.tag else len(styles) - plugs
             colors = PLUG_COLORS if row.row.tag else GREYS
-            styles[label] = Style(label, colors[number % len(colors)], MARKERS[number % len(MARKERS)])
+            # Where colours and markers would begin anew together, the markers go on by one.
+            shift = number // math.lcm(len(colors), len(MARKERS))
+            styles[label] = Style(label, colors[number % len(colors)], MARKERS[(number + shift) % len(MARKERS)])
     return {row.row.name: styles[replace(row.row, base=NARROW).label] for row in result.rows}
 
 

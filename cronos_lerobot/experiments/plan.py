@@ -47,7 +47,7 @@ def make_jobs(experiments: Iterable[tuple[Experiment, tuple[Row, ...]]], options
             train = train_job(spec, base[-1].name if base else None)
             jobs |= {train.name: train}
             for evaluation in experiment.evaluations:
-                jobs |= {job.name: job for job in base_evaluation_jobs(spec.base, options, evaluation)}
+                jobs |= {job.name: job for job in base_evaluation_jobs(spec, evaluation)}
                 jobs |= {job.name: job for job in evaluation_jobs(spec, evaluation)}
     return list(jobs.values())
 
@@ -108,10 +108,10 @@ def train_flags(spec: RunSpec) -> list[str]:
 def train_job(spec: RunSpec, base: str | None) -> Job:
     """One run of `cronos-train`."""
     options = spec.options
-    extra, wanted = _eval_episodes(options)
+    extra, wanted, times = _eval_episodes(options)
     episodes = min(wanted, spec.row.num_configurations)
     # From few configurations as many episodes as from all.
-    repetitions = wanted // episodes if options.temperature else 1
+    repetitions = times * (wanted // episodes if options.temperature else 1)
     command = [
         "cronos-train",
         f"--policy.path={base_policy(spec.base, options)}",
@@ -158,14 +158,18 @@ def _recipe_flags(spec: RunSpec) -> list[str]:
     return [flag for flag in ALGORITHM_FLAGS[spec.options.obs_type] if not flag.startswith(tuple(others))]
 
 
-def _eval_episodes(options: Options) -> tuple[list[str], int]:
-    """The other flags that were given for every run, and the episodes of each task in its evaluations."""
-    name = "--eval.n_episodes="
-    given = [flag.removeprefix(name) for flag in options.extra if flag.startswith(name)]
-    if not given or not given[-1].isdigit() or not int(given[-1]):
+def _eval_episodes(options: Options) -> tuple[list[str], int, int]:
+    """The other flags that were given for every run; episodes of each task in its evaluations, and how often."""
+    numbers = {"--eval.n_episodes": options.scale.eval_episodes, "--eval.repetitions": 1}
+    others = []
+    for flag in options.extra:
+        name, _, value = flag.partition("=")
         # What is no number is told when the command is checked.
-        return list(options.extra), options.scale.eval_episodes
-    return [flag for flag in options.extra if not flag.startswith(name)], int(given[-1])
+        if name in numbers and value.isdigit() and int(value):
+            numbers[name] = int(value)
+        else:
+            others.append(flag)
+    return others, numbers["--eval.n_episodes"], numbers["--eval.repetitions"]
 
 
 def resume_command(folder: Path, command: Iterable[str]) -> list[str] | None:
@@ -212,18 +216,19 @@ def checkpoint_evaluations(spec: RunSpec, evaluation: CheckpointEvaluation) -> l
     return jobs
 
 
-def base_evaluation_jobs(base: Base, options: Options, evaluation: CheckpointEvaluation) -> list[Job]:
-    """`cronos-eval` of the base policy, where curves begin."""
+def base_evaluation_jobs(spec: RunSpec, evaluation: CheckpointEvaluation) -> list[Job]:
+    """`cronos-eval` of the base policy, where a run's curves begin, in the run's environment."""
     if not evaluation.every_checkpoint:
         return []
+    base, options, own = spec.base, spec.options, _env_flags(spec.row.flags)
     jobs, policy = [], base_policy(base, options)
     # Checkpoints of the runs have these in their config.
     settings = [flag for flag in options.extra if options.policy_path and flag.startswith("--policy.")]
     needed = None if options.policy_path else (base_jobs(base, options)[-1].name, policy)
     for split in evaluation.splits:
-        folder = base_evaluation_folder(base, evaluation.suite, split, options)
+        folder = base_evaluation_folder(base, evaluation.suite, split, options, own)
         command = eval_command(policy, base.scene, evaluation.suite, split, folder, options)
-        command = _with_flags(command, _env_flags(options.extra), settings)
+        command = _with_flags(command, own, _env_flags(options.extra), settings)
         name = f"base/{folder.parent.name}/{folder.name}"
         jobs.append(_eval_job(name, command, folder, needed, base.scene, options.root))
     return jobs

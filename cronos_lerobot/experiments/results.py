@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from cronos_lerobot.evaluation.policy_source import PINNED
 from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.experiments.definitions import INTERVENTIONS, CheckpointEvaluation, Experiment, Row
 from cronos_lerobot.experiments.jobs import Job, known_changes, other_commits, read_record, status
@@ -224,11 +225,12 @@ class ExperimentResult:
     def bases(self) -> dict[str, dict[str, list[SeedResult]]]:
         """By its folder's name, then by the fingerprint of the policy that was cloned there: the runs from it.
 
-        Two machines may clone the same demonstrations to other last bits.
+        Two machines may clone the same demonstrations to other last bits. A policy of the Hub has its commit in
+        place of a fingerprint: runs may have begun before and after it was pushed anew.
         """
         found: dict[str, dict[str, list[SeedResult]]] = {}
         for seed in (seed for row in self.rows for seed in row.seeds):
-            if base := seed.run.base:
+            if base := seed.run.base or _commit_of(seed.run):
                 name = (
                     "--policy.path" if self.options.policy_path else base_folder(seed.spec.base, self.options).name
                 )
@@ -279,6 +281,13 @@ def collect(experiment: Experiment, rows: Iterable[Row], options: Options) -> Ex
     return result
 
 
+def _commit_of(run: TrainingRun) -> str | None:
+    """The repository that a run began with and its commit; None if it began with no policy of the Hub."""
+    policy = run.config.get("policy") or {}
+    path, commit = policy.get("pretrained_path"), policy.get(PINNED)
+    return f"{path}@{commit}" if path and commit else None
+
+
 def _has_record(spec: RunSpec) -> bool:
     metrics = spec.train_folder / METRICS
     return metrics.is_file() and b"\n" in metrics.read_bytes()
@@ -300,7 +309,7 @@ def _read_seed(spec: RunSpec, result: ExperimentResult) -> SeedResult | None:
         return None
     result.commits += [f"{spec.name}: {commit}" for commit in other_commits(job)]
     for evaluation in result.experiment.evaluations:
-        for job in base_evaluation_jobs(spec.base, spec.options, evaluation):
+        for job in base_evaluation_jobs(spec, evaluation):
             _read_evaluation(job, 0, evaluation, seed, result)
         for job, checkpoint in checkpoint_evaluations(spec, evaluation):
             _read_evaluation(job, seed.place(checkpoint), evaluation, seed, result)

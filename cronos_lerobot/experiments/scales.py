@@ -173,8 +173,12 @@ def base_recipe(scale: Scale, scene: str, obs_type: str, *, clean: bool = False,
 
 def _for_tasks(recipe: BaseRecipe, scene: str) -> BaseRecipe:
     """A recipe of `MODEL` with as many demonstrations and gradient steps for each task of another scene."""
-    from lerobot_env_cronos.scene.scenes import get_scene
+    from lerobot.utils.import_utils import register_third_party_plugins
+    from lerobot_env_cronos.scene.scenes import SCENES, get_scene
 
+    if scene not in SCENES:
+        # An installed one is registered by the import of its package.
+        register_third_party_plugins()
     tasks, of = len(get_scene(scene).tasks), len(get_scene(MODEL).tasks)
     more = replace(
         recipe,

@@ -13,7 +13,7 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -285,10 +285,10 @@ class Cluster:
             try:
                 array("base", bases, None)
                 # `any`: what an element needs it looks for itself, and others may have theirs.
-                needed = {need for element in runs for job in element for need in job.needs}
-                first = sorted({number for name, number in (queued | submitted).items() if name in needed})
-                numbers = array("run", runs, f"afterany:{':'.join(first)}" if first else None)
+                begun, runs = behind_runs(runs, queued, made)
+                numbers = array("run", runs, _after_any(runs, queued | submitted))
                 array("evaluation", evaluations, _after_each(numbers, len(evaluations)))
+                array("evaluation", begun, _after_any(begun, queued))
             finally:
                 # What the cluster has taken is remembered, also where it refused the rest.
                 new = {name: Submission(number, list(made[name].command)) for name, number in submitted.items()}
@@ -323,6 +323,23 @@ def _needs(element: list[Job], made: dict[str, Job]) -> list[Job]:
     """The jobs that an element needs and others make."""
     own = {job.name for job in element}
     return [made[name] for name in dict.fromkeys(need for job in element for need in job.needs) if name not in own]
+
+
+def behind_runs(elements: Elements, queued: Container[str], made: Mapping[str, Job]) -> tuple[Elements, Elements]:
+    """Those that wait for a run in the queue, and the others, which need not wait for it."""
+    behind = [
+        element
+        for element in elements
+        if any(need in queued and made[need].stage != BASE for job in element for need in job.needs)
+    ]
+    return behind, [element for element in elements if element not in behind]
+
+
+def _after_any(elements: Elements, ids: Mapping[str, str]) -> str | None:
+    """The dependency of an array on all that its elements need."""
+    needed = {need for element in elements for job in element for need in job.needs}
+    first = sorted({number for name, number in ids.items() if name in needed})
+    return f"afterany:{':'.join(first)}" if first else None
 
 
 def _after_each(ids: list[str], number: int) -> str | None:

@@ -145,11 +145,12 @@ def base_policy(base: Base, options: Options) -> str:
     return str(base_folder(base, options) / "clone" / CHECKPOINTS_DIR / checkpoint / PRETRAINED_MODEL_DIR)
 
 
-def base_evaluation_folder(base: Base, suite: str, split: str, options: Options) -> Path:
-    """`--output_dir` of an evaluation of the base policy."""
+def base_evaluation_folder(base: Base, suite: str, split: str, options: Options, own: Iterable[str] = ()) -> Path:
+    """`--output_dir` of an evaluation of the base policy; `own` are a row's flags of the environment."""
     if options.policy_path:
         given = hashlib.sha256(options.policy_path.encode()).hexdigest()[:8]
         folder = options.root / "base" / f"{base.scene}_{OBS_NAMES[options.obs_type]}_{given}"
     else:
         folder = base_folder(base, options)
-    return folder / f"{suite}_{split}{'_smoke' if options.scale.smoke else ''}"
+    there = hashlib.sha256(" ".join(own).encode()).hexdigest()[:8] if (own := sorted(own)) else ""
+    return folder / "_".join(filter(None, (suite, split, there, "smoke" if options.scale.smoke else "")))

@@ -93,6 +93,9 @@ def config_facts(config: dict[str, Any]) -> dict[str, Any]:
         "configurations": _describe_configurations(env.get("benchmark"), protocol),
         "protocol": protocol,
         "protocol_name": describe_protocol(protocol),
+        "scene_resets": _describe_scene_resets(protocol),
+        "reset_phase": protocol["reset_phase"] if protocol.get("reset_phase", "together") != "together" else None,
+        "takeovers": _describe_takeovers(protocol),
         "algorithm": config["algorithm"]["type"],
         "learned": _describe_learning(config["algorithm"]),
         "learned_tag": LEARNED.get(config["algorithm"]["type"], (None, None))[1],
@@ -116,6 +119,23 @@ def run_facts(run: TrainingRun) -> dict[str, Any]:
         "num_starts": len(run.starts),
         "changed": [f"{name}={values}" for name, values in run.changed.items()],
     }
+
+
+def _describe_scene_resets(protocol: dict[str, Any]) -> str:
+    """When there is a scene reset, in words; critics ask for them where T has its default, too."""
+    if protocol.get("scene_reset", "periodic") == "critic":
+        return "asked for by the critic"
+    interval = protocol["scene_reset_interval"]
+    return f"every {interval} steps of a stream" if interval else "never"
+
+
+def _describe_takeovers(protocol: dict[str, Any]) -> str | None:
+    """When an expert takes over, in words; None if it never does."""
+    if (after := protocol.get("takeover_after")) is None:
+        return None
+    budget, price = protocol.get("takeover_budget"), protocol["takeover_price"]
+    limit = f", at most {budget} interventions in all" if budget is not None else ""
+    return f"after {after} failures in a row, each counts as {price}{limit}"
 
 
 def _describe_learning(algorithm: dict[str, Any]) -> str:

@@ -167,7 +167,7 @@ def read_side(folders: Sequence[Path]) -> Side:
         for path in metrics:
             if path.resolve() not in runs:
                 _keep(notes, lambda path=path: runs.setdefault(path.resolve(), read_training_run(path.parent)))
-    groups = group_runs(list(runs.values()))
+    groups = group_runs(list(runs.values()), notes)
     if len(groups) > 1:
         labels = "; ".join(group.label for group in groups)
         raise ValueError(f"{_names(folders)}: runs of {len(groups)} experiments, not seeds of one: {labels}")

@@ -24,7 +24,18 @@ from cronos_lerobot.report.statistics import Rate
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")
 """Okabe and Ito's palette: told apart by the colour-blind too."""
-LINES_AND_HATCHES = (("-", ""), ("--", "////"), (":", "...."), ("-.", "xxxx"))
+Line = str | tuple[int, tuple[float, ...]]
+"""By matplotlib's name, or an offset and lengths of dashes and gaps [line widths]."""
+LINES_AND_HATCHES: tuple[tuple[Line, str], ...] = (
+    ("-", ""),
+    ("--", "////"),
+    (":", "...."),
+    ("-.", "xxxx"),
+    ((0, (8, 1.5, 1, 1.5, 1, 1.5)), "\\\\\\\\"),
+    ((0, (9, 4)), "||||"),
+    ((0, (6, 1.5, 2, 1.5)), "----"),
+    ((0, (1, 4)), "oooo"),
+)
 """Of lines and bars, for each time that the colours begin anew."""
 SPLIT_LABELS = {"train": "training configurations", "held_out": "held-out configurations"}
 INK, GRID = "#333333", "#e4e4e4"
@@ -169,7 +180,7 @@ def _label(group: Group) -> str:
     return group.label if len(group.runs) == 1 else f"{group.label} ({len(group.runs)} seeds)"
 
 
-def style_of(i: int) -> tuple[str, str, str]:
+def style_of(i: int) -> tuple[str, Line, str]:
     """The colour, the line and the hatch that tell row number `i` of a figure from the others."""
     return (COLORS[i % len(COLORS)], *LINES_AND_HATCHES[i // len(COLORS) % len(LINES_AND_HATCHES)])
 
@@ -188,7 +199,7 @@ def draw_curve(
     if curve is None:
         return
     color, line, _ = style_of(i)
-    ax.plot(curve.x, curve.y, line, color=color, lw=width, marker=marker, ms=marker_size, label=label)
+    ax.plot(curve.x, curve.y, linestyle=line, color=color, lw=width, marker=marker, ms=marker_size, label=label)
     ax.fill_between(curve.x, curve.low, curve.high, color=color, alpha=0.18, lw=0)
 
 

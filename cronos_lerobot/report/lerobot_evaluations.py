@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_env_cronos import load_benchmark
+from lerobot_env_cronos.benchmark.benchmark import SUITES
 
 from cronos_lerobot.report.statistics import ChainRate, Rate, sum_rates
 
@@ -54,12 +55,20 @@ def read_evaluation_runs(
         folder: holds eval_info.json.
         scene: the scene, which the file does not name; its tasks are numbered in the file.
         benchmark: whose episodes they are, as `--env.benchmark` names it; the package's by default.
+
+    Raises:
+        ValueError: it is of an environment other than CRONOS, or of a split that there is not.
     """
     episodes = load_benchmark(benchmark, scene)
     runs: dict[str, EvaluationRun] = {}
     for entry in json.loads((folder / EVAL_INFO).read_text())["per_task"]:
         suite, number = entry["task_group"], entry["task_id"]
         kind, _, split = suite.partition("_")
+        if kind not in SUITES:
+            raise ValueError(
+                f"{folder / EVAL_INFO} is of another environment: its task group is {suite!r}, those of CRONOS"
+                f" begin with {' or '.join(SUITES)}"
+            )
         groups = {group.number: group for group in episodes.groups(kind, split)}
         run = runs.setdefault(suite, EvaluationRun(folder, suite, {}, {}, len(episodes.configurations[split])))
         if kind == "sequential":

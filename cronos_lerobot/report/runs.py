@@ -30,6 +30,8 @@ NOT_THE_EXPERIMENT = (
     "log_freq", "save_freq", "save_checkpoint", "keep_checkpoints",
 )  # fmt: skip
 """Top-level fields of a training config in which two runs of one experiment may differ."""
+STEPS = "steps"
+"""The one of them that is the experiment's where a budget is paced over it."""
 
 Evaluation = dict[str, Any]
 Update = dict[str, Any]
@@ -135,7 +137,7 @@ class FoundRuns:
     """Those of cronos-eval."""
     left_out: list[str]
     """What could not be read, a sentence for each: crashed before its first record, damaged, of version 0. And
-    the evaluations of runs that are not `alike`."""
+    the evaluations of runs that are not `alike`, and the shorter of two runs of one seed."""
 
 
 def find_runs(folders: Iterable[Path], scene: str | None = None, benchmark: str | None = None) -> FoundRuns:
@@ -190,6 +192,7 @@ def find_runs(folders: Iterable[Path], scene: str | None = None, benchmark: str 
         raise ValueError("; ".join(left_out.values()))
     evaluations = [run for runs in evaluation.values() for run in runs]
     said = [*left_out.values(), *(run.left_out for run in training.values() if run.left_out)]
+    group_runs(list(training.values()), said)
     return FoundRuns(list(training.values()), evaluations, read_suite_runs(suites), said)
 
 
@@ -272,33 +275,40 @@ def _with_defaults(config: dict[str, Any]) -> dict[str, Any]:
     return config | {"protocol": draccus.encode(ProtocolConfig()) | config["protocol"]}
 
 
-def group_runs(runs: list[TrainingRun]) -> list[Group]:
+def _experiment_of(run: TrainingRun) -> dict[str, Any]:
+    """The config of a run without what its seeds and longer runs may have otherwise."""
+    mine = {name: value for name, value in run.config.items() if name not in NOT_THE_EXPERIMENT}
+    if policy := mine.get("policy"):
+        mine["policy"] = {name: value for name, value in policy.items() if name not in PUSHED}
+    config = _below_root(_with_defaults(mine))
+    protocol = config.get("protocol") or {}
+    # A longer run spends its budget more slowly: it does not begin with the shorter one.
+    is_paced = protocol.get("scene_reset") == "critic" or protocol.get("takeover_budget") is not None
+    return config | {STEPS: run.config.get(STEPS)} if is_paced else config
+
+
+def group_runs(runs: list[TrainingRun], notes: list[str] | None = None) -> list[Group]:
     """Group runs by their config but for seed and length, labelled by what tells the groups apart.
 
     A run that was resumed with other flags of the protocol or the agent is of its own kind, as its label says.
 
     Of several runs of one seed from one policy a group has the longest.
+
+    Args:
+        runs: of any experiments.
+        notes: takes a sentence for each run that is in no group.
     """
     groups: dict[str, Group] = {}
     flat = {}
     for run in runs:
-        mine = {name: value for name, value in run.config.items() if name not in NOT_THE_EXPERIMENT}
-        if policy := mine.get("policy"):
-            mine["policy"] = {name: value for name, value in policy.items() if name not in PUSHED}
-        config = _below_root(_with_defaults(mine))
+        config = _experiment_of(run)
         key = json.dumps([config, run.changed], sort_keys=True) if config else str(run.folder)
-        group = groups.setdefault(key, Group(run.name))
-        # A longer run of the same seed begins with the shorter one: counted twice it would narrow the spread.
-        same = next((other for other in group.runs if _are_of_one_seed(run, other)), None)
-        if same is None:
-            group.runs.append(run)
-        elif run.last["interaction_steps"] > same.last["interaction_steps"]:
-            group.runs[group.runs.index(same)] = run
+        _add_run(groups.setdefault(key, Group("")), run, notes)
         flat[key] = _flatten(config)
-    names = sorted({name for config in flat.values() for name in config})
-    differing = [name for name in names if len({config.get(name) for config in flat.values()}) > 1]
+    differing = _find_differing(flat.values())
     others = [name for name in differing if name not in DESCRIBED]
     for key, group in groups.items():
+        group.label = _shared_name(group.runs)
         # Where one group is all there is, the name of one of its runs would stand for all of them.
         is_alone = len(groups) == 1 and len(group.runs) > 1 and "protocol" in group.runs[0].config
         if is_alone or (differing and len(others) <= 3):
@@ -314,10 +324,47 @@ def group_runs(runs: list[TrainingRun]) -> list[Group]:
     return list(groups.values())
 
 
+def _add_run(group: Group, run: TrainingRun, notes: list[str] | None) -> None:
+    """Add a run to its group, or keep the longer of it and one of the same seed."""
+    # A longer run of the same seed begins with the shorter one: counted twice it would narrow the spread.
+    same = next((other for other in group.runs if _are_of_one_seed(run, other)), None)
+    if same is None:
+        group.runs.append(run)
+        return
+    is_longer = run.last["interaction_steps"] > same.last["interaction_steps"]
+    kept, dropped = (run, same) if is_longer else (same, run)
+    group.runs[group.runs.index(same)] = kept
+    if notes is not None:
+        steps, more = (one.last["interaction_steps"] for one in (dropped, kept))
+        notes.append(
+            f"the run {dropped.folder}, of {steps:,} steps: {kept.folder} is of the same settings and seed and has"
+            f" {more:,}"
+        )
+
+
+def _shared_name(runs: list[TrainingRun]) -> str:
+    """The words that the names of runs begin with, such as `t80` of `t80/seed1`; all names where there is none."""
+    if len(runs) == 1:
+        return runs[0].name
+    shared = ""
+    for words in zip(*(re.split(r"([/._-])", run.name) for run in runs), strict=False):
+        if len(set(words)) > 1:
+            break
+        shared += words[0]
+    return shared.rstrip("/._-") or ", ".join(run.name for run in runs)
+
+
+def _find_differing(configs: Iterable[dict[str, str]]) -> list[str]:
+    """Settings that are not the same in all of these; of `steps` those count that a budget is paced over."""
+    configs = list(configs)
+    values = {name: {config.get(name) for config in configs} for config in configs for name in config}
+    values.get(STEPS, set()).discard(None)
+    return sorted(name for name, several in values.items() if len(several) > 1)
+
+
 def _tell_apart(alike: dict[str, Group], flat: dict[str, dict[str, str]]) -> None:
     """Add to one label of several groups what words do not say, or where that is too much their folders."""
-    names = sorted({name for key in alike for name in flat[key]})
-    differing = [name for name in names if len({flat[key].get(name) for key in alike}) > 1]
+    differing = _find_differing(flat[key] for key in alike)
     for key, group in alike.items():
         is_short = 0 < len(differing) <= 3
         group.label += f" ({_name_values(flat[key], differing) if is_short else group.runs[0].folder})"
@@ -330,7 +377,8 @@ def _are_of_one_seed(run: TrainingRun, other: TrainingRun) -> bool:
 
 
 def _name_values(config: dict[str, str], names: list[str]) -> str:
-    return ", ".join(f"{name.split('.')[-1]}={config.get(name)}" for name in names)
+    told = [name for name in names if name != STEPS or name in config]
+    return ", ".join(f"{name.split('.')[-1]}={config.get(name)}" for name in told)
 
 
 def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, str]:

@@ -8,10 +8,11 @@ from experiment_runs import by_row, evaluation, make_run, results, write_results
 from synthetic_runs import INSTRUCTIONS, write_training_run
 
 from cronos_lerobot.experiments import plots, tables
+from cronos_lerobot.experiments.columns import main_columns
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base, CheckpointEvaluation, Row
 from cronos_lerobot.experiments.jobs import made_by, write_record
 from cronos_lerobot.experiments.outputs import write_outputs
-from cronos_lerobot.experiments.plan import train_job
+from cronos_lerobot.experiments.plan import base_evaluation_jobs, train_job
 from cronos_lerobot.experiments.results import collect
 from cronos_lerobot.experiments.specs import base_evaluation_folder, run_specs
 
@@ -33,6 +34,29 @@ def test_held_out_curve_is_cronos_evals(options, tmp_path):
     assert (row["success_train_mean"], row["success_held_out_mean"]) == (0.75, 0.625)
     text = write_outputs(EXPERIMENTS["figure4"], EXPERIMENTS["figure4"].rows, options, tmp_path / "out")
     assert "success, held-out" in text
+
+
+def test_a_row_of_its_own_environment_begins_where_the_base_stands_there(options, monkeypatch):
+    """Its curve's first point is of the same episodes as the others."""
+    there = Row(80, tag="there", flags=("--env.benchmark=me/bench",))
+    curves = (CheckpointEvaluation("independent", ("held_out",), every_checkpoint=True),)
+    experiment = replace(EXPERIMENTS["figure4"], rows=(Row(80), there), evaluations=curves)
+    here, own = run_specs(experiment, options)[:2]
+    jobs = [base_evaluation_jobs(spec, curves[0])[0] for spec in (here, own)]
+    assert [("--env.benchmark=me/bench" in job.command) for job in jobs] == [False, True]
+    assert jobs[0].output == base_evaluation_folder(here.base, "independent", "held_out", options)
+    write_results(jobs[1].output, "independent", "held_out", evaluation(0.25))
+    monkeypatch.setitem(EXPERIMENTS, "there", experiment)
+    make_run(options, "there", there.name, 1, (2, 4, 6))
+    (seed,) = results(options, "there").rows[1].seeds
+    assert [(p.interaction_steps, p.success) for p in seed.curve("held_out")] == [(0, 0.25)]
+
+
+def test_one_split_that_is_not_the_curves_is_named(options):
+    experiment = replace(EXPERIMENTS["figure4"], splits=("held_out",))
+    make_run(options, "figure4", "t320_eer", 1, (2, 4, 6))
+    titles = main_columns(collect(experiment, experiment.rows, options)).keys()
+    assert {"success, held-out", "base, train", "D / steps, train", "C / interventions, train"} <= titles
 
 
 def test_seeds_without_an_evaluation_are_not_counted_as_if_they_had_one(options, tmp_path):

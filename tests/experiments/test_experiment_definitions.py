@@ -188,6 +188,11 @@ def test_given_numbers_of_episodes_hold_for_rows_with_one_configuration():
     flags = {name: jobs[f"kitchen_2x2_state_paper/{name}_1300k/seed1"].command for name in ("t80", "t80_1config")}
     assert {"--eval.n_episodes=16", "--eval.repetitions=1", "--algorithm.target_kl=0.02"} <= set(flags["t80"])
     assert {"--eval.n_episodes=1", "--eval.repetitions=16"} <= set(flags["t80_1config"])
+    # Three times each are three times as many of a single one, too.
+    jobs = jobs_of("figure4", extra=("--eval.repetitions=3",))
+    flags = {name: jobs[f"kitchen_2x2_state_paper/{name}_1300k/seed1"].command for name in ("t80", "t80_1config")}
+    assert {"--eval.n_episodes=64", "--eval.repetitions=3"} <= set(flags["t80"])
+    assert {"--eval.n_episodes=1", "--eval.repetitions=192"} <= set(flags["t80_1config"])
 
 
 @pytest.mark.parametrize(

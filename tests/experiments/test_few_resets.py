@@ -205,6 +205,14 @@ def test_rows_of_the_paper_are_grey_and_the_same_on_both_bases(drawn):
     )
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_no_two_rows_look_alike(name, tmp_path):
+    """Once five greys and five markers began anew together, and the sixth row looked as the first."""
+    experiment = EXPERIMENTS[name]
+    styles = set(row_styles(collect(experiment, experiment.rows, options_of(name, tmp_path))).values())
+    assert len({(style.color, style.marker) for style in styles}) == len(styles)
+
+
 def test_ends_are_joined_by_budget(tmp_path):
     options = options_of("few_resets_budgets", tmp_path / "root")
     for interval, wins in ((1280, 7), (5120, 5)):

@@ -1,6 +1,7 @@
 """Experiments of one's own: what their fields may be is told when they are declared, not after their runs."""
 
 import pytest
+from lerobot.utils import import_utils
 from lerobot_env_cronos.benchmark.benchmark import SUITES
 from lerobot_env_cronos.benchmark.configurations import SPLITS
 from lerobot_env_cronos.scene.scenes import SCENES, Scene
@@ -119,3 +120,12 @@ def test_a_scene_of_ones_own_has_as_much_for_each_task(monkeypatch):
     assert (recipe.demos, recipe.clone_steps, recipe.kind) == (1600, 1200, "wide_resets")
     with pytest.raises(ValueError, match="unknown scene 'nowhere'"):
         base_recipe(SCALES["small"], "nowhere", STATE)
+
+
+def test_the_scene_of_an_installed_package_is_known(monkeypatch):
+    """Its import registers it, which nothing has asked for when an experiment is planned or reported."""
+    scene = Scene("desk_2x2", objects=("toy bear", "plastic bottle"), receptacles=("cloth", "carpet"))
+    monkeypatch.setattr(
+        import_utils, "register_third_party_plugins", lambda: monkeypatch.setitem(SCENES, scene.name, scene)
+    )
+    assert base_recipe(SCALES["small"], "desk_2x2", STATE).demos == 400

@@ -12,7 +12,7 @@ from slurm_cluster import SlurmCluster, missing
 from cronos_lerobot.experiments.follow import Follower
 from cronos_lerobot.experiments.jobs import BASE, EVALUATION, RUN, Job, read_record, write_record
 from cronos_lerobot.experiments.runner import ENDING_SIGNALS
-from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, Task, plan_arrays
+from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, Task, behind_runs, plan_arrays
 from cronos_lerobot.experiments.submitted import read_submitted
 
 needs_slurm = pytest.mark.skipif(
@@ -95,6 +95,15 @@ def test_arrays_have_bases_then_runs_then_their_evaluations(tmp_path):
     assert [[[job.name for job in element] for element in array] for array in made] == [
         [], [["r2"], ["r1"], ["e3"]], [["e2", "f2"]],
     ]  # fmt: skip
+
+
+def test_what_waits_for_a_queued_run_keeps_no_other_waiting(tmp_path):
+    clone = job(tmp_path, "clone", stage=BASE)
+    r1, r2 = (job(tmp_path, f"r{n}", stage=RUN, needs=("clone",)) for n in (1, 2))
+    e1 = job(tmp_path, "e1", stage=EVALUATION, needs=("r1",))
+    made = {one.name: one for one in (clone, r1, r2, e1)}
+    assert behind_runs([[r2], [e1]], {"clone", "r1"}, made) == ([[e1]], [[r2]])
+    assert behind_runs([[r2], [e1]], {"clone"}, made) == ([], [[r2], [e1]])
 
 
 def test_a_time_limit_that_leaves_nothing_to_go_on_with_ends_the_job(tmp_path, capsys):

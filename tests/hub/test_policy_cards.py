@@ -25,6 +25,7 @@ from cronos_lerobot.hub import policy as hub_policy
 from cronos_lerobot.hub.caveats import changes_of_policy
 from cronos_lerobot.hub.config import PolicyConfig
 from cronos_lerobot.hub.eval_flags import lerobot_eval_flags
+from cronos_lerobot.hub.runs import config_facts
 from cronos_lerobot.scripts.publish import publish_policy
 from cronos_lerobot.training.config import CronosTrainConfig
 
@@ -282,6 +283,41 @@ def test_a_card_says_what_a_resume_changed(tmp_path, monkeypatch):
         manifest.write_text(json.dumps({"starts": [start, again | {"interaction_steps": began}]}))
         card = dry_run(checkpoint, tmp_path / f"out_{began}")
         assert f"| flags that a resume changed | {told} |" in card
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        # T has its default there, too.
+        ({"scene_reset": "critic", "reset_budget": 100}, {"scene reset": "asked for by the critic"}),
+        ({"scene_reset_interval": None}, {"scene reset": "never"}),
+        ({"reset_phase": "staggered", "takeover_after": 2, "takeover_price": 3, "takeover_budget": 60},
+         {"scene reset": "every 1280 steps of a stream", "phase of scene resets": "staggered",
+          "takeovers": "after 2 failures in a row, each counts as 3, at most 60 interventions in all"}),
+        ({"takeover_after": 2},
+         {"scene reset": "every 1280 steps of a stream",
+          "takeovers": "after 2 failures in a row, each counts as 1"}),
+    ],
+)  # fmt: skip
+def test_a_card_says_who_resets_and_who_takes_over(tmp_path, monkeypatch, changes, told):
+    monkeypatch.setattr(hub_policy, "FIGURES", {})
+    checkpoint = write_checkpoint(tmp_path, "pocketvla", CronosEnvConfig(**STATE), PPOConfig())
+    manifest = tmp_path / "run/manifest.json"
+    (start,) = json.loads(manifest.read_text())["starts"]
+    start["config"]["protocol"] |= changes
+    manifest.write_text(json.dumps({"starts": [start]}))
+    rows = dict(re.findall(r"^\| ([^|]*) \| ([^|]*) \|$", dry_run(checkpoint, tmp_path / "out"), re.MULTILINE))
+    asked = ("scene reset", "phase of scene resets", "takeovers")
+    assert {name: rows[name] for name in asked if name in rows} == told
+
+
+def test_a_run_that_is_older_than_the_flags_has_facts_too():
+    config = json.loads(json.dumps(draccus.encode(CronosTrainConfig(env=CronosEnvConfig(**STATE)))))
+    for name in ("scene_reset", "reset_phase", "takeover_after", "takeover_price", "takeover_budget"):
+        del config["protocol"][name]
+    facts = config_facts(config)
+    told = facts["scene_resets"], facts["reset_phase"], facts["takeovers"]
+    assert told == ("every 1280 steps of a stream", None, None)
 
 
 def test_a_card_of_a_run_that_began_with_a_folder_names_no_repository(tmp_path, monkeypatch):

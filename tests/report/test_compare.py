@@ -199,6 +199,17 @@ def test_a_run_that_did_not_come_as_far_is_left_out(tmp_path, monkeypatch, capsy
     assert (len(found["comparisons"][0]["b"]), found["left_out"]) == (2, [])
 
 
+def test_of_two_runs_of_one_seed_the_shorter_is_said(tmp_path, monkeypatch, capsys):
+    a = write_run(tmp_path / "a", 1, ["1000", "0000"])
+    for name, steps in (("short", 5120), ("long", 10240)):
+        write_run(tmp_path / "b" / name, 1, ["1111", "0000"], steps=steps)
+    found = compared(monkeypatch, capsys, a, tmp_path / "b")
+    assert found["comparisons"][0]["b"] == ["long 0010240"]
+    (note,) = found["left_out"]
+    assert "b/short, of 5,120 steps: " in note
+    assert note.endswith("b/long is of the same settings and seed and has 10,240")
+
+
 def test_runs_without_a_cronos_eval_are_not_dropped_for_those_that_have_one(tmp_path, monkeypatch, capsys):
     a = write_run(tmp_path / "a", 1, ["1000", "0000"])
     for seed in (1, 2):

@@ -19,7 +19,11 @@ def test_more_rows_than_colours_are_told_apart():
     for i in range(28):
         draw_curve(ax, Curve(np.arange(2), *np.ones((3, 2)), False), i, str(i))
     assert len({(line.get_color(), line.get_linestyle()) for line in ax.lines}) == 28
-    assert len({(color, hatch) for color, _, hatch in map(style_of, range(28))}) == 28
+    # few_resets has 42 rows, and matplotlib calls every line with dashes of one's own `--`.
+    assert len({(color, line) for color, line, _ in map(style_of, range(56))}) == 56
+    assert len({(color, hatch) for color, _, hatch in map(style_of, range(56))}) == 56
+    draw_curve(ax, Curve(np.arange(2), *np.ones((3, 2)), False), 28, "28")
+    assert ax.lines[28].is_dashed()
 
 
 @pytest.mark.parametrize("intervals", [(160,), (160, 320), (160, 320, 640)])

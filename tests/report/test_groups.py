@@ -117,8 +117,13 @@ def test_of_two_runs_of_one_seed_the_longer_counts(tmp_path):
     write_training_run(tmp_path / "short", seed=1, successes=(2, 3, 4), updates=4)
     write_training_run(tmp_path / "long", seed=1, successes=(2, 4, 6))
     write_training_run(tmp_path / "other", seed=2, successes=(2, 4, 4))
-    (group,) = group_runs(find_runs([tmp_path]).training)
+    found = find_runs([tmp_path])
+    (group,) = group_runs(found.training)
     assert sorted(run.name for run in group.runs) == ["long", "other"]
+    assert found.left_out == [
+        f"the run {tmp_path / 'short'}, of 5,120 steps: {tmp_path / 'long'} is of the same settings and seed and"
+        " has 10,240"
+    ]
     (row,) = seed_rows([group])
     assert row["seeds"] == 2
     # From another machine's clone the same seed is another run, where both say what they began with.
@@ -129,3 +134,60 @@ def test_of_two_runs_of_one_seed_the_longer_counts(tmp_path):
         manifest.write_text(json.dumps(content))
         (group,) = group_runs(find_runs([tmp_path]).training)
         assert len(group.runs) == count
+
+
+def edit_config(run, protocol=None, **changes):
+    manifest = run / "manifest.json"
+    content = json.loads(manifest.read_text())
+    config = content["starts"][0]["config"]
+    config |= changes
+    config["protocol"] |= protocol or {}
+    manifest.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(
+    ("protocol", "labels"),
+    [
+        ({}, ["T = 320"]),
+        ({"scene_reset": "critic", "reset_budget": 9}, ["steps=5120", "steps=10240"]),
+        ({"takeover_after": 2, "takeover_price": 1, "takeover_budget": 9}, ["steps=5120", "steps=10240"]),
+    ],
+    ids=["no pace", "resets", "takeovers"],
+)
+def test_a_budget_that_is_paced_over_the_steps_makes_a_longer_run_another_experiment(tmp_path, protocol, labels):
+    for seed in (1, 2):
+        for updates, steps in ((4, 5120), (8, 10240)):
+            run = write_training_run(tmp_path / f"{steps}/seed{seed}", seed=seed, interval=320, updates=updates)
+            edit_config(run, protocol, steps=steps)
+    found = find_runs([tmp_path / "5120", tmp_path / "10240"])
+    assert [group.label for group in group_runs(found.training)] == labels
+    assert len(found.left_out) == (0 if protocol else 2)
+    # What has no such budget is called as it would be without them.
+    edit_config(write_training_run(tmp_path / "80/seed1", interval=80), steps=10240)
+    groups = group_runs(find_runs([tmp_path]).training)
+    assert [group.label for group in groups if "steps=" not in group.label][-1] == "T = 80"
+
+
+def test_seeds_that_differ_from_others_in_too_much_are_called_by_what_their_names_share(tmp_path):
+    for row in ("t80_307k", "t1280_307k"):
+        for seed in (1, 2):
+            run = write_training_run(tmp_path / f"{row}/seed{seed}/train", seed=seed)
+            edit_config(run, algorithm=dict.fromkeys("vwxyz", row))
+    groups = group_runs(find_runs([tmp_path]).training)
+    assert sorted(group.label for group in groups) == ["t1280_307k", "t80_307k"]
+
+
+@pytest.mark.parametrize(
+    ("names", "label"),
+    [
+        (("eer_1", "eer_10"), "eer"),
+        (("eer", "eer_2"), "eer"),
+        (("seed1", "seed2"), "seed1, seed2"),
+        (("eer_1",), "eer_1"),
+    ],
+)
+def test_a_groups_name_is_whole_words_of_its_runs(tmp_path, names, label):
+    for seed, name in enumerate(names):
+        edit_config(write_training_run(tmp_path / name, seed=seed), algorithm=dict.fromkeys("vwxyz", 1))
+    write_training_run(tmp_path / "zzz")
+    assert [group.label for group in group_runs(find_runs([tmp_path]).training)] == [label, "zzz"]

@@ -1,6 +1,7 @@
 """The tasks that `lerobot-eval` numbers are those of the benchmark and scene that it ran."""
 
 import json
+import re
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -10,6 +11,7 @@ from lerobot_env_cronos.benchmark.files import write_benchmark
 from lerobot_env_cronos.scene.scenes import SCENES
 from synthetic_runs import INSTRUCTIONS, write_evaluation, write_training_run
 
+from cronos_lerobot.report.runs import find_runs
 from cronos_lerobot.scripts.report import make_report
 
 
@@ -50,3 +52,18 @@ def test_the_scene_is_that_of_the_runs_beside_them_unless_it_is_named(evaluation
     assert tasks_of(make_report([run], **evaluations, scene="kitchen_2x2")) == list(INSTRUCTIONS)
     with pytest.raises(ValueError, match="unknown scene 'nowhere'"):
         make_report([run], scene="nowhere")
+
+
+@pytest.mark.parametrize("group", ["pusht", "libero_spatial", "independently_train"])
+def test_an_evaluation_of_another_environment_is_said_to_be_one(tmp_path, group):
+    write_evaluation(tmp_path / "cronos")
+    other = write_evaluation(tmp_path / "other", group)
+    said = (
+        f"{other / 'eval_info.json'} is of another environment: its task group is '{group}', those of CRONOS begin"
+        " with independent or sequential"
+    )
+    found = find_runs([tmp_path])
+    assert found.left_out == [said]
+    assert [run.name for run in found.evaluations] == ["cronos"]
+    with pytest.raises(ValueError, match=re.escape(said)):
+        find_runs([other])
