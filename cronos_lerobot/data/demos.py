@@ -55,7 +55,7 @@ class DemoConfig:
     """What a demonstration is."""
 
     max_steps: int = 80
-    """Control steps until an episode counts as failed."""
+    """Control steps until an episode ends, as a failure if its task is not complete by then."""
     steps_after_release: int = 3
     """Frames kept after the object lies on its receptacle and is released."""
     keep_failures: bool = False
@@ -209,15 +209,15 @@ class DemoCollector:
         if not episode.preludes:
             for key, column in columns.items():
                 episode.frames.setdefault(key, []).append(column[stream].copy())
-        succeeded = episode.released > self.config.steps_after_release
+        rested = episode.released > self.config.steps_after_release
         is_late = episode.steps >= self.config.max_steps
         if info["diverged"][stream] and episode.preludes and self._is_policys(episode):
             self._discard(stream, episode)
         elif info["diverged"][stream]:
             self._end(stream, episode, succeeded=False, keep=False)
-        elif episode.preludes and (is_late if self._is_policys(episode) else succeeded):
+        elif episode.preludes and (is_late if self._is_policys(episode) else rested):
             self._end_prelude(stream, episode)
-        elif succeeded and not episode.preludes:
+        elif not episode.preludes and (rested or (is_late and info["is_success"][stream])):
             self._end(stream, episode, succeeded=True, keep=True)
         elif is_late:
             self._end(stream, episode, succeeded=False, keep=self.config.keep_failures and not episode.preludes)
@@ -236,7 +236,8 @@ class DemoCollector:
             is_last = np.arange(episode.steps) == episode.steps - 1
             # The expert stops because its task is done; a failure that is kept ran out of time.
             frames |= {DONE: is_last & succeeded, TRUNCATED: is_last & (not succeeded)}
-            metadata = {CONFIGURATION: episode.configuration, SUCCESS: succeeded}
+            # As in a stream: a failure may have lost again what it had put in its place.
+            metadata = {CONFIGURATION: episode.configuration, SUCCESS: bool(frames[SUCCESS].any())}
             self.writer.add_segment(frames, episode.task.instruction, episode_metadata=metadata)
             self._kept[episode.task] += 1
             self._on_episode(episode.steps)

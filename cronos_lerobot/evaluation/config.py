@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import datetime as dt
-import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import draccus
+from draccus.cfgparsing import load_config
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs.configs import EnvConfig
 from lerobot_env_cronos import Benchmark, CronosEnvConfig, gymnasium_id, load_benchmark
@@ -86,7 +86,8 @@ class CronosEvalConfig:
 
     env: EnvConfig = field(default_factory=CronosEnvConfig)
     """Scene, benchmark and observations. What is not given follows from the benchmark, if there is one, and from
-    the policy: the scene and the renderer that it was trained with, and the images or the state that it takes."""
+    the policy: the scene and the renderer that it was trained with, and the images or the state that it takes.
+    Flags and the file of --config_path give fields; in Python, values other than the defaults do."""
     policy: PreTrainedConfig | None = None
     """The policy: --policy.path=<checkpoint, or Hub id[@revision]>."""
     eval: SuitesConfig = field(default_factory=SuitesConfig)
@@ -206,11 +207,16 @@ class CronosEvalConfig:
             raise ValueError("choose a policy: --policy.path=<checkpoint or Hub id> (or --expert=true)")
 
     def _derive_env(self, given: set[str]) -> None:
-        """Set what no flag of --env gives: the training's scene and renderer, and what the policy observes."""
-        env = self.env
+        """Set what is not given: the training's scene and renderer, and what the policy observes.
+
+        Args:
+            given: fields of `env` that flags give.
+        """
+        env, default = self.env, CronosEnvConfig()
         assert isinstance(env, CronosEnvConfig)
-        if "--config_path" in {argument.split("=")[0] for argument in sys.argv[1:]}:
-            return
+        given = given | _env_of_file(parser.parse_arg("config_path"))
+        # A default that a config made in Python gives cannot be told from one that it leaves alone.
+        given |= {f.name for f in fields(env) if getattr(env, f.name) != getattr(default, f.name)}
         derived: dict[str, Any] = {}
         if self.policy is None:
             derived["obs_type"] = "environment_state_agent_pos"
@@ -325,6 +331,14 @@ class CronosEvalConfig:
     def __get_path_fields__(cls) -> list[str]:
         """Fields that take `--<field>.path`."""
         return ["policy"]
+
+
+def _env_of_file(path: str | None) -> set[str]:
+    """The fields of `env` that the file of --config_path gives, if there is one."""
+    if path is None:
+        return set()
+    with open(path) as file:
+        return set((load_config(file, file=path) or {}).get("env") or {})
 
 
 def _words(text: str) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from lerobot_env_cronos import Benchmark, EpisodeGroup
 from lerobot_env_cronos.benchmark.benchmark import SUITES
 from lerobot_env_cronos.benchmark.configurations import SPLITS
@@ -26,10 +27,19 @@ class Part:
     chains: tuple[Chain, ...]
     repetition: int = 0
     """How often the same chains come before it; each time they have the next seed."""
+    block: int = 0
+    """Of those that --stop_at_error runs of a suite and split, one after the other; 0 without it."""
 
     def noise(self, seed: int) -> Noise:
         """The randomness of its chains under its seed, the evaluation's plus `repetition`."""
         return chain_noise(STEPS_PER_TASK, seed, SUITES.index(self.suite), SPLITS.index(self.split))
+
+    def actor_seed(self, seed: int) -> int:
+        """What an actor with randomness of its own is seeded with, under the part's seed.
+
+        Another one for each block: no two of them draw the same numbers.
+        """
+        return int(np.random.SeedSequence([seed, self.block]).generate_state(1)[0]) if self.block else seed
 
 
 def make_parts(

@@ -133,7 +133,7 @@ class Evaluation:
         env.split = part.split
         # Every part begins like this, so that it ends the same whether others ran before it or not.
         seed = self.config.seed + part.repetition
-        actor.seed(seed)
+        actor.seed(part.actor_seed(seed))
         runner = ChainRunner(env, actor, keeps_states=self._is_filmed(part))
         results = runner.run(part.chains, part.noise(seed), show)
         records = chain_records(results)

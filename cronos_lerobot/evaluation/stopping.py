@@ -97,9 +97,9 @@ class StoppingEvaluation(Evaluation):
         shared = [chain for chain in chains if self._episode(suite, split, chain) in self.reference.lengths]
         key = self.config.seed, SUITES.index(suite), SPLITS.index(split)
         order = np.random.default_rng(key).permutation(len(shared))
-        for start in range(0, len(shared), LOOK_EVERY):
+        for block, start in enumerate(range(0, len(shared), LOOK_EVERY)):
             some = tuple(shared[i] for i in order[start : start + LOOK_EVERY])
-            yield Part(f"compared_{suite}_{split}_{start:05d}", suite, split, some)
+            yield Part(f"compared_{suite}_{split}_{start:05d}", suite, split, some, block=block)
 
     def _episode(self, suite: str, split: str, chain: Chain) -> Episode:
         return Episode(suite, split, chain.number, chain.configuration, self.config.seed)

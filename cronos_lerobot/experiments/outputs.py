@@ -265,7 +265,7 @@ def _unfinished(result: ExperimentResult) -> list[str]:
         lines += [f"- {text}" for text in result.changed]
     for name, policies in result.bases.items():
         if len(policies) > 1:
-            lines += ["", f"## Not one base policy: {len(policies)} clones called {name}", ""]
+            lines += ["", f"## Not one base policy: {len(policies)} policies called {name}", ""]
             lines += [f"- {base}: {_names(seeds)}" for base, seeds in policies.items()]
     if mixed := result.mixed:
         lines += ["", "## Rows whose runs had other settings by default", ""]

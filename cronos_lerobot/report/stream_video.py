@@ -39,7 +39,7 @@ from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import SegmentEnd, Step
 from cronos_lerobot.protocol.resets import make_resets
 from cronos_lerobot.protocol.rf_mtrl import rf_mtrl
-from cronos_lerobot.protocol.task_orders import TaskSet, check_task_order, make_task_order
+from cronos_lerobot.protocol.task_orders import TASK_ORDERS, TaskSet, check_task_order, make_task_order
 from cronos_lerobot.training.seeding import NamedGenerators
 
 EXPERT = "expert"
@@ -220,6 +220,25 @@ def _spectator(policy_config: PreTrainedConfig, env_config: CronosEnvConfig) -> 
     return PolicySpectator(load_actor(policy_config, env_config, temperature))
 
 
+def check_order(name: str) -> None:
+    """Check that a task order can do without a training, which it would be told of by `bind`.
+
+    Raises:
+        ValueError: it cannot, or there is none of that name; the sentence names those that can.
+    """
+    check_task_order(name)
+    if _goes_by_run(name):
+        valid = sorted(other for other in TASK_ORDERS if not _goes_by_run(other))
+        raise ValueError(
+            f"--task_order={name} goes by what it is told of a training (bind), and here nothing is trained: "
+            f"choose one of {valid}"
+        )
+
+
+def _goes_by_run(task_order: str) -> bool:
+    return hasattr(TASK_ORDERS[task_order](np.random.default_rng(0)), "bind")
+
+
 def make_parser() -> argparse.ArgumentParser:
     """The flags of this command."""
     description = (__doc__ or "").splitlines()[0]
@@ -233,7 +252,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--scene_reset_interval", type=int, help="control steps between scene resets; never if absent"
     )
-    parser.add_argument("--task_order", default="heuristic", help="heuristic or random")
+    parser.add_argument(
+        "--task_order", default="heuristic", help="heuristic or random, or one of your own that asks no agent"
+    )
     parser.add_argument("--no_end_effector_reset", action="store_true", help="leave the arm where it is")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("stream.mp4"), help="the MP4 (default: stream.mp4)")
@@ -253,7 +274,7 @@ def main() -> None:
             parser.error(f"--{name} must be at least 1, got {getattr(args, name)}")
     scene = {"scene": args.scene} if args.scene else {}
     try:
-        check_task_order(args.task_order)
+        check_order(args.task_order)
         protocol = ProtocolConfig(
             scene_reset_interval=args.scene_reset_interval,
             end_effector_reset=not args.no_end_effector_reset,

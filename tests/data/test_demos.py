@@ -288,6 +288,36 @@ def test_failures_are_dropped_unless_asked_for(env, tmp_path):
         collect(env, tmp_path / "e", DemoConfig(max_steps=1), 1, expert=Idle())
 
 
+def test_what_is_in_its_place_when_the_time_is_over_is_a_success(env, tmp_path):
+    """With no time left for the frames after the release, of which more are wanted than there are steps."""
+    config = DemoConfig(max_steps=60, steps_after_release=60, keep_failures=True)
+    dataset, collector = collect(env, tmp_path / "d", config, 4)
+    assert collector.successes == 4
+    for episode, row in zip(episodes_of(dataset), dataset.meta.episodes, strict=True):
+        assert len(episode["index"]) == 60
+        assert row["next.success"] == episode["next.success"][-1] == episode["next.done"][-1] == 1
+        assert not episode["next.truncated"].any()
+
+
+def test_the_row_of_a_failure_says_whether_its_task_was_ever_complete(env, tmp_path, monkeypatch):
+    """Of four steps the task is complete after the second, in two streams."""
+    step, steps = env.step, []
+
+    def lose(actions):
+        steps.append(step(actions))
+        # The first step of an episode is at rest, and not recorded.
+        steps[-1][4]["is_success"] = np.array([len(steps) == 3] * 2 + [False] * 2)
+        return steps[-1]
+
+    monkeypatch.setattr(env, "step", lose)
+    config = DemoConfig(max_steps=4, steps_after_release=9, keep_failures=True)
+    dataset, collector = collect(env, tmp_path / "d", config, 4)
+    assert collector.successes == 0
+    rows = dataset.meta.episodes["next.success"]
+    assert rows == [episode["next.success"].any() for episode in episodes_of(dataset)]
+    assert sum(rows) == 2
+
+
 def test_one_task_only(env, tmp_path):
     dataset, _ = collect(env, tmp_path / "d", DemoConfig(), 2, tasks=[env.scene.tasks[3]])
     assert dataset.meta.episodes["tasks"] == [[env.scene.tasks[3].instruction]] * 2

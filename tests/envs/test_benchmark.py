@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, get_scene, load_benchmark
 from lerobot_env_cronos.benchmark.benchmark import draw_benchmark, packaged_benchmark
-from lerobot_env_cronos.benchmark.configurations import load_configurations
+from lerobot_env_cronos.benchmark.configurations import SEED, SPLITS, load_configurations
 from lerobot_env_cronos.benchmark.files import BenchmarkError, read_benchmark, write_benchmark
 
 STATE = "environment_state_agent_pos"
@@ -66,6 +66,19 @@ def test_the_fingerprint_is_of_poses_and_chains():
         draw_benchmark("kitchen_2x2", seed=1, num_configurations=3),
     ]
     assert len({drawn.fingerprint, *(other.fingerprint for other in others)}) == 4
+
+
+@pytest.mark.parametrize("seed", [7, SEED])
+def test_each_split_and_the_orderings_are_drawn_by_themselves(seed):
+    """Whatever is asked for, a seed's first configurations and chains are the same, and nobody else's."""
+    few, many = (draw_benchmark("kitchen_2x2", seed, number, num_orderings=4) for number in (4, 8))
+    for split in SPLITS:
+        np.testing.assert_array_equal(many.configurations[split][:4], few.configurations[split])
+        chains = [[group.tasks for group in drawn.sequential[split]] for drawn in (few, many)]
+        assert chains[0] == chains[1]
+    known = [*many.configurations.values(), *packaged_benchmark("kitchen_2x2").configurations.values()]
+    first = np.concatenate(known)[:, 0, 0]
+    assert len(set(first)) == len(first) == 8 + 8 + 64 + 64
 
 
 def test_what_cannot_be_drawn():

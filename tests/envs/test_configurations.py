@@ -7,14 +7,17 @@ from importlib import resources
 import numpy as np
 import pytest
 from lerobot_env_cronos import SCENES, CronosVectorEnv, get_scene
+from lerobot_env_cronos.benchmark import configurations
 from lerobot_env_cronos.benchmark.configurations import (
     CLEARANCE_M,
+    OBJECT_YAWS,
     SEED,
     SPLITS,
     footprint_corners,
     footprint_gap,
     load_configurations,
     sample_configuration,
+    sample_place,
 )
 
 # A change of these is a new version of the environment id.
@@ -38,6 +41,31 @@ def test_a_seed_draws_what_is_frozen():
     frozen = np.concatenate([load_configurations(scene.name, split) for split in SPLITS])
     again = [sample_configuration(scene, drawn).round(6) for _ in range(len(frozen))]
     np.testing.assert_array_equal(again, frozen)
+
+
+def test_places_are_those_of_a_look_at_each_in_turn(monkeypatch):
+    """Among six carpets, and among nine, where there is none: as many are drawn as it takes."""
+    monkeypatch.setattr(configurations, "MAX_ATTEMPTS", 700)
+    scene, body = get_scene("kitchen_3x3"), "kitchen shovel"
+    middles = np.array([[x, y] for x in (0.17, 0.295, 0.42) for y in (-0.15, 0.0, 0.15)])
+    others = [footprint_corners("carpet", xy, 0.0) for xy in middles]
+
+    def one_by_one(others, rng):
+        for _ in range(700):
+            xy, yaw = rng.uniform(scene.spawn_low, scene.spawn_high), rng.choice(OBJECT_YAWS)
+            if all(footprint_gap(footprint_corners(body, xy, yaw), o) > CLEARANCE_M for o in others):
+                return xy
+        return None
+
+    for seed in range(3):
+        mine, theirs = np.random.default_rng(seed), np.random.default_rng(seed)
+        for _ in range(2):
+            pose, _ = sample_place(scene, body, others[:6], mine)
+            np.testing.assert_array_equal(pose[:2], one_by_one(others[:6], theirs))
+    with pytest.raises(RuntimeError, match="no free place for the kitchen shovel among 9 bodies"):
+        sample_place(scene, body, others, mine)
+    assert one_by_one(others, theirs) is None
+    assert mine.random() == theirs.random()
 
 
 @pytest.mark.parametrize("scene", SCENES)

@@ -112,6 +112,15 @@ def test_without_autoreset_the_mask_says_who_starts_again():
         gym.make_vec(ID, num_envs=1, autoreset_mode="later", **STATE)
 
 
+def test_a_vector_draws_only_if_it_is_told_to():
+    silent, drawing = (gym.make_vec(ID, num_envs=2, render_mode=mode, **STATE) for mode in (None, "rgb_array"))
+    assert (silent.render_mode, silent.render()) == (None, None)
+    assert drawing.render_mode == "rgb_array"
+    assert [frame.shape for frame in drawing.render()] == [(480, 640, 3)] * 2
+    silent.close()
+    drawing.close()
+
+
 def test_a_single_environment_speaks_python_and_stays_over():
     env = gym.make(ID, **STATE)
     _, info = env.reset(seed=0)

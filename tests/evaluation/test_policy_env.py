@@ -3,11 +3,14 @@
 import sys
 
 import pytest
+import yaml
 from lerobot.configs import PreTrainedConfig
+from lerobot_env_cronos import CronosEnvConfig
 from tiny_checkpoints import STATE, record_one, save_policy, write_train_config
 
 from cronos_lerobot.evaluation.config import CronosEvalConfig
 from cronos_lerobot.evaluation.policy_env import trained_renderer
+from cronos_lerobot.scripts.errors import parse_command_line
 
 FILAMENT = {"renderer": "filament"}
 
@@ -53,3 +56,45 @@ def test_an_evaluation_draws_as_the_training_did_unless_it_is_told(
     config.validate()
     assert config.env.renderer == renderer
     assert config.identity().get("renderer", "classic") == renderer
+
+
+@pytest.fixture(scope="module")
+def of_playroom(tmp_path_factory):
+    """A policy that takes pictures of 96 x 64, trained in the playroom."""
+    size = {"scene": "playroom_2x2", "observation_height": 64, "observation_width": 96}
+    folder = save_policy(tmp_path_factory.mktemp("policy"), "pocketvla", size, hidden_width=16, hidden_depth=1)
+    return write_train_config(folder, env={"type": "cronos", "scene": "playroom_2x2"} | FILAMENT)
+
+
+@pytest.mark.parametrize(
+    ("env", "scene", "height", "renderer"),
+    [
+        (None, "playroom_2x2", 64, "filament"),
+        ({"type": "cronos", "renderer": "classic"}, "playroom_2x2", 64, "classic"),
+        ({"type": "cronos", "scene": "kitchen_2x2", "observation_height": 128}, "kitchen_2x2", 128, "filament"),
+    ],
+)
+def test_what_a_config_file_leaves_open_follows_from_the_policy(
+    env, scene, height, renderer, of_playroom, tmp_path, monkeypatch
+):
+    file = tmp_path / "eval.yaml"
+    file.write_text(yaml.safe_dump({"seed": 3} | ({} if env is None else {"env": env})))
+    monkeypatch.setattr(sys, "argv", ["cronos-eval", f"--config_path={file}", f"--policy.path={of_playroom}"])
+    config = parse_command_line(CronosEvalConfig)
+    config.validate()
+    assert (config.seed, config.env.scene, config.env.observation_height) == (3, scene, height)
+    assert (config.env.observation_width, config.env.renderer) == (96, renderer)
+
+
+def test_an_environment_given_in_python_is_kept(of_playroom, monkeypatch):
+    """As far as it is no default, which says nothing."""
+    monkeypatch.setattr(sys, "argv", ["script.py"])
+    policy = PreTrainedConfig.from_pretrained(of_playroom)
+    policy.pretrained_path = of_playroom
+    config = CronosEvalConfig(env=CronosEnvConfig(scene="kitchen_3x3", observation_height=32), policy=policy)
+    config.validate()
+    assert (config.env.scene, config.env.observation_height) == ("kitchen_3x3", 32)
+    assert (config.env.observation_width, config.env.renderer) == (96, "filament")
+    # Looking again changes nothing.
+    config.validate()
+    assert (config.env.scene, config.env.observation_height) == ("kitchen_3x3", 32)

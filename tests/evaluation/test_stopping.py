@@ -2,13 +2,17 @@
 
 import json
 import sys
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from synthetic_evaluations import write_evaluation
 
 from cronos_lerobot.evaluation import stopping
+from cronos_lerobot.evaluation.config import CronosEvalConfig, SuitesConfig
 from cronos_lerobot.evaluation.outcomes import read_outcomes
 from cronos_lerobot.evaluation.runner import Evaluation
+from cronos_lerobot.evaluation.stopping import StoppingEvaluation
 from cronos_lerobot.scripts import eval as script
 
 FLAGS = ("--expert=true", "--eval.suites=independent", "--eval.splits=train", "--eval.videos=0")
@@ -71,6 +75,44 @@ def test_it_goes_on_after_a_kill_and_says_if_it_cannot_tell(tmp_path, monkeypatc
     assert sorted((c["number"], c["configuration"]) for chains in done for c in chains) == [
         (number, configuration) for number in range(4) for configuration in range(2)
     ]
+
+
+class Recorder:
+    """Does nothing, and tells what it is seeded with."""
+
+    is_per_environment, temperature = True, None
+
+    def __init__(self):
+        self.seeds = []
+
+    def seed(self, seed):
+        self.seeds.append(seed)
+
+    def begin(self, ids):
+        pass
+
+    def act(self, observation, instructions, uniform, ids):
+        return np.zeros((len(ids), 7))
+
+
+def test_no_two_blocks_draw_the_same_numbers(tmp_path, monkeypatch):
+    reference = write_evaluation(tmp_path / "a", "me/zero", tasks=["000"] * 4, split="train")
+    monkeypatch.setattr(stopping, "LOOK_EVERY", 4)
+    suites = SuitesConfig("independent", "train", n_episodes=3, videos=0)
+    seeds = []
+    for seed in (1000, 1001):
+        config = CronosEvalConfig(
+            expert=True, eval=suites, seed=seed, compare_with=reference, stop_at_error=0.05,
+            output_dir=tmp_path / str(seed),
+        )  # fmt: skip
+        config.validate()
+        outcomes, actor = read_outcomes(reference), Recorder()
+        lengths = {episode._replace(seed=seed): length for episode, length in outcomes.lengths.items()}
+        StoppingEvaluation(config, replace(outcomes, lengths=lengths), lambda env, actor=actor: actor).run()
+        seeds.append(actor.seeds)
+    # The first block, which may be the only one, has that of the evaluation.
+    assert [some[0] for some in seeds] == [1000, 1001]
+    assert len({*seeds[0], *seeds[1]}) == 6
 
 
 def test_without_an_error_everything_is_evaluated_and_compared(tmp_path, monkeypatch, capsys):

@@ -367,7 +367,7 @@ def test_clones_that_differ_are_said(options, tmp_path):
         page = write_outputs(experiment, experiment.rows, options, tmp_path / "out")
         assert ("Not one base policy" in page) == (fingerprint == "bbbb")
     name = "kitchen_2x2_state_400demos_320steps"
-    assert f"## Not one base policy: 2 clones called {name}" in page
+    assert f"## Not one base policy: 2 policies called {name}" in page
     assert "- aaaa: t80 seed 1\n- bbbb: t80 seed 2" in page
     bases = json.loads((tmp_path / "out/figure4.json").read_text())["bases"]
     assert bases == {name: ["aaaa", "bbbb"], f"{name}_1config": ["cccc"]}

@@ -25,7 +25,7 @@ from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import Step
 from cronos_lerobot.protocol.resets import make_resets
 from cronos_lerobot.protocol.rf_mtrl import rf_mtrl
-from cronos_lerobot.protocol.task_orders import TaskSet, make_task_order
+from cronos_lerobot.protocol.task_orders import TASK_ORDERS, RandomOrder, TaskSet, make_task_order
 from cronos_lerobot.report import stream_video
 from cronos_lerobot.report.stream_video import ExpertSpectator, PolicySpectator, film_stream, make_spectator
 from cronos_lerobot.report.task_pictures import draw_sheet, render_tasks
@@ -212,6 +212,24 @@ def test_gif_keeps_to_its_size(film, tmp_path):
             duration += gif.info["duration"]
     # Every second of 60 steps, at 10 frames/s.
     assert duration == 3000
+
+
+@pytest.mark.parametrize("name", ["critic", "of_ones_own"])
+def test_an_order_that_asks_a_training_is_refused_in_a_line(name, tmp_path, monkeypatch, capsys):
+    class Bound(RandomOrder):
+        def bind(self, run):
+            self.tasks = run.tasks
+
+    monkeypatch.setitem(TASK_ORDERS, "of_ones_own", Bound)
+    arguments = ["--policy=expert", f"--task_order={name}", f"--output={tmp_path / 'stream.mp4'}"]
+    monkeypatch.setattr("sys.argv", ["stream_video", *arguments])
+    with pytest.raises(SystemExit) as end:
+        stream_video.main()
+    assert end.value.code == 2
+    sentence = (
+        f"error: --task_order={name} goes by what it is told of a training (bind), and here nothing is trained"
+    )
+    assert f"{sentence}: choose one of ['heuristic', 'random']" in capsys.readouterr().err
 
 
 def test_sheet_has_every_task_from_both_cameras():

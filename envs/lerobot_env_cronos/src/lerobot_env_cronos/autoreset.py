@@ -29,7 +29,7 @@ class CronosGymVectorEnv(IndependentVectorEnv):
             `SameStep`: the ending step returns the next episode's first observation, and `info` the last one as
             `final_obs` and `final_info`, with masks `_final_obs` and `_final_info`. `Disabled`: what is over
             stays as it is until `reset(options={"reset_mask": ...})`.
-        render_mode: None or `rgb_array`.
+        render_mode: None, with which `render` returns None, or `rgb_array`.
         **kwargs: see `CronosVectorEnv`.
 
     Of `reset`'s options, `configuration` is where all episodes start, and `reset_mask` (n,) bool who is reset.
@@ -54,6 +54,7 @@ class CronosGymVectorEnv(IndependentVectorEnv):
         chosen = find_task(scene, task)
         self._choices = get_scene(scene).tasks if chosen is None else (chosen,)
         super().__init__(num_envs, scene, task=self._choices[0], split=split, **kwargs)
+        self.render_mode = render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode}
         self._generators = [np_random()[0] for _ in range(num_envs)]
@@ -109,6 +110,11 @@ class CronosGymVectorEnv(IndependentVectorEnv):
                 info[name][ids] = value[ids]
             info["diverged"][ids] = False
         return observation, reward, terminated, truncated, info
+
+    # None as by Gymnasium's VectorEnv; CronosVectorEnv, which has no such argument, always renders.
+    def render(self) -> tuple[np.ndarray, ...] | None:  # ty: ignore[incompatible-method-override]
+        """See `CronosVectorEnv.render`; None without a render mode."""
+        return super().render() if self.render_mode == "rgb_array" else None
 
     def _begin(self, ids: np.ndarray, configuration: int | None = None) -> None:
         """Start an episode in each of the environments `ids`, drawn from its generator."""

@@ -17,13 +17,16 @@ from lerobot_env_cronos.benchmark.configurations import (
     SPLITS,
     check_split,
     load_configurations,
-    sample_configuration,
+    sample_configurations,
 )
 from lerobot_env_cronos.benchmark.orderings import draw_balanced, is_training_cycle, load_orderings
 from lerobot_env_cronos.benchmark.version import gymnasium_id
 from lerobot_env_cronos.scene.scenes import BODIES, STEPS_PER_TASK, Scene, Task, get_scene
 
 SUITES = ("independent", "sequential")
+DRAWN = 7351
+"""Ends the keys that a seed's benchmarks are drawn from. NumPy ignores zeros at the end of a key: without it the
+first one would be the seed itself, from which the packaged configurations are drawn."""
 
 
 @dataclass(frozen=True)
@@ -112,14 +115,14 @@ def draw_benchmark(
 
     Args:
         scene_name: of a scene.
-        seed: decides configurations and orderings.
-        num_configurations: of each split.
+        seed: decides configurations and orderings; the package's own seed draws others than the package has.
+        num_configurations: of each split; with more of them come new ones after the same first ones.
         num_orderings: of each split, the same in both; all different, every task as often as any other at every
             position, none a part of the training cycle while there are others.
         chain_length: tasks of a chain, all different; null for all of the scene.
 
     Raises:
-        ValueError: there are not so many different orderings, or a number is out of range.
+        ValueError: there are not so many different orderings, a number is out of range, or the bodies do not fit.
     """
     scene = get_scene(scene_name)
     length = len(scene.tasks) if chain_length is None else chain_length
@@ -130,12 +133,13 @@ def draw_benchmark(
         raise ValueError(f"num_orderings must be 1 to {most}, all of {length} tasks, got {num_orderings}")
     if num_configurations < 1 or seed < 0:
         raise ValueError(f"need a configuration and a seed >= 0, got {num_configurations} and {seed}")
-    rng = np.random.default_rng(seed)
+    # Of its own each: from one after the other, a split would hold what another number gives the other split.
+    *of_splits, of_orderings = (np.random.default_rng([seed, k, DRAWN]) for k in range(len(SPLITS) + 1))
     poses = {
-        split: np.stack([sample_configuration(scene, rng).round(6) for _ in range(num_configurations)])
-        for split in SPLITS
+        split: sample_configurations(scene, num_configurations, rng)
+        for split, rng in zip(SPLITS, of_splits, strict=True)
     }
-    drawn = draw_balanced(len(scene.tasks), length, num_orderings, rng)
+    drawn = draw_balanced(len(scene.tasks), length, num_orderings, of_orderings)
     orderings = [tuple(scene.tasks[i] for i in ordering) for ordering in drawn]
     return _cross(scene, poses, orderings, f"drawn with seed {seed}")
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from lerobot_env_cronos.benchmark.configurations import set_configurations_file
 from lerobot_env_cronos.benchmark.version import gymnasium_id
-from lerobot_env_cronos.scene.bodies import SHAPES
+from lerobot_env_cronos.scene.bodies import SHAPES, narrowest_width
 from lerobot_env_cronos.scene.model import TABLE
 from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, add_robot
 from lerobot_env_cronos.scene.scenes import BODIES, SCENES, Body, Scene
@@ -19,7 +19,6 @@ from lerobot_env_cronos.scene.visuals.objects import LOOKS
 
 # Part of Gymnasium's environment ids and of file names.
 NAME_PATTERN = re.compile(r"[a-z0-9_]+")
-PLAIN_SHAPES = ("box", "disc")
 ROUND_SHAPES = ("disc", "plate")
 MAX_WIDTH_M = 0.044
 """What the gripper takes between its fingers."""
@@ -37,8 +36,9 @@ def register_scene(scene: Scene, bodies: Sequence[Body] = (), configurations: Pa
             64 training and 64 held-out configurations are drawn from a fixed seed in every process.
 
     Raises:
-        ValueError: a name is taken by something else or malformed, a shape or a body is unknown, the spawn
-            area is not within the workspace, or the file is of another scene. Nothing is registered then.
+        ValueError: a name is taken by something else or malformed, a shape or a body is unknown, the gripper
+            cannot take an object, the spawn area is not within the workspace, or the file is of another scene.
+            Nothing is registered then.
     """
     new_bodies = {body.name: body for body in bodies}
     _check(scene, new_bodies)
@@ -75,6 +75,13 @@ def _check(scene: Scene, new_bodies: dict[str, Body]) -> None:
     for name in scene.bodies:
         if name not in BODIES and name not in new_bodies:
             raise ValueError(f"unknown body {name!r}; valid bodies: {sorted(BODIES | new_bodies)}")
+    columns: dict[str, str] = {}
+    for name in scene.bodies:
+        if (other := columns.setdefault(name.replace(" ", "_"), name)) != name:
+            raise ValueError(
+                f"the bodies {other!r} and {name!r} of {scene.name} differ only by a space or underscore, and the "
+                "columns of datasets would have one name: rename one of them"
+            )
     low, high = np.array(scene.spawn_low), np.array(scene.spawn_high)
     if not ((EE_LOW[:2] <= low) & (low < high) & (high <= EE_HIGH[:2])).all():
         raise ValueError(
@@ -83,10 +90,8 @@ def _check(scene: Scene, new_bodies: dict[str, Body]) -> None:
             f"{EE_HIGH[:2].tolist()} m"
         )
     for name in scene.objects:
-        body = (BODIES | new_bodies)[name]
-        # Other shapes may be held where they are narrower, as a shovel is by its handle.
-        width = min(body.size[:2])
-        if body.shape in PLAIN_SHAPES and width >= MAX_WIDTH_M:
+        width = narrowest_width((BODIES | new_bodies)[name])
+        if width >= MAX_WIDTH_M:
             raise ValueError(
                 f"the {name} is an object, {1000 * width:.0f} mm wide where it is narrowest; the gripper takes "
                 f"less than {1000 * MAX_WIDTH_M:.0f} mm"

@@ -96,6 +96,6 @@ def sample_reach_configuration(scene: Scene, rng: np.random.Generator) -> np.nda
     """Draw poses (bodies, 7) of all bodies at rest on the table within reach, no two touching.
 
     Raises:
-        RuntimeError: the bodies do not fit there.
+        ValueError: the bodies do not fit there.
     """
     return sample_configuration(scene, rng, find_reach(scene).draw)

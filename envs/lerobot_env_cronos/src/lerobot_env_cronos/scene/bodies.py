@@ -7,6 +7,7 @@ Looks are added by `lerobot_env_cronos.scene.visuals`; only the geometry here ha
 from collections.abc import Callable
 
 import mujoco
+import numpy as np
 
 from lerobot_env_cronos.scene.robot import CONTACT_SOLIMP
 from lerobot_env_cronos.scene.scenes import Body
@@ -15,6 +16,8 @@ from lerobot_env_cronos.scene.scenes import Body
 FRICTION = [1.0, 0.01, 0.003]
 
 COLLISION_GROUP = 3
+MAX_CLOSING_TILT = 0.7
+"""Vertical part of the unit vector along which a hand that points down closes."""
 
 
 def _add_geom(spec_body: mujoco.MjsBody, body: Body, geom_type: mujoco.mjtGeom, size, pos=(0, 0, 0), **extra):
@@ -81,6 +84,24 @@ SHAPES: dict[str, Callable[[mujoco.MjsBody, Body], None]] = {
     "disc": _add_plate,
 }
 """How to build a body, by `Body.shape`; another shape is another entry here and in `visuals.objects.LOOKS`."""
+
+
+def narrowest_width(body: Body) -> float:
+    """The least horizontal side of any of the boxes that a body consists of, in its resting pose [m].
+
+    That is where a hand that points down can hold it, as a shovel by its handle.
+    """
+    spec = mujoco.MjSpec()
+    add_body(spec, body)
+    model = spec.compile()
+    widths = []
+    for g in np.flatnonzero(model.geom_contype):
+        rotation = np.empty(9)
+        mujoco.mju_quat2Mat(rotation, model.geom_quat[g])
+        # Sides of the box along which a hand could close: those that are not upright.
+        is_level = np.abs(rotation.reshape(3, 3)[2]) <= MAX_CLOSING_TILT
+        widths += (2 * model.geom_aabb[g, 3:][is_level]).tolist()
+    return min(widths)
 
 
 def add_body(spec: mujoco.MjSpec, body: Body) -> mujoco.MjsBody:
