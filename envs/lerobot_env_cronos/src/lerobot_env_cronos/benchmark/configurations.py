@@ -166,7 +166,7 @@ def sample_place(
 
 
 def _find_free(body: str, places: Sequence[Place], others: Sequence[np.ndarray]) -> np.ndarray:
-    """Indices of the places that are free, and of any that are so but for rounding, which many at once differ in."""
+    """Indices of the places that are free, and of any that are but for rounding, in which many at once differ."""
     xy, yaw = (np.array(part) for part in zip(*places, strict=True))
     footprints, wanted = np.reshape(others, (-1, 4, 2)), CLEARANCE_M - 1e-9
     # As far as the circles within them reach: where those are too near, so are the footprints.
