@@ -137,7 +137,11 @@ for _experiment in (
     Experiment(
         "few_resets",
         "Learning with few resets",
-        (*SCREENED, *map(wide, SCREENED), *map(with_resets, (EPISODIC, CURRICULUM))),
+        (
+            *SCREENED,
+            *(wide(row) for row in SCREENED if not row.learned_reset),
+            *map(with_resets, (EPISODIC, CURRICULUM, *(row for row in SCREENED if row.learned_reset))),
+        ),
         budgets=_BUDGETS,
         by_base=True,
     ),
