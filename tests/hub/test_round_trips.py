@@ -262,8 +262,10 @@ def test_results_of_a_policy_that_flags_changed_are_refused(policy, commands, tm
     assert "independent_train: flags changed the policy: sigma_max 0.3 in place of 0.6;" in refused.output
 
 
-def test_a_training_begins_with_one_commit_of_a_policy(hub, bench, policy, commands, tmp_path):
+def test_a_training_begins_with_one_commit_of_a_policy(hub, run, commands, tmp_path):
     """All of it is of the revision that is given, or of what `main` is when the run begins."""
+    policy = "me/trained_on"
+    commands.run("cronos-publish", "policy", f"--path={run}", f"--repo_id={policy}")
     repository = hub.repositories["models", policy]
     first = repository.branches["main"]
     old = hub.tree("models", policy)
