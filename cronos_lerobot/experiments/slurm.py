@@ -288,7 +288,8 @@ class Cluster:
                 begun, runs = behind_runs(runs, queued, made)
                 numbers = array("run", runs, _after_any(runs, queued | submitted))
                 array("evaluation", evaluations, _after_each(numbers, len(evaluations)))
-                array("evaluation", begun, _after_any(begun, queued))
+                if begun:
+                    array("evaluation", begun, _after_any(begun, queued))
             finally:
                 # What the cluster has taken is remembered, also where it refused the rest.
                 new = {name: Submission(number, list(made[name].command)) for name, number in submitted.items()}

@@ -188,6 +188,18 @@ def test_what_is_in_the_queue_with_other_flags_is_refused(tmp_path, monkeypatch)
     assert taken[-3:] == [[], [["a"]], []]
 
 
+def test_what_waits_for_a_queued_run_is_an_array_of_its_own(tmp_path, monkeypatch):
+    queue = {}
+    cluster, taken = cluster_of(tmp_path, monkeypatch, queue)
+    old, new = (run_job(tmp_path, name) for name in ("old", "new"))
+    cluster.submit([old], threads=1, parallel=None)
+    queue["2_0"] = ("RUNNING", "None")
+    of_old = replace(run_job(tmp_path, "old/eval"), needs=("old",), stage=EVALUATION)
+    submitted = cluster.submit([old, of_old, new], threads=1, parallel=None)
+    assert submitted == {"old": "2_0", "new": "5_0", "old/eval": "7_0"}
+    assert taken[-4:] == [[], [["new"]], [], [["old/eval"]]]
+
+
 def test_a_queue_from_before_commands_were_noted_is_followed(tmp_path, monkeypatch):
     cluster, _ = cluster_of(tmp_path, monkeypatch, {"7_0": ("RUNNING", "None")})
     cluster.folder.mkdir()
