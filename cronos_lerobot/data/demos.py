@@ -55,7 +55,7 @@ class DemoConfig:
     """What a demonstration is."""
 
     max_steps: int = 80
-    """Control steps until an episode ends, as a failure if its task is not complete by then."""
+    """Control steps until an episode counts as failed, also if its object has lain too short by then."""
     steps_after_release: int = 3
     """Frames kept after the object lies on its receptacle and is released."""
     keep_failures: bool = False
@@ -217,7 +217,7 @@ class DemoCollector:
             self._end(stream, episode, succeeded=False, keep=False)
         elif episode.preludes and (is_late if self._is_policys(episode) else rested):
             self._end_prelude(stream, episode)
-        elif not episode.preludes and (rested or (is_late and info["is_success"][stream])):
+        elif rested and not episode.preludes:
             self._end(stream, episode, succeeded=True, keep=True)
         elif is_late:
             self._end(stream, episode, succeeded=False, keep=self.config.keep_failures and not episode.preludes)
