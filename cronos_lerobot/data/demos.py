@@ -209,15 +209,15 @@ class DemoCollector:
         if not episode.preludes:
             for key, column in columns.items():
                 episode.frames.setdefault(key, []).append(column[stream].copy())
-        rested = episode.released > self.config.steps_after_release
+        succeeded = episode.released > self.config.steps_after_release
         is_late = episode.steps >= self.config.max_steps
         if info["diverged"][stream] and episode.preludes and self._is_policys(episode):
             self._discard(stream, episode)
         elif info["diverged"][stream]:
             self._end(stream, episode, succeeded=False, keep=False)
-        elif episode.preludes and (is_late if self._is_policys(episode) else rested):
+        elif episode.preludes and (is_late if self._is_policys(episode) else succeeded):
             self._end_prelude(stream, episode)
-        elif rested and not episode.preludes:
+        elif succeeded and not episode.preludes:
             self._end(stream, episode, succeeded=True, keep=True)
         elif is_late:
             self._end(stream, episode, succeeded=False, keep=self.config.keep_failures and not episode.preludes)

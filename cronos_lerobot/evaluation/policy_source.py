@@ -7,7 +7,7 @@ import io
 import json
 import sys
 from collections.abc import Iterator
-from contextlib import redirect_stderr, suppress
+from contextlib import redirect_stderr
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -77,42 +77,44 @@ def follow_last(folder: Path) -> Path:
     return folder
 
 
-def pin_policy(name: str, overrides: list[str]) -> tuple[str, list[str]]:
+def pin_policy(name: str, given: str | None) -> tuple[str, str | None]:
     """Hold a policy of the Hub at the commit that it is at now, or at the revision that is given.
 
     Args:
-        name: a folder, which stays as it is, or `<owner>/<repository>[@<revision>]`.
-        overrides: flags of the policy's config; `--pretrained_revision` says the revision, too.
+        name: a folder, which has no revision, or `<owner>/<repository>[@<revision>]`.
+        given: the revision that `--policy.pretrained_revision` says.
 
     Returns:
-        The name without its revision, and the flags with that of the commit.
+        The name without its revision, and the commit.
 
     Raises:
         ValueError: two revisions are given.
     """
     if Path(name).is_dir():
-        return str(follow_last(Path(name))), overrides
+        return str(follow_last(Path(name))), None
     repository, _, revision = name.partition("@")
-    flag = f"--{PINNED}="
-    given = [override.removeprefix(flag) for override in overrides if override.startswith(flag)]
-    if revision and any(other != revision for other in given):
-        raise ValueError(f"--policy.path={name} and --policy.{PINNED}={given[-1]} are two revisions: give one.")
-    revision = revision or (given[-1] if given else "")
-    # What cannot be asked may be in the cache; who loads it says what is wrong.
-    with suppress(OSError, HFValidationError):
-        revision = HfApi().model_info(repository, revision=revision or None).sha or revision
-    others = [override for override in overrides if not override.startswith(flag)]
-    return repository, [*others, f"{flag}{revision}"] if revision else others
+    if revision and given and given != revision:
+        raise ValueError(f"--policy.path={name} and --policy.{PINNED}={given} are two revisions: give one.")
+    wanted = revision or given or None
+    try:
+        return repository, HfApi().model_info(repository, revision=wanted).sha or wanted
+    except (OSError, HFValidationError):
+        # It may be in the cache; who loads it says what is wrong.
+        return repository, wanted
 
 
-def load_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
-    """Return the config of the policy that `--policy.path` names, of its `--pretrained_revision` if there is one.
+def load_policy_config(path: str, overrides: list[str], revision: str | None = None) -> PreTrainedConfig:
+    """Return the config of the policy that `--policy.path` names.
+
+    Args:
+        path: a folder, or a repository of the Hub.
+        overrides: flags of the config.
+        revision: of the repository, which the config then says.
 
     Raises:
         ValueError: there is no such folder or repository, or what it has is damaged.
     """
-    folder, flag = Path(path), f"--{PINNED}="
-    revision = next((text.removeprefix(flag) for text in overrides if text.startswith(flag)), None)
+    folder = Path(path)
     if folder.is_dir() and not (folder / CONFIG_NAME).is_file():
         raise ValueError(f"--policy.path={path} has no {CONFIG_NAME}: give a checkpoint's pretrained_model.")
     said = io.StringIO()
@@ -132,6 +134,8 @@ def load_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
         raise ValueError(f"--policy.path={path}: {error if folder.is_dir() else nowhere}") from error
     sys.stderr.write(said.getvalue())
     config.pretrained_path = folder
+    if revision is not None:
+        config.pretrained_revision = revision
     return config
 
 

@@ -180,11 +180,7 @@ def _for_tasks(recipe: BaseRecipe, scene: str) -> BaseRecipe:
         # An installed one is registered by the import of its package.
         register_third_party_plugins()
     tasks, of = len(get_scene(scene).tasks), len(get_scene(MODEL).tasks)
-    more = replace(
-        recipe,
-        demos=recipe.demos * tasks // of,
-        clone_steps=recipe.clone_steps * tasks // of,
-        checkpoint=recipe.clone_steps * tasks // of,
-    )
+    steps = recipe.clone_steps * tasks // of
+    more = replace(recipe, demos=recipe.demos * tasks // of, clone_steps=steps, checkpoint=steps)
     quarters = 4 * recipe.checkpoint // recipe.clone_steps
     return more if quarters == 4 else replace(more, checkpoint=quarters * more.save_freq)

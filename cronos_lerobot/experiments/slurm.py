@@ -328,12 +328,11 @@ def _needs(element: list[Job], made: dict[str, Job]) -> list[Job]:
 
 def behind_runs(elements: Elements, queued: Container[str], made: Mapping[str, Job]) -> tuple[Elements, Elements]:
     """Those that wait for a run in the queue, and the others, which need not wait for it."""
-    behind = [
-        element
-        for element in elements
-        if any(need in queued and made[need].stage != BASE for job in element for need in job.needs)
-    ]
-    return behind, [element for element in elements if element not in behind]
+    parts: tuple[Elements, Elements] = [], []
+    for element in elements:
+        needs = [need for job in element for need in job.needs]
+        parts[not any(need in queued and made[need].stage != BASE for need in needs)].append(element)
+    return parts
 
 
 def _after_any(elements: Elements, ids: Mapping[str, str]) -> str | None:

@@ -137,7 +137,7 @@ class FoundRuns:
     """Those of cronos-eval."""
     left_out: list[str]
     """What could not be read, a sentence for each: crashed before its first record, damaged, of version 0. And
-    the evaluations of runs that are not `alike`, and the shorter of two runs of one seed."""
+    the evaluations of runs that are not `alike`."""
 
 
 def find_runs(folders: Iterable[Path], scene: str | None = None, benchmark: str | None = None) -> FoundRuns:
@@ -192,7 +192,6 @@ def find_runs(folders: Iterable[Path], scene: str | None = None, benchmark: str 
         raise ValueError("; ".join(left_out.values()))
     evaluations = [run for runs in evaluation.values() for run in runs]
     said = [*left_out.values(), *(run.left_out for run in training.values() if run.left_out)]
-    group_runs(list(training.values()), said)
     return FoundRuns(list(training.values()), evaluations, read_suite_runs(suites), said)
 
 

@@ -121,16 +121,16 @@ def parse_command_line(
 def _null_flags(arguments: list[str]) -> list[str]:
     """The flags that are given as null, without their dashes."""
     pairs = (argument.removeprefix("--").split("=", 1) for argument in arguments if argument.startswith("--"))
-    return [name for name, *value in pairs if value and value[0].lower() in ("null", "none", "~")]
+    return [name for name, *value in pairs if value in (["null"], ["~"])]
 
 
 def _takes_null(config: Any, flag: str) -> bool:
-    """Whether a field of a config may be None; draccus gives it to numbers and booleans, too."""
+    """Whether a field of a config may be None, if it is; draccus gives it to numbers and booleans, too."""
     *groups, name = flag.split(".")
     for group in groups:
         config = getattr(config, group, None)
     field = next((f for f in fields(config) if f.name == name), None) if is_dataclass(config) else None
-    if field is None or field.default is None:
+    if field is None or field.default is None or getattr(config, name) is not None:
         return True
     return NoneType in get_args(get_type_hints(type(config))[name])
 

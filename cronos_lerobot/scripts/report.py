@@ -116,7 +116,7 @@ def make_report(
         if not video.is_file():
             raise FileNotFoundError(f"No video {video}.")
     left_out = list(dict.fromkeys(found.left_out + old.left_out + new.left_out))
-    for group in group_runs(found.training):
+    for group in group_runs(found.training, left_out):
         at_their_end(group.runs, left_out)
     return Report(
         found.training, rest, old.evaluations, new.evaluations, videos or [], title, found.suites, left_out

@@ -23,7 +23,7 @@ from lerobot_env_cronos.hub_config import is_of_this_package
 from cronos_lerobot.agents import builtin  # noqa: F401  (registers the agents)
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.registry import check_agent, check_settings
-from cronos_lerobot.evaluation.policy_source import load_policy_config, pin_policy
+from cronos_lerobot.evaluation.policy_source import PINNED, load_policy_config, pin_policy
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.experts import check_expert
 from cronos_lerobot.protocol.resets import check_extra_resets
@@ -191,7 +191,10 @@ class CronosTrainConfig:
         self._pin_benchmark(self.env)
         if not self.resume and (path := parser.get_path_arg("policy")):
             overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
-            self.policy = load_policy_config(*pin_policy(path, overrides))
+            flag = f"--{PINNED}="
+            given = next((text.removeprefix(flag) for text in overrides if text.startswith(flag)), None)
+            path, revision = pin_policy(path, given)
+            self.policy = load_policy_config(path, overrides, revision)
             if not any(override.startswith("--repo_id") for override in overrides):
                 # That of the policy's own, which is not to be pushed over.
                 self.policy.repo_id = None

@@ -7,6 +7,7 @@ from synthetic_runs import write_training_run
 
 from cronos_lerobot.report.runs import find_runs, group_runs
 from cronos_lerobot.report.tables import seed_rows
+from cronos_lerobot.scripts.report import make_report
 
 
 def test_seeds_of_one_protocol_are_called_by_it_and_a_run_by_its_name(tmp_path):
@@ -117,10 +118,9 @@ def test_of_two_runs_of_one_seed_the_longer_counts(tmp_path):
     write_training_run(tmp_path / "short", seed=1, successes=(2, 3, 4), updates=4)
     write_training_run(tmp_path / "long", seed=1, successes=(2, 4, 6))
     write_training_run(tmp_path / "other", seed=2, successes=(2, 4, 4))
-    found = find_runs([tmp_path])
-    (group,) = group_runs(found.training)
+    (group,) = group_runs(find_runs([tmp_path]).training)
     assert sorted(run.name for run in group.runs) == ["long", "other"]
-    assert found.left_out == [
+    assert make_report([tmp_path]).left_out == [
         f"the run {tmp_path / 'short'}, of 5,120 steps: {tmp_path / 'long'} is of the same settings and seed and"
         " has 10,240"
     ]
@@ -159,9 +159,9 @@ def test_a_budget_that_is_paced_over_the_steps_makes_a_longer_run_another_experi
         for updates, steps in ((4, 5120), (8, 10240)):
             run = write_training_run(tmp_path / f"{steps}/seed{seed}", seed=seed, interval=320, updates=updates)
             edit_config(run, protocol, steps=steps)
-    found = find_runs([tmp_path / "5120", tmp_path / "10240"])
-    assert [group.label for group in group_runs(found.training)] == labels
-    assert len(found.left_out) == (0 if protocol else 2)
+    found, notes = find_runs([tmp_path / "5120", tmp_path / "10240"]), []
+    assert [group.label for group in group_runs(found.training, notes)] == labels
+    assert len(notes) == (0 if protocol else 2)
     # What has no such budget is called as it would be without them.
     edit_config(write_training_run(tmp_path / "80/seed1", interval=80), steps=10240)
     groups = group_runs(find_runs([tmp_path]).training)

@@ -73,6 +73,8 @@ def test_null_is_refused_where_it_is_no_value(monkeypatch):
     for flag in ("name", "fast", "inner.size", "inner.depth"):
         with pytest.raises(SystemExit, match=rf"^error: null is no value of --{flag}$"):
             parse(monkeypatch, f"--{flag}=null")
+    # A word is a word.
+    assert parse(monkeypatch, "--name=none") == Config("none")
 
 
 def test_bugs_keep_their_traceback():

@@ -7,8 +7,8 @@ outside the package come with a file of their own, or theirs are drawn from the 
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
-from functools import cache, partial
+from collections.abc import Callable
+from functools import cache
 from importlib import import_module, resources
 from pathlib import Path
 
@@ -29,8 +29,6 @@ MAX_ATTEMPTS, MAX_RESTARTS = 10_000, 20
 MAX_RESTARTS_EACH = 6
 """Restarts for each configuration, on average over all so far: bodies that fit less often than that do not fit. To
 draw them all would take many minutes, most of them in vain."""
-FIRST_DRAWS, MOST_DRAWS = 4, 512
-"""Places that are drawn before all of them are looked at: few where there is room, then ever more."""
 SEED = 2026
 """Of the packaged configurations, and of those of scenes without a file."""
 
@@ -88,34 +86,29 @@ def _check_content(scene: Scene, content: dict, source: object) -> None:
             raise ValueError(f"split {split} of {source} must be of shape {shape}")
 
 
-def footprint_corners(name: str, xy: np.ndarray, yaw: np.ndarray | float) -> np.ndarray:
-    """Corners (..., 4, 2) of a body's bounding box on the table, at places (..., 2) and yaws (...) [m, rad]."""
+def footprint_corners(name: str, xy: np.ndarray, yaw: float) -> np.ndarray:
+    """Corners (4, 2) of a body's bounding box on the table [m]."""
     half = np.array(BODIES[name].size[:2]) / 2
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half
     c, s = np.cos(yaw), np.sin(yaw)
-    turn = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
-    return corners @ turn + xy[..., None, :]
+    return corners @ np.array([[c, s], [-s, c]]) + xy
 
 
-def footprint_gap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Separation (...) of rectangles (..., 4, 2) along their best separating axis [m]; negative if they overlap.
-
-    Leading dimensions broadcast.
-    """
+def footprint_gap(a: np.ndarray, b: np.ndarray) -> float:
+    """Separation of two rectangles along their best separating axis [m]; negative if they overlap."""
     gaps = []
     for corners in (a, b):
-        edges = np.roll(corners, -1, axis=-2)[..., :2, :] - corners[..., :2, :]
-        normals = np.stack([edges[..., 1], -edges[..., 0]], axis=-1)
-        normals = normals / np.linalg.norm(edges, axis=-1)[..., None]
-        pa, pb = normals @ a.swapaxes(-1, -2), normals @ b.swapaxes(-1, -2)
-        gaps.append(np.maximum(pa.min(-1) - pb.max(-1), pb.min(-1) - pa.max(-1)).max(-1))
-    return np.maximum(*gaps)
+        edges = np.roll(corners, -1, axis=0)[:2] - corners[:2]
+        normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1)[:, None]
+        pa, pb = normals @ a.T, normals @ b.T
+        gaps.append(np.maximum(pa.min(1) - pb.max(1), pb.min(1) - pa.max(1)).max())
+    return max(gaps)
 
 
 Place = tuple[np.ndarray, float]
 """Where a body lies: its centre (2,) on the table [m] and its yaw [rad]."""
 DrawPlace = Callable[[str, np.random.Generator], Place]
-"""Draws a place for a body, free or not; it depends on the generator's state and nothing else that changes."""
+"""Draws a place for a body, free or not."""
 
 
 def draw_spawn_place(scene: Scene, body: str, rng: np.random.Generator) -> Place:
@@ -146,36 +139,19 @@ def sample_place(
     Raises:
         RuntimeError: no free place was found.
     """
-    draw = draw or partial(draw_spawn_place, scene)
-    left, draws = MAX_ATTEMPTS, FIRST_DRAWS
-    while left:
-        before, draws = rng.bit_generator.state, min(draws, left)
-        places = [draw(body, rng) for _ in range(draws)]
-        for i in _find_free(body, places, others):
-            xy, yaw = places[i]
-            corners = footprint_corners(body, xy, yaw)
-            if all(footprint_gap(corners, other) > CLEARANCE_M for other in others):
-                # What comes next does not depend on how many were looked at together.
-                rng.bit_generator.state = before
-                for _ in range(i + 1):
-                    draw(body, rng)
-                pose = [*xy, BODIES[body].size[2] / 2, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
-                return np.array(pose), corners
-        left, draws = left - draws, min(2 * draws, MOST_DRAWS)
-    raise RuntimeError(f"no free place for the {body} among {len(others)} bodies")
-
-
-def _find_free(body: str, places: Sequence[Place], others: Sequence[np.ndarray]) -> np.ndarray:
-    """Indices of the places that are free, and of any that are but for rounding, in which many at once differ."""
-    xy, yaw = (np.array(part) for part in zip(*places, strict=True))
-    footprints, wanted = np.reshape(others, (-1, 4, 2)), CLEARANCE_M - 1e-9
+    centres = np.array([other.mean(axis=0) for other in others]).reshape(-1, 2)
     # As far as the circles within them reach: where those are too near, so are the footprints.
-    inner = np.linalg.norm(footprints[:, :2] - footprints[:, 1:3], axis=-1).min(axis=-1) / 2
-    nearest = inner + min(BODIES[body].size[:2]) / 2 + wanted
-    offset = xy[:, None] - footprints.mean(axis=1)
-    apart = np.flatnonzero(((offset**2).sum(axis=-1) >= nearest**2).all(axis=1))
-    corners = footprint_corners(body, xy[apart], yaw[apart])
-    return apart[(footprint_gap(corners[:, None], footprints) > wanted).all(axis=1)]
+    inner = np.array([np.linalg.norm(other[:2] - other[1:3], axis=1).min() / 2 for other in others])
+    nearest = inner + min(BODIES[body].size[:2]) / 2 + CLEARANCE_M - 1e-9
+    for _ in range(MAX_ATTEMPTS):
+        xy, yaw = draw(body, rng) if draw else draw_spawn_place(scene, body, rng)
+        if (((centres - xy) ** 2).sum(axis=1) < nearest**2).any():
+            continue
+        corners = footprint_corners(body, xy, yaw)
+        if all(footprint_gap(corners, other) > CLEARANCE_M for other in others):
+            pose = [*xy, BODIES[body].size[2] / 2, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
+            return np.array(pose), corners
+    raise RuntimeError(f"no free place for the {body} among {len(others)} bodies")
 
 
 def sample_configuration(scene: Scene, rng: np.random.Generator, draw: DrawPlace | None = None) -> np.ndarray:
@@ -199,14 +175,13 @@ def sample_configurations(scene: Scene, number: int, rng: np.random.Generator) -
     Raises:
         ValueError: the bodies do not fit into the spawn area, or hardly ever.
     """
-    drawn, restarts, in_a_row = [], 0, 0
+    drawn, restarts = [], 0
     while len(drawn) < number:
         if (poses := _try_configuration(scene, rng)) is not None:
             drawn.append(poses.round(6))
-            in_a_row = 0
             continue
-        restarts, in_a_row = restarts + 1, in_a_row + 1
-        if in_a_row == MAX_RESTARTS or restarts >= max(MAX_RESTARTS, MAX_RESTARTS_EACH * (len(drawn) + 1)):
+        restarts += 1
+        if restarts >= max(MAX_RESTARTS, MAX_RESTARTS_EACH * (len(drawn) + 1)):
             raise _no_fit(scene)
     return np.stack(drawn)
 
