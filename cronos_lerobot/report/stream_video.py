@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -255,6 +256,11 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--task_order", default="heuristic", help="heuristic or random, or one of your own that asks no agent"
     )
+    parser.add_argument(
+        "--discover_packages_path", "--env.discover_packages_path", "--protocol.discover_packages_path",
+        dest="modules", action="append", default=[], metavar="MODULE",
+        help="import a module first, which registers a scene or a task order",
+    )  # fmt: skip
     parser.add_argument("--no_end_effector_reset", action="store_true", help="leave the arm where it is")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("stream.mp4"), help="the MP4 (default: stream.mp4)")
@@ -274,6 +280,8 @@ def main() -> None:
             parser.error(f"--{name} must be at least 1, got {getattr(args, name)}")
     scene = {"scene": args.scene} if args.scene else {}
     try:
+        for module in args.modules:
+            import_module(module)
         check_order(args.task_order)
         protocol = ProtocolConfig(
             scene_reset_interval=args.scene_reset_interval,
@@ -283,7 +291,7 @@ def main() -> None:
         config, agent = CronosEnvConfig(obs_type="environment_state_agent_pos", **scene), None
         if args.policy_path:
             config, agent = make_spectator(args.policy_path, args.device, args.scene)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ModuleNotFoundError) as error:
         parser.error(str(error))
     env = CronosVectorEnv(1, config.scene, **config.gym_kwargs)
     try:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.scene.scenes import get_scene
 from lerobot_env_cronos.simulation.rendering import RENDERERS
@@ -79,8 +80,13 @@ def main() -> None:
     parser.add_argument("--renderer", default="classic", choices=RENDERERS)
     parser.add_argument("--output", type=Path, help="default: docs/images/tasks_SCENE.png")
     args = parser.parse_args()
-    if args.module:
-        import_module(args.module)
+    register_third_party_plugins()
+    try:
+        if args.module:
+            import_module(args.module)
+        get_scene(args.scene)
+    except (ValueError, ModuleNotFoundError) as error:
+        parser.error(str(error))
     output = args.output or Path("docs/images") / f"tasks_{args.scene}.png"
     output.parent.mkdir(parents=True, exist_ok=True)
     sheet = draw_sheet(render_tasks(args.scene, args.split, args.renderer))

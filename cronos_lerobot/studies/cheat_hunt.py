@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
+from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosVectorEnv, Task, get_scene
 from PIL import Image
 from tqdm import tqdm
@@ -202,6 +203,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     args = parser.parse_args(argv)
     if args.trials < 1:
         parser.error(f"--trials must be at least 1, got {args.trials}")
+    register_third_party_plugins()
     try:
         get_scene(args.scene)
     except ValueError as error:

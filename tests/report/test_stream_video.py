@@ -1,5 +1,7 @@
 """Films of streams: as many frames as control steps, resets where they belong, files that play."""
 
+import os
+import sys
 from types import SimpleNamespace
 
 import av
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from dummies import DummyEnv, DummyPolicy, identity_processors
+from forked_commands import run_forked
 from lerobot.policies import get_policy_class, make_policy, make_policy_config, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
@@ -230,6 +233,33 @@ def test_an_order_that_asks_a_training_is_refused_in_a_line(name, tmp_path, monk
         f"error: --task_order={name} goes by what it is told of a training (bind), and here nothing is trained"
     )
     assert f"{sentence}: choose one of ['heuristic', 'random']" in capsys.readouterr().err
+
+
+OWN_MODULE = """
+from lerobot_env_cronos import Body, Scene, register_scene
+from cronos_lerobot.protocol.task_orders import TASK_ORDERS
+
+register_scene(
+    Scene("one_task", objects=("block of ones own",), receptacles=("coaster of ones own",)),
+    bodies=[
+        Body("block of ones own", (0.030, 0.060, 0.020), 600, "box", colour=(0.85, 0.30, 0.35)),
+        Body("coaster of ones own", (0.100, 0.100, 0.005), 900, "disc", colour=(0.10, 0.30, 0.80)),
+    ],
+)
+TASK_ORDERS["of_ones_own"] = TASK_ORDERS["heuristic"]
+"""
+
+
+def test_a_scene_and_an_order_of_ones_own_are_filmed(tmp_path):
+    (tmp_path / "own_module.py").write_text(OWN_MODULE)
+    command = [sys.executable, "-m", "cronos_lerobot.report.stream_video", "--policy=expert", "--segments=1"]
+    command += ["--scene=one_task", "--task_order=of_ones_own", f"--output={tmp_path / 'stream.mp4'}"]
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    done = run_forked([*command, "--discover_packages_path=own_module"], env=environment)
+    assert (done.returncode, "80 frames" in done.stdout) == (0, True), done.stderr
+    done = run_forked([*command, "--discover_packages_path=no_module"], env=environment)
+    assert done.returncode == 2
+    assert done.stderr.endswith("error: No module named 'no_module'\n")
 
 
 def test_sheet_has_every_task_from_both_cameras():
