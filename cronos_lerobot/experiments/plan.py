@@ -38,17 +38,27 @@ LAST_POLICY = Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR)
 
 
 def make_jobs(experiments: Iterable[tuple[Experiment, tuple[Row, ...]]], options: Options) -> list[Job]:
-    """All jobs of some experiments with their chosen rows, each once, in an order that runs."""
+    """All jobs of some experiments with their chosen rows, each once, in an order that runs.
+
+    Raises:
+        ValueError: two of them are other commands with one name, and so with one folder.
+    """
     jobs: dict[str, Job] = {}
+
+    def add(job: Job) -> None:
+        there = jobs.setdefault(job.name, job)
+        if there.command != job.command:
+            one, other = (" ".join(each.command) for each in (there, job))
+            raise ValueError(f"two commands would share the folder of {job.name}: {one}; and {other}")
+
     for experiment, rows in experiments:
         for spec in run_specs(experiment, options, rows):
             base = [] if options.policy_path else base_jobs(spec.base, options)
-            jobs |= {job.name: job for job in base}
-            train = train_job(spec, base[-1].name if base else None)
-            jobs |= {train.name: train}
+            made = [*base, train_job(spec, base[-1].name if base else None)]
             for evaluation in experiment.evaluations:
-                jobs |= {job.name: job for job in base_evaluation_jobs(spec, evaluation)}
-                jobs |= {job.name: job for job in evaluation_jobs(spec, evaluation)}
+                made += [*base_evaluation_jobs(spec, evaluation), *evaluation_jobs(spec, evaluation)]
+            for job in made:
+                add(job)
     return list(jobs.values())
 
 
@@ -76,8 +86,11 @@ def base_jobs(base: Base, options: Options) -> list[Job]:
     demos = Job(f"{name}/demos", tuple(record), folder / "demos", stage=BASE)
     # Evaluations may have come from another machine, without the clone that they are of.
     pairs = [(suite, split) for suite in SUITES for split in SPLITS]
-    evaluations = tuple(base_evaluation_folder(base, suite, split, options) for suite, split in pairs)
-    clone_job = Job(f"{name}/clone", tuple(clone), folder / "clone", evaluations, needs=(demos.name,), stage=BASE)
+    evaluations = {base_evaluation_folder(base, suite, split, options) for suite, split in pairs}
+    # Rows with an environment of their own have theirs beside them.
+    evaluations |= {there for suite in SUITES for there in folder.glob(f"{suite}_*") if there.is_dir()}
+    from_it = tuple(sorted(evaluations))
+    clone_job = Job(f"{name}/clone", tuple(clone), folder / "clone", from_it, needs=(demos.name,), stage=BASE)
     return [replace(job, environment=gymnasium_id(scene), root=options.root) for job in (demos, clone_job)]
 
 

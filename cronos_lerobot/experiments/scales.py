@@ -37,7 +37,8 @@ SCALES: dict[str, Scale] = {
     ),
     "smoke": Scale(
         "smoke",
-        {SHORT: 2_560, LONG: 2_560},
+        # Each its own, as folders of runs are named by their steps.
+        {SHORT: 2_560, LONG: 3_840},
         seeds=1,
         num_envs=4,
         eval_freq=1_280,

@@ -164,6 +164,18 @@ def test_runs_are_shared_between_experiments():
     assert len([job for job in everything if job.name.startswith("base/")]) == 6 + 1 + 3
 
 
+@pytest.mark.parametrize("scale", SCALES)
+def test_no_two_commands_share_a_folder(scale):
+    everything = [(experiment, experiment.rows) for experiment in EXPERIMENTS.values()]
+    kinds = {row.begins_with(experiment.scene) for experiment, rows in everything for row in rows}
+    recipes = {base.recipe: base_recipe(SCALES[scale], base.scene, STATE, kind=base.kind) for base in kinds}
+    make_jobs(everything, replace(options(scale), recipes=recipes))
+    table1 = EXPERIMENTS["table1"]
+    other = replace(table1, name="mine", rows=(replace(table1.rows[0], flags=("--algorithm.gamma=0.9",)),))
+    with pytest.raises(ValueError, match=r"two commands would share the folder of kitchen_2x2_state_.*/t80_"):
+        make_jobs([(table1, table1.rows), (other, other.rows)], options(scale))
+
+
 def test_rows_of_one_configuration_begin_with_a_policy_of_that_one_and_repeat_their_episodes():
     jobs = jobs_of("figure4", rows=["t80", "t80_1config"])
     one = "base/kitchen_2x2_state_400demos_320steps_1config"
@@ -258,7 +270,7 @@ def test_pixels():
     assert not [flag for job in trains for flag in job.command if flag.startswith("--policy.freeze")]
 
 
-def test_evaluations_of_checkpoints():
+def test_evaluations_of_checkpoints(tmp_path):
     figure4 = jobs_of("figure4", rows=["t80"])
     evals = [job for job in figure4.values() if job.command[0] == "cronos-eval" and "/seed2/" in job.name]
     # Every multiple of 102,400 up to 1,300,480, 1.3 M rounded up to whole updates, and that itself.
@@ -281,6 +293,10 @@ def test_evaluations_of_checkpoints():
     assert made == {
         f"{suite}_{split}" for suite in ("independent", "sequential") for split in ("train", "held_out")
     }
+    # And what a row with an environment of its own has there.
+    own = tmp_path / base / "independent_held_out_1234abcd"
+    own.mkdir(parents=True)
+    assert own in jobs_of("figure4", rows=["t80"], root=tmp_path)[f"{base}/clone"].made_from_it
     assert f"--policy.path={run}/train/checkpoints/1300480/pretrained_model" in evals[-1].command
     assert evals[0].needs == ("kitchen_2x2_state_paper/t80_1300k/seed2",)
     figure5 = [job for job in jobs_of("figure5", rows=["t80"]).values() if job.command[0] == "cronos-eval"]
