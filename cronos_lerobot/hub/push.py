@@ -14,6 +14,7 @@ from huggingface_hub import HfApi, constants
 from huggingface_hub.errors import (
     HfHubHTTPError,
     HFValidationError,
+    LocalEntryNotFoundError,
     LocalTokenNotFoundError,
     RepositoryNotFoundError,
     RevisionNotFoundError,
@@ -152,7 +153,7 @@ def _explain(error: BaseException, target: Target) -> str | None:
         return f"the token may not write to {where} on {hub}"
     if isinstance(error, HfHubHTTPError) and status is not None and status < 500:
         return f"{hub} refused: {error}"
-    if isinstance(error, HfHubHTTPError | httpx.TransportError):
+    if isinstance(error, HfHubHTTPError | LocalEntryNotFoundError | httpx.TransportError):
         return (
             f"lost the connection to {hub} ({type(error).__name__}) while pushing to {where}: run the same command"
             " again, it goes on with what is missing"

@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 from huggingface_hub import EvalResultEntry, HfApi, eval_result_entries_to_yaml
 from huggingface_hub.constants import CONFIG_NAME
-from huggingface_hub.errors import EntryNotFoundError
+from huggingface_hub.errors import RemoteEntryNotFoundError
 from huggingface_hub.hf_api import RepoFile
 from lerobot_env_cronos import Benchmark, gymnasium_id, load_benchmark
 from lerobot_env_cronos.benchmark.benchmark import SUITES
@@ -214,10 +214,11 @@ def _published(config: ResultsConfig, revision: str | None) -> list[dict[str, An
     """The entries that the repository has."""
     api = HfApi()
     with explained(config.target):
-        api.model_info(config.repo_id, revision=revision)
+        # By its commit: without a connection an older one of the cache is none.
+        commit = api.model_info(config.repo_id, revision=revision).sha
         try:
-            path = api.hf_hub_download(config.repo_id, FILE, revision=revision)
-        except EntryNotFoundError:
+            path = api.hf_hub_download(config.repo_id, FILE, revision=commit)
+        except RemoteEntryNotFoundError:
             return []
     entries = yaml.safe_load(Path(path).read_text()) or []
     if not isinstance(entries, list) or not all(

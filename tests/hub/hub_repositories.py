@@ -94,8 +94,8 @@ class Faults:
     read_only_tokens: bool = False
     drop_uploads_of: str | None = None
     """LFS uploads of files with this suffix lose their connection after half of the bytes."""
-    drop_downloads: bool = False
-    """Every download of a file loses its connection."""
+    drop_downloads_of: str | None = None
+    """Downloads of files with this suffix lose their connection."""
     drop_commits: int = 0
     """So many commits lose their connection before they are read."""
 

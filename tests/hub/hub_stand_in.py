@@ -352,7 +352,8 @@ class Handler(BaseHTTPRequestHandler):
         file = commit.files.get(path)
         if file is None:
             raise HubError(404, "EntryNotFound", f"{path} does not exist")
-        if self.hub.faults.drop_downloads:
+        suffix = self.hub.faults.drop_downloads_of
+        if suffix is not None and path.endswith(suffix):
             raise DroppedError
         headers = {
             "ETag": f'"{file.etag}"',

@@ -236,6 +236,11 @@ HfApi().upload_file(path_or_fileobj={yaml.safe_dump([old, other]).encode()!r}, r
     path_in_repo=".eval_results/cronos.yaml")
 """)  # fmt: skip
     before = hub.tree("models", policy)
+    # What the Hub does not answer is not taken for none.
+    hub.faults.drop_downloads_of = "cronos.yaml"
+    assert "lost the connection" in commands.try_(*publish, impatient=True).output
+    hub.faults.drop_downloads_of = None
+    assert hub.tree("models", policy) == before
     commands.run(*publish, "--dry_run=true", f"--output_dir={tmp_path / 'dry'}")
     commands.run(*publish)
     after = hub.tree("models", policy)
@@ -337,10 +342,10 @@ def test_a_refused_token(hub, commands):
 def test_a_benchmark_that_cannot_be_loaded(hub, bench, commands):
     commands.forget()
     show = ("cronos-eval", "--expert=true", "--env.benchmark=me/bench")
-    hub.faults.drop_downloads = True
+    hub.faults.drop_downloads_of = ""
     lost = commands.try_(*show, impatient=True)
     assert re.search(r"error: .*(lost the connection to|cannot reach) the Hub .*benchmark 'me/bench'", lost.output)
-    hub.faults.drop_downloads, hub.faults.refuse_tokens = False, True
+    hub.faults.drop_downloads_of, hub.faults.refuse_tokens = None, True
     refused = commands.try_(*show)
     assert "error: the Hub refused to give out benchmark 'me/bench': Client error '401" in refused.output
 
