@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -16,10 +17,14 @@ from tqdm import tqdm
 
 from cronos_lerobot.evaluation.chains import Chain, Trajectory
 from cronos_lerobot.evaluation.plan import Part
-from cronos_lerobot.evaluation.store import ResultStore, chain_key
+from cronos_lerobot.evaluation.store import RESULTS, ResultStore, chain_key, write_json
 from cronos_lerobot.film.encode import write_mp4
 from cronos_lerobot.film.overlay import Status, draw_status
 
+DRAWN = "videos/drawn.json"
+"""In an evaluation's folder: with what each video was drawn, by its name."""
+LOOKS = ("renderer", "render_size")
+"""Fields of `env` that change the videos, and of a policy that sees the state nothing else."""
 GOOD, BAD = "good", "bad"
 FPS = 20
 """Four times as fast as it happened."""
@@ -54,12 +59,13 @@ def choose(records: Sequence[dict[str, Any]], num_tasks: int, count: int) -> dic
 def film_best_and_worst(
     store: ResultStore, parts: Sequence[Part], env_config: CronosEnvConfig, count: int
 ) -> list[dict[str, Any]]:
-    """Film `count` good and bad chains of every suite and split, unless their videos are there already.
+    """Film `count` good and bad chains of every suite and split, unless videos that look so are there already.
 
     Returns:
         What was filmed: `path` in the store's folder, `suite`, `split`, `kind`, and the chain's record.
     """
     todo = list(_chosen(store, parts, count))
+    drawn, looks = note_drawings(store.folder, env_config), _looks(env_config)
     renderer: BatchRenderer | None = None
     videos = []
     for part, kind, record in tqdm(todo, unit="video", disable=None):
@@ -70,19 +76,44 @@ def film_best_and_worst(
         name = f"{what}{record['number']}_configuration{record['configuration']}"
         path = Path("videos") / f"{part.suite}_{part.split}_{kind}_{name}.mp4"
         videos.append({"path": str(path), "suite": part.suite, "split": part.split, "kind": kind} | record)
-        if (store.folder / path).is_file():
+        if (store.folder / path).is_file() and drawn[path.name] == looks:
             continue
         try:
             renderer = renderer or _open_renderer(env_config)
         except RuntimeError as error:
             logging.warning("no videos: %s", error)
             return []
+        # In this order, so that after a kill no video is there that looks otherwise than noted.
+        (store.folder / path).unlink(missing_ok=True)
+        drawn[path.name] = looks
+        write_json(store.folder / DRAWN, drawn)
         chain = next(c for c in part.chains if chain_key(vars(c)) == chain_key(record))
         where = f"{part.split.replace('_', '-')} {record['configuration']}, {what} {record['number']}"
         film_chain(store.folder / path, chain, record["length"], trajectory, renderer.render, where)
     if renderer is not None:
         renderer.close()
     return videos
+
+
+def note_drawings(folder: Path, env_config: CronosEnvConfig) -> dict[str, dict[str, Any]]:
+    """Note with what the videos in an evaluation's folder were drawn, where it is not noted; returns all notes.
+
+    Those without a note look as results.json says, so this comes before it is written anew.
+    """
+    path, results = folder / DRAWN, folder / RESULTS
+    notes = json.loads(path.read_text()) if path.is_file() else {}
+    unnoted = {video.name for video in folder.glob("videos/*.mp4")} - set(notes)
+    if unnoted:
+        there = json.loads(results.read_text()) if results.is_file() else {}
+        env = there.get("config", {}).get("env", {})
+        looks = _looks(env_config) | {name: env[name] for name in LOOKS if name in env}
+        notes |= dict.fromkeys(sorted(unnoted), looks)
+        write_json(path, notes)
+    return notes
+
+
+def _looks(env_config: CronosEnvConfig) -> dict[str, Any]:
+    return {"renderer": env_config.renderer, "render_size": list(env_config.render_size)}
 
 
 def _chosen(store: ResultStore, parts: Sequence[Part], count: int) -> Iterator[tuple[Part, str, dict[str, Any]]]:

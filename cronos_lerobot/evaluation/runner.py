@@ -18,7 +18,7 @@ from tqdm import tqdm
 from cronos_lerobot.evaluation.actors import Actor, ExpertActor, load_actor
 from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
 from cronos_lerobot.evaluation.config import CronosEvalConfig
-from cronos_lerobot.evaluation.film import film_best_and_worst
+from cronos_lerobot.evaluation.film import film_best_and_worst, note_drawings
 from cronos_lerobot.evaluation.plan import Part
 from cronos_lerobot.evaluation.results import independent_results, sequential_results
 from cronos_lerobot.evaluation.store import (
@@ -89,6 +89,7 @@ class Evaluation:
         finally:
             self._close()
         results = self.results()
+        note_drawings(self.store.folder, self.env_config)
         write_json(self.store.folder / self.file, results)
         if left_out := set(self.store.names()) - {part.name for part in self.parts}:
             logging.warning(

@@ -12,6 +12,8 @@ from lerobot_env_cronos.benchmark.benchmark import SUITES
 from cronos_lerobot.report.statistics import ChainRate, Rate, sum_rates
 
 EVAL_INFO = "eval_info.json"
+SEED = 1000
+"""LeRobot's default. The file names none; another one matters where orderings start from other configurations."""
 
 
 @dataclass
@@ -25,8 +27,8 @@ class EvaluationRun:
     """By instruction, or ordering of a sequential suite: one flag for each episode."""
     videos: dict[str, list[Path]]
     """By instruction: the videos of the first episodes, in their order."""
-    num_configurations: int
-    """Of the split. Episodes begin with one after the other, and anew with the first."""
+    starts: dict[str, list[int]]
+    """By ordering of a sequential suite: the configurations that its chains begin with, again and again."""
 
     @property
     def name(self) -> str:
@@ -38,7 +40,7 @@ class EvaluationRun:
         """Success by instruction or ordering."""
         if not self.suite.startswith("sequential"):
             return {task: Rate(sum(flags), len(flags)) for task, flags in self.successes.items()}
-        return {name: ChainRate.of(flags, self.num_configurations) for name, flags in self.successes.items()}
+        return {name: ChainRate.of(flags, self.starts[name]) for name, flags in self.successes.items()}
 
     @property
     def overall(self) -> Rate:
@@ -70,9 +72,12 @@ def read_evaluation_runs(
                 f" begin with {' or '.join(SUITES)}"
             )
         groups = {group.number: group for group in episodes.groups(kind, split)}
-        run = runs.setdefault(suite, EvaluationRun(folder, suite, {}, {}, len(episodes.configurations[split])))
+        run = runs.setdefault(suite, EvaluationRun(folder, suite, {}, {}, {}))
         if kind == "sequential":
             task = f"ordering {number}"  # an episode is a chain of all tasks
+            everywhere = range(len(episodes.configurations[split]))
+            own = groups[number].configurations if number in groups else everywhere
+            run.starts[task] = [own[(SEED + i) % len(own)] for i in range(len(own))]
         else:
             task = groups[number].instructions[0] if number in groups else f"task {number}"
         run.successes[task] = [bool(flag) for flag in entry["metrics"]["successes"]]

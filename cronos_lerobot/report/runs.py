@@ -91,21 +91,27 @@ class TrainingRun:
 
     @property
     def begins_alike(self) -> bool:
-        """Whether the first evaluation was made as the last one: else there is no success before the training."""
-        return self.alike[:1] == self.evaluations[:1]
+        """Whether the first evaluation is of step 0 and made as the last one: else there is no success before."""
+        return self.alike[:1] == self.evaluations[:1] and not self._unmeasured
 
     @property
-    def left_out(self) -> str | None:
-        """Which evaluations are not among those `alike`, and why, in words; None if all are."""
-        others = [one for one in self.evaluations if _made(one) != _made(self.evaluations[-1])]
-        if not others:
-            return None
-        settings = dict.fromkeys(_describe_made(one) for one in others)
-        text = (
-            f"{len(others)} of {len(self.evaluations)} evaluations of {self.folder}: they are of"
-            f" {' and of '.join(settings)}, the last one is of {_describe_made(self.evaluations[-1])}"
-        )
-        return text if self.begins_alike else f"{text}; what is left has no before, D or C"
+    def _unmeasured(self) -> int:
+        """Steps before the first evaluation: of a run that began with `--eval_freq=0` and was resumed without."""
+        return self.evaluations[0]["interaction_steps"] if self.evaluations else 0
+
+    @property
+    def left_out(self) -> list[str]:
+        """Which evaluations are not among those `alike`, and why, and that there is none of step 0, in words."""
+        n = self._unmeasured
+        said = [f"the first evaluation of {self.folder} is after {n:,} steps: no before, D or C"] if n else []
+        if others := [one for one in self.evaluations if _made(one) != _made(self.evaluations[-1])]:
+            settings = dict.fromkeys(_describe_made(one) for one in others)
+            text = (
+                f"{len(others)} of {len(self.evaluations)} evaluations of {self.folder}: they are of"
+                f" {' and of '.join(settings)}, the last one is of {_describe_made(self.evaluations[-1])}"
+            )
+            said.append(text if n or self.begins_alike else f"{text}; what is left has no before, D or C")
+        return said
 
 
 def _made(evaluation: Evaluation) -> tuple[Any, ...]:
@@ -137,7 +143,7 @@ class FoundRuns:
     """Those of cronos-eval."""
     left_out: list[str]
     """What could not be read, a sentence for each: crashed before its first record, damaged, of version 0. And
-    the evaluations of runs that are not `alike`."""
+    the evaluations of runs that are not `alike`, or missing at step 0."""
 
 
 def find_runs(folders: Iterable[Path], scene: str | None = None, benchmark: str | None = None) -> FoundRuns:
@@ -191,7 +197,7 @@ def find_runs(folders: Iterable[Path], scene: str | None = None, benchmark: str 
     if left_out and not (training or evaluation or suites):
         raise ValueError("; ".join(left_out.values()))
     evaluations = [run for runs in evaluation.values() for run in runs]
-    said = [*left_out.values(), *(run.left_out for run in training.values() if run.left_out)]
+    said = [*left_out.values(), *(text for run in training.values() for text in run.left_out)]
     return FoundRuns(list(training.values()), evaluations, read_suite_runs(suites), said)
 
 
@@ -229,7 +235,6 @@ def read_training_run(folder: Path) -> TrainingRun:
     # Null is an environment of another kind.
     if starts and (made_in := starts[0].get("environment", "")) is not None:
         check_environment_id(made_in or None, f"the run in {folder}", "train it anew")
-
     return TrainingRun(
         folder,
         config_of(folder, starts),
@@ -290,7 +295,6 @@ def group_runs(runs: list[TrainingRun], notes: list[str] | None = None) -> list[
     """Group runs by their config but for seed and length, labelled by what tells the groups apart.
 
     A run that was resumed with other flags of the protocol or the agent is of its own kind, as its label says.
-
     Of several runs of one seed from one policy a group has the longest.
 
     Args:

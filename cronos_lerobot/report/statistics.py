@@ -51,9 +51,9 @@ class ChainRate(Rate):
     """Where each began."""
 
     @classmethod
-    def of(cls, flags: Sequence[bool], num_configurations: int) -> ChainRate:
-        """The rate of chains that begin with one configuration after the other."""
-        return cls(sum(flags), len(flags), tuple(flags), tuple(i % num_configurations for i in range(len(flags))))
+    def of(cls, flags: Sequence[bool], starts: Sequence[int]) -> ChainRate:
+        """The rate of chains that begin with one of these configurations after the other, and anew."""
+        return cls(sum(flags), len(flags), tuple(flags), tuple(starts[i % len(starts)] for i in range(len(flags))))
 
     @property
     def interval(self) -> tuple[float, float]:

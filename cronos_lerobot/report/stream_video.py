@@ -21,6 +21,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
+from safetensors import SafetensorError
 from tqdm import tqdm
 
 from cronos_lerobot.agents.base import ActionSample, plain_sample
@@ -278,6 +279,8 @@ def main() -> None:
     for name in ("segments", "gif_segments", "fps"):
         if getattr(args, name) < 1:
             parser.error(f"--{name} must be at least 1, got {getattr(args, name)}")
+    if args.seed < 0:
+        parser.error(f"--seed must be at least 0, got {args.seed}")
     scene = {"scene": args.scene} if args.scene else {}
     try:
         for module in args.modules:
@@ -293,6 +296,8 @@ def main() -> None:
             config, agent = make_spectator(args.policy_path, args.device, args.scene)
     except (ValueError, OSError, ModuleNotFoundError) as error:
         parser.error(str(error))
+    except SafetensorError as error:
+        parser.error(f"--policy.path={args.policy_path}: its weights are damaged: {error}")
     env = CronosVectorEnv(1, config.scene, **config.gym_kwargs)
     try:
         stream = film_stream(env, agent or ExpertSpectator(env), protocol, args.segments, args.seed)

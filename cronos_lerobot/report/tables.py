@@ -17,8 +17,6 @@ Row = dict[str, Any]
 ALL = "all tasks"
 APART = ("found_complete", "never_grasped")
 """Of the successes, those for which nothing had to be done, and others without a grasp."""
-COUNTED = ("scene_reset", "heuristic_reset", "divergence")
-"""Kinds of intervention that count against the budget."""
 
 
 def rate_columns(rate: Rate, prefix: str = "") -> Row:

@@ -132,6 +132,8 @@ def main() -> None:
     args = parser.parse_args()
     if not args.runs + args.before + args.after:
         parser.error("name at least one run folder; cronos-report --help has examples")
+    if args.output.exists() and not args.output.is_dir():
+        parser.error(f"--output={args.output} is a file; name a folder, new or of another report")
     from lerobot.utils.import_utils import register_third_party_plugins
 
     # Scenes that are installed by themselves.
@@ -151,7 +153,10 @@ def main() -> None:
     from cronos_lerobot.report.page import write_report
     from cronos_lerobot.report.tables import comparison_text
 
-    page = write_report(report, args.output)
+    try:
+        page = write_report(report, args.output)
+    except OSError as error:
+        sys.exit(f"error: the report was not written: {error}")
     for text in report.left_out:
         print(f"left out: {text}", file=sys.stderr)
     if report.comparisons:

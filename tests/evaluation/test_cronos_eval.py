@@ -22,6 +22,7 @@ from cronos_lerobot.agents.processing import make_processors
 from cronos_lerobot.evaluation.actors import make_actor
 from cronos_lerobot.evaluation.chains import Chain, ChainRunner, chain_noise
 from cronos_lerobot.evaluation.config import CronosEvalConfig, SuitesConfig
+from cronos_lerobot.evaluation.film import DRAWN
 from cronos_lerobot.evaluation.outcomes import read_outcomes
 from cronos_lerobot.evaluation.plan import Part
 from cronos_lerobot.evaluation.runner import Evaluation
@@ -318,11 +319,11 @@ def test_lerobot_eval_command(pocketvla, tmp_path):
 def test_a_part_says_what_made_it_and_is_kept_made_again_or_refused_by_that(pocketvla, tmp_path, caplog):
     folder = tmp_path / "out"
 
-    def evaluate(videos=0):
+    def evaluate(videos=0, size=(48, 64)):
         policy = PreTrainedConfig.from_pretrained(pocketvla)
         policy.pretrained_path, policy.device = pocketvla, "cpu"
         suites = SuitesConfig("independent", "train", n_episodes=1, batch_size=4, videos=videos)
-        env = CronosEnvConfig(**STATE, render_size=(48, 64))
+        env = CronosEnvConfig(**STATE, render_size=size)
         return Evaluation(CronosEvalConfig(env, policy, suites, output_dir=folder)).run()
 
     def edit(**made_by):
@@ -354,6 +355,13 @@ def test_a_part_says_what_made_it_and_is_kept_made_again_or_refused_by_that(pock
     before = path.stat().st_mtime_ns
     # More videos than the first time, without running anything.
     assert len(evaluate(videos=4)["videos"]) == 4
+    # Of another size: drawn anew, also where nothing but results.json says of which size the old ones are.
+    for size, is_noted in (((64, 64), True), ((48, 64), False)):
+        if not is_noted:
+            (folder / DRAWN).unlink()
+        (video,) = evaluate(videos=1, size=size)["videos"]
+        with av.open(str(folder / video["path"])) as film:
+            assert (film.streams.video[0].height, film.streams.video[0].width) == size
     assert path.stat().st_mtime_ns == before
     edit(policy="another")
     with pytest.raises(ValueError, match=r"another policy: another there, .*now; choose another --output_dir"):

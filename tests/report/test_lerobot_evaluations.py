@@ -5,12 +5,15 @@ import re
 from dataclasses import replace
 from types import MappingProxyType
 
+import numpy as np
 import pytest
 from lerobot_env_cronos import load_benchmark
+from lerobot_env_cronos.benchmark.benchmark import draw_benchmark
 from lerobot_env_cronos.benchmark.files import write_benchmark
 from lerobot_env_cronos.scene.scenes import SCENES
 from synthetic_runs import INSTRUCTIONS, write_evaluation, write_training_run
 
+from cronos_lerobot.evaluation.rates import cluster_interval
 from cronos_lerobot.report.runs import find_runs
 from cronos_lerobot.scripts.report import make_report
 
@@ -39,6 +42,29 @@ def test_tasks_are_named_as_in_the_benchmark(evaluations, tmp_path):
     assert tasks_of(report) == [task.instruction for task in SCENES["playroom_2x2"].tasks][::-1]
     with pytest.raises(ValueError, match="is of playroom_2x2, not of kitchen_2x2"):
         make_report([], **evaluations, benchmark=str(tmp_path / "mine"), scene="kitchen_2x2")
+
+
+def test_chains_go_together_by_the_configurations_that_their_own_ordering_begins_with(tmp_path):
+    drawn = draw_benchmark("kitchen_2x2", seed=1, num_configurations=16, num_orderings=2)
+    some = (tuple(range(8)), tuple(range(4, 16)))
+    chains = {
+        split: tuple(replace(g, configurations=own) for g, own in zip(groups, some, strict=True))
+        for split, groups in drawn.sequential.items()
+    }
+    write_benchmark(replace(drawn, sequential=MappingProxyType(chains)), tmp_path / "mine")
+    folder = write_evaluation(tmp_path / "eval", "sequential_train", successes=(13, 9), n=32)
+    flags = np.random.default_rng(0).random((2, 32)) < 0.5
+    info = json.loads((folder / "eval_info.json").read_text())
+    for entry, own in zip(info["per_task"], flags.tolist(), strict=True):
+        entry["metrics"]["successes"] = own
+    (folder / "eval_info.json").write_text(json.dumps(info))
+    (run,) = make_report([folder], benchmark=str(tmp_path / "mine")).evaluations
+    first = run.tasks["ordering 0"].interval
+    assert first == pytest.approx(cluster_interval(flags[0], np.arange(32) % 8))
+    assert first != pytest.approx(cluster_interval(flags[0], np.arange(32) % 16))
+    # lerobot-eval's episode i starts from number (1000 + i) % k of each ordering's own.
+    starts = [own[(1000 + i) % len(own)] for own in some for i in range(32)]
+    assert run.overall.interval == pytest.approx(cluster_interval(flags.ravel(), np.array(starts)))
 
 
 def test_the_scene_is_that_of_the_runs_beside_them_unless_it_is_named(evaluations, tmp_path):

@@ -58,6 +58,21 @@ def test_a_run_whose_first_evaluation_was_made_otherwise_has_no_before_and_no_ar
     assert (row["D / steps"], row["C / interventions"]) == (None, None)
 
 
+@pytest.mark.parametrize("settings", [{}, {"split": "held_out"}])
+def test_a_run_that_was_first_evaluated_midway_has_no_before_and_no_areas(tmp_path, settings):
+    run = write_training_run(tmp_path / "run", successes=(1, 2, 6))
+    evaluated_otherwise(run, {0: settings})
+    lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
+    # As of --eval_freq=0, until it was resumed with another one.
+    (run / "metrics.jsonl").write_text("".join(lines[1:]))
+    found = find_runs([run])
+    assert found.left_out == [f"the first evaluation of {run} is after 5,120 steps: no before, D or C"]
+    groups = group_runs(found.training)
+    assert compare_training(groups) == []
+    (row,) = seed_rows(groups)
+    assert (row["success"], row["D / steps"], row["C / interventions"]) == (0.75, None, None)
+
+
 def test_a_seed_that_did_not_come_as_far_is_left_out_of_the_gains_and_said(tmp_path):
     for seed, updates in ((1, 8), (2, 8), (3, 8)):
         write_training_run(tmp_path / str(seed), seed=seed, successes=(2, 4, 5 + seed), updates=updates)

@@ -332,6 +332,22 @@ def test_large_videos_are_linked(tmp_path, monkeypatch):
     assert "data:video" not in page
 
 
+def test_an_output_that_cannot_be_written_is_told_in_a_line(tmp_path, monkeypatch, capsys):
+    run = write_training_run(tmp_path / "run")
+    (file := tmp_path / "page").touch()
+    monkeypatch.setattr(sys, "argv", ["cronos-report", str(run), f"--output={file}"])
+    with monkeypatch.context() as patch:
+        # Refused before anything is read.
+        patch.setattr("cronos_lerobot.scripts.report.make_report", None)
+        with pytest.raises(SystemExit, match="2"):
+            main()
+    said = f"error: --output={file} is a file; name a folder, new or of another report\n"
+    assert capsys.readouterr().err.endswith(said)
+    monkeypatch.setattr(sys, "argv", ["cronos-report", str(run), f"--output={file / 'below'}"])
+    with pytest.raises(SystemExit, match=r"^error: the report was not written: .*Not a directory: "):
+        main()
+
+
 def test_command_line(tmp_path):
     write_training_run(tmp_path / "run")
     command = [sys.executable, "-m", "cronos_lerobot.scripts.report", str(tmp_path / "run")]

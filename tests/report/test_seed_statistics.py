@@ -31,7 +31,7 @@ def test_seeds_that_are_all_alike_do_not_say_that_every_training_is():
 
 
 def test_chains_from_one_configuration_go_together():
-    one = ChainRate.of([True, True, False, False], 4)
+    one = ChainRate.of([True, True, False, False], range(4))
     # One from each configuration: Wilson's of 2 of 4, .5 -+ z sqrt(.25 / 4 + z^2 / 64) / (1 + z^2 / 4).
     assert one.interval == pytest.approx((0.1500, 0.8500), abs=1e-4)
     # A second ordering that comes out alike. 2, 2, 0, 0 of the four vary by 4 / 3 * 4 / 8^2 = 1 / 12, where eight
@@ -41,7 +41,7 @@ def test_chains_from_one_configuration_go_together():
     assert both.interval == pytest.approx((0.0608, 0.9392), abs=1e-3)
     assert SeedRate.of([both]).interval == both.interval
     # More chains than configurations begin anew with the first.
-    assert ChainRate.of([True, True, False, False] * 2, 4) == both
+    assert ChainRate.of([True, True, False, False] * 2, range(4)) == both
 
 
 def test_gains_that_are_all_alike_have_an_interval_of_their_evaluations():

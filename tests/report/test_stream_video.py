@@ -235,6 +235,25 @@ def test_an_order_that_asks_a_training_is_refused_in_a_line(name, tmp_path, monk
     assert f"{sentence}: choose one of ['heuristic', 'random']" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("flag", "said"),
+    [
+        ("--segments=0", "--segments must be at least 1, got 0"),
+        ("--seed=-1", "--seed must be at least 0, got -1"),
+        ("--fps=20", "--policy.path={}: its weights are damaged: Error while deserializing header"),
+    ],
+)
+def test_flags_and_weights_that_cannot_be_are_refused_in_a_line(flag, said, tmp_path, monkeypatch, capsys):
+    checkpoint = save_policy(tmp_path / "policy", "act", TOLD, **TINY_ACT)
+    weights = checkpoint / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:1000])
+    arguments = [f"--policy.path={checkpoint}", flag, f"--output={tmp_path / 'stream.mp4'}"]
+    monkeypatch.setattr("sys.argv", ["stream_video", *arguments])
+    with pytest.raises(SystemExit, match="2"):
+        stream_video.main()
+    assert f"error: {said.format(checkpoint)}" in capsys.readouterr().err.splitlines()[-1]
+
+
 OWN_MODULE = """
 from lerobot_env_cronos import Body, Scene, register_scene
 from cronos_lerobot.protocol.task_orders import TASK_ORDERS
