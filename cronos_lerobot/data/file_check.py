@@ -60,9 +60,9 @@ def check_dataset(root: Path) -> Origin:
         ValueError: another version of the environment made it, or none.
     """
     _check_meta_is_there(root)
+    rows = [row for path in sorted(root.glob("meta/episodes/*/*.parquet")) for row in _rows(root, path)]
     try:
         meta = LeRobotDatasetMetadata("local/dataset", root=root)
-        rows = [row for path in sorted(root.glob("meta/episodes/*/*.parquet")) for row in _rows(path)]
     except (KeyError, TypeError, json.JSONDecodeError, pa.ArrowInvalid) as error:
         raise DatasetFileError(f"{root}/meta cannot be read: {error}") from error
     origin = read_origin(root, meta.features, f"the dataset in {root}")
@@ -139,8 +139,11 @@ def _check_meta_is_there(root: Path) -> None:
             raise DatasetFileError(f"{root}/{name} is missing")
 
 
-def _rows(path: Path) -> list[dict[str, Any]]:
-    table = pq.read_table(path)
+def _rows(root: Path, path: Path) -> list[dict[str, Any]]:
+    try:
+        table = pq.read_table(path)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise DatasetFileError(f"{path.relative_to(root)} is damaged: {error}") from error
     return table.drop_columns([name for name in table.column_names if name.startswith("stats/")]).to_pylist()
 
 

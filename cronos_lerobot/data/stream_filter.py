@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
@@ -35,6 +35,7 @@ from cronos_lerobot.data.stats import Stats, episode_stats
 from cronos_lerobot.data.storage import INCOMPLETE, Shard, stats_of_row
 from cronos_lerobot.data.streams import Segment, StreamDataset, to_array
 from cronos_lerobot.data.video import MAX_FILE_DURATION_S, Clip, CopiedVideoFile, read_frames
+from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.protocol.interventions import BEFORE_SEGMENTS
 
 PROVENANCE = "meta/filter.json"
@@ -133,11 +134,11 @@ def filter_streams(
 
     Raises:
         FileExistsError: `root` exists.
+        FolderInUseError: another process writes it.
         ValueError: no segment is wanted, or a stream or task that is not there; or `source` is on the Hub.
     """
     root = Path(root)
-    if root.exists():
-        raise FileExistsError(f"{root} exists; choose another folder for the filtered dataset")
+    _check_free(root)
     if not (source.meta.root / "data").is_dir():
         raise ValueError(f"{source.repo_id} is streamed from the Hub; open it with streaming=False to filter it")
     for name, given, there in (
@@ -149,6 +150,26 @@ def filter_streams(
     segments = sorted((s for s in source.segments if wanted(s)), key=lambda s: s.episode)
     if not segments:
         raise ValueError(f"none of the {len(source.segments)} segments fits {wanted}")
+    with FolderLock(root):
+        # Another process may have been quicker.
+        _check_free(root)
+        _write(source, segments, wanted, repo_id, root, frames_after_success)
+    return len(segments)
+
+
+def _check_free(root: Path) -> None:
+    if root.exists():
+        raise FileExistsError(f"{root} exists; choose another folder for the filtered dataset")
+
+
+def _write(
+    source: StreamDataset,
+    segments: Sequence[Segment],
+    wanted: SegmentFilter,
+    repo_id: str,
+    root: Path,
+    frames_after_success: int | None,
+) -> None:
     partial = root.with_name(f".{root.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     writer = _Writer(source, repo_id, partial)
@@ -169,7 +190,6 @@ def filter_streams(
     (partial / PROVENANCE).write_text(json.dumps(provenance, indent=2))
     write_origin(partial, source.origin)
     os.replace(partial, root)
-    return len(segments)
 
 
 class _Writer:

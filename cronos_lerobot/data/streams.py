@@ -23,6 +23,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
+from datasets.exceptions import DatasetsError
 from huggingface_hub import HfFileSystem
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
@@ -128,8 +129,13 @@ class StreamDataset:
         streaming: bool = False,
     ) -> None:
         self.repo_id = repo_id
-        self._dataset = None if streaming else LeRobotDataset(repo_id, root=root, revision=revision)
-        self.meta = self._dataset.meta if self._dataset else LeRobotDatasetMetadata(repo_id, root, revision)
+        try:
+            self._dataset = None if streaming else LeRobotDataset(repo_id, root=root, revision=revision)
+            self.meta = self._dataset.meta if self._dataset else LeRobotDatasetMetadata(repo_id, root, revision)
+        except (DatasetsError, pa.ArrowInvalid) as error:
+            # What Arrow found is the cause of what `datasets` raises.
+            why = error.__cause__ or error
+            raise ValueError(f"{repo_id} cannot be read, a file of {root or 'it'} is damaged: {why}") from error
         if STREAM_ID not in self.meta.features:
             raise ValueError(f"{repo_id} has no recorded streams: it lacks the columns {list(STREAM_COLUMNS)}")
         self.origin = read_origin(self.meta.root, self.meta.features, f"dataset {repo_id}")

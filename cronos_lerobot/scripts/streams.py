@@ -167,8 +167,12 @@ def print_statistics(config: StatisticsConfig) -> None:
 
 def check(config: CheckConfig) -> None:
     """`cronos-streams check`."""
+    root = config.dataset.root
+    # First, as it names the file that is damaged.
+    if is_here := root is not None and (root / "data").is_dir():
+        check_dataset(root)
     streams = config.dataset.open(streaming=True)
-    if (streams.meta.root / "data").is_dir():
+    if not is_here and (streams.meta.root / "data").is_dir():
         check_dataset(streams.meta.root)
     streams.check()
     frames = sum(segment.length for segment in streams.segments)

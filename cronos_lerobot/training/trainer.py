@@ -335,9 +335,11 @@ class Trainer:
         self.stopwatch.lap()
 
     def _save(self, env_state: dict[str, np.ndarray]) -> None:
+        # Before the logger's, as a recording that fails in its flush is told there.
+        recorder = self.recorder.state_dict()
         observers = {
             "logger": self.logger.state_dict(),
-            "recorder": self.recorder.state_dict(),
+            "recorder": recorder,
             "last_evaluation": self._last_evaluation,
             "last_interventions": self._last_interventions,
             "statistics": self.statistics.state_dict(),

@@ -12,6 +12,7 @@ from cronos_lerobot.data.stats import image_stats, vector_stats
 from cronos_lerobot.data.stream_filter import PROVENANCE, SegmentFilter, filter_streams
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.data.video import Clip, CopiedVideoFile, read_frames
+from cronos_lerobot.locks import FolderInUseError, FolderLock
 from cronos_lerobot.scripts import streams as script
 
 FRONT = "observation.images.front"
@@ -146,6 +147,14 @@ def test_mistakes_leave_nothing_behind(source, tmp_path):
     assert not list(tmp_path.iterdir())
     with pytest.raises(FileExistsError, match="exists; choose another folder"):
         filter_streams(source, SegmentFilter(), "me/all", tmp_path)
+
+
+def test_two_do_not_write_one_dataset(source, tmp_path):
+    partial = tmp_path / ".d.partial"
+    partial.mkdir()
+    with FolderLock(tmp_path / "d"), pytest.raises(FolderInUseError, match="d is being written by process"):
+        filter_streams(source, SegmentFilter(), "me/d", tmp_path / "d")
+    assert partial.is_dir()
 
 
 def test_clips_that_begin_between_keyframes_are_refused(source, tmp_path):

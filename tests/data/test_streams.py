@@ -257,6 +257,18 @@ def test_other_datasets_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("command", ["check", "statistics"])
+def test_a_damaged_list_of_segments_is_said_in_one_line(root, tmp_path, monkeypatch, command):
+    """Of the second flush: LeRobot reads all of these files as one dataset."""
+    damaged = shutil.copytree(root, tmp_path / "d") / "meta/episodes/chunk-000/file-001.parquet"
+    damaged.write_bytes(damaged.read_bytes()[: damaged.stat().st_size // 2])
+    flags = ["--dataset.repo_id=me/stream", f"--dataset.root={tmp_path / 'd'}"]
+    monkeypatch.setattr(sys, "argv", ["cronos-streams", command, *flags])
+    what = "meta/episodes/chunk-000/file-001.parquet" if command == "check" else f"a file of {tmp_path / 'd'}"
+    with pytest.raises(SystemExit, match=rf"^error: .*{what} is damaged: .*arquet"):
+        main()
+
+
+@pytest.mark.parametrize("command", ["check", "statistics"])
 def test_a_recording_without_a_segment_is_said_in_one_line(tmp_path, monkeypatch, command):
     features = stream_features(observation_space(environment_state=None))
     writer = SegmentWriter("me/stream", tmp_path / "d", features, FPS, origin=ORIGIN)

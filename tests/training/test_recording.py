@@ -21,6 +21,7 @@ from cronos_lerobot.data.drawing import LateCamera
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.data.video import read_frames
+from cronos_lerobot.data.writer import RecordingError, SegmentWriter
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.loop_state import Step
 from cronos_lerobot.scripts import train as script
@@ -128,6 +129,26 @@ def test_a_failed_recording_keeps_what_was_flushed_and_is_not_resumed(tmp_path, 
     shutil.rmtree(tmp_path / "run/streams")
     resume(8 * 8 * STREAMS)
     assert not (tmp_path / "run/streams").exists()
+
+
+def test_a_recording_that_fails_in_the_flush_of_a_checkpoint_is_told_once(tmp_path, monkeypatch):
+    """And not behind the place in the log from which a resumed run goes on."""
+    flush, flushes = SegmentWriter.flush, []
+
+    def fail_at_the_second(writer):
+        flushes.append(writer)
+        if len(flushes) == 2:
+            raise RecordingError("the disk is full")
+        flush(writer)
+
+    monkeypatch.setattr(SegmentWriter, "flush", fail_at_the_second)
+    train(config(tmp_path / "run", steps=16 * STREAMS))
+    resumed = config(tmp_path / "run", steps=24 * STREAMS)
+    resumed.checkpoint_path = (tmp_path / "run/checkpoints/last").resolve()
+    resumed.record.check(tmp_path / "run", STREAMS, CronosEnvConfig(), 4, resume=True)
+    train(resumed)
+    told = [json.loads(line)["kind"] for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
+    assert told.count("recording") == 1
 
 
 def cronos_train(monkeypatch, *arguments):
