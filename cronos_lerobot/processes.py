@@ -200,6 +200,24 @@ def join_processes(device: str | None) -> Processes:
     return LaunchedProcesses(accelerator.process_index, accelerator.num_processes, local_count)
 
 
+def choose_gpu(device: str | None) -> None:
+    """Make the policy's GPU PyTorch's current one, of which alone LeRobot keeps and restores the generator.
+
+    Args:
+        device: of the policy; without a number (`cuda`), as of any other, the current one stays.
+
+    Raises:
+        ValueError: there is no such GPU.
+    """
+    place = torch.device(device or "cpu")
+    if place.type != "cuda" or place.index is None:
+        return
+    if place.index >= (count := torch.cuda.device_count()):
+        valid = ", ".join(f"cuda:{index}" for index in range(count))
+        raise ValueError(f"--policy.device={device}: PyTorch finds no such GPU; valid ones: {valid or 'none'}.")
+    torch.cuda.set_device(place)
+
+
 def bit_sum(tensors: Iterable[Tensor]) -> int:
     """A number that tells tensors apart down to the last bit, whatever device adds it up."""
     as_int = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}

@@ -6,10 +6,12 @@ Example:
 """
 
 import signal
-from contextlib import ExitStack, nullcontext
+from collections.abc import Generator
+from contextlib import ExitStack, contextmanager, nullcontext
 from typing import Any
 
 import torch
+from httpx import HTTPError
 from lerobot.utils.hub import HubMixin
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
@@ -19,9 +21,10 @@ from lerobot_env_cronos import SequentialVectorEnv
 from cronos_lerobot.agents.base import LearningAgent
 from cronos_lerobot.agents.registry import check_agent
 from cronos_lerobot.agents.weights import is_wrapped
+from cronos_lerobot.hub.push import PublishError, Target, explained
 from cronos_lerobot.locks import FolderLock
-from cronos_lerobot.processes import join_processes
-from cronos_lerobot.scripts.errors import error_line, parse_command_line
+from cronos_lerobot.processes import choose_gpu, join_processes
+from cronos_lerobot.scripts.errors import error_line, parse_command_line, reason, stop
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.factory import make_env, make_eval_env, make_policy_and_processors
 from cronos_lerobot.training.stopping import StopRequest, end_by
@@ -31,7 +34,8 @@ from cronos_lerobot.training.trainer import Trainer
 def train(config: CronosTrainConfig) -> None:
     """Train as `config` says, from the start or from a checkpoint."""
     with ExitStack() as stack:
-        with error_line():
+        # What a policy or --peft.* needs may not be installed.
+        with error_line(ImportError):
             config.validate()
             assert config.policy is not None
             # Nobody gets past this before all have seen that the output folder does not exist yet.
@@ -47,6 +51,7 @@ def train(config: CronosTrainConfig) -> None:
             if config.torch_threads is None:
                 config.torch_threads = torch.get_num_threads()
             torch.set_num_threads(config.torch_threads)
+            choose_gpu(config.policy.device)
             set_seed(config.seed)
             policy, preprocessor, postprocessor = make_policy_and_processors(config)
             if not processes.is_main:
@@ -61,16 +66,37 @@ def train(config: CronosTrainConfig) -> None:
             trainer.load()
             trainer.open()
         # What keeps nothing ends at once.
-        stop = StopRequest()
-        with stop if config.save_checkpoint else nullcontext():
-            has_ended = trainer.train(stop)
+        request = StopRequest()
+        with request if config.save_checkpoint else nullcontext():
+            has_ended = trainer.train(request)
     if not has_ended:
         processes.leave()
         # None: another of the processes was told.
-        end_by(stop.number or signal.SIGTERM)
-    if processes.is_main:
-        push_to_hub(config, trainer.agent, preprocessor, postprocessor)
-    processes.leave()
+        end_by(request.number or signal.SIGTERM)
+    try:
+        if processes.is_main:
+            with told_how_to_push(config):
+                push_to_hub(config, trainer.agent, preprocessor, postprocessor)
+    finally:
+        processes.leave()
+
+
+@contextmanager
+def told_how_to_push(config: CronosTrainConfig) -> Generator[None]:
+    """End the program with one line if the Hub refuses a run: what was trained is there, and this pushes it."""
+    assert config.policy is not None
+    repository = str(config.policy.repo_id)
+    try:
+        with explained(Target(repository, "model")):
+            yield
+    except (PublishError, OSError, HTTPError) as error:
+        command = f"cronos-publish policy --path={config.output_dir} --repo_id={repository}"
+        if config.policy.private:
+            command += " --private=true"
+        what = f"the run in {config.output_dir} is whole but could not be pushed; `{command}` pushes it"
+        if not config.save_checkpoint:
+            what = "what was trained could not be pushed, and --save_checkpoint=false kept none of it"
+        stop(f"{what}: {reason(error)}")
 
 
 def push_to_hub(config: CronosTrainConfig, agent: LearningAgent, preprocessor: Any, postprocessor: Any) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+from draccus.cfgparsing import parse_string
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
@@ -294,7 +295,7 @@ class CronosTrainConfig:
             )
         if given is not None:
             self.checkpoint_path = _checkpoint_of(given)
-            run_folder = self.checkpoint_path.parents[1]
+            run_folder = self.checkpoint_path.parent.parent
             output_dir = parser.parse_arg("output_dir")
             if output_dir is not None and Path(output_dir).resolve() != run_folder:
                 raise ValueError(
@@ -319,11 +320,12 @@ class CronosTrainConfig:
         if not file.is_file():
             raise FileNotFoundError(f"No training config at {file}.")
         asked = parser.parse_arg("resume", cli_args or [])
-        if asked == "true":
+        kind = "json" if file.suffix == ".json" else "yaml"
+        if _is_true(asked, kind):
             # LeRobot's parser keeps the plugins of the command line from `cli_args`.
             import_plugins(_checkpoint_of(file), sys.argv[1:])
             check_types(_checkpoint_of(file), cli_args or [])
-        with draccus.config_type("json" if file.suffix == ".json" else "yaml"):
+        with draccus.config_type(kind):
             config = draccus.parse(cls, file, args=cli_args or [])
         # The file of a resumed run may say it, which asks for nothing.
         config.resume = config.resume and asked is not None
@@ -355,6 +357,13 @@ class CronosTrainConfig:
     # What lerobot's WandBLogger asks of a training config.
     is_reward_model_training = False
     dataset = None
+
+
+def _is_true(value: str | None, kind: str) -> bool:
+    """Whether draccus reads a flag as true: beside a file of YAML `yes` is, beside one of JSON it is refused."""
+    with draccus.config_type(kind):
+        read = None if value is None else parse_string(value)
+    return read is True or read == "true"
 
 
 def _checkpoint_of(config_path: str | Path) -> Path:

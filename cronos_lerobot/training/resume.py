@@ -172,7 +172,7 @@ def import_plugins(checkpoint: Path, arguments: Sequence[str]) -> None:
         PluginLoadError: one of them cannot be imported.
         ValueError: the manifest is damaged.
     """
-    manifest = checkpoint.parents[1] / MANIFEST
+    manifest = checkpoint.parent.parent / MANIFEST
     if not manifest.is_file():
         return
     own: dict[str, str] = {}

@@ -1,5 +1,6 @@
 """What is remembered of streams, and that batches of it are those of a LeRobotDataset of the same frames."""
 
+import math
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -246,13 +247,17 @@ def test_a_dataset_that_is_not_there_is_named(dataset_root, monkeypatch):
     [
         ({"steps_per_update": 0}, "algorithm.steps_per_update must be >= 1, got 0"),
         ({"tail_steps": -1}, "algorithm.tail_steps must be >= 0, got -1"),
-        ({"lr": 0.0}, "algorithm.lr must be > 0, got 0.0"),
-        ({"memory_gib": float("nan")}, "algorithm.memory_gib must be > 0, got nan"),
+        ({"lr": 0.0}, "algorithm.lr must be > 0 and finite, got 0.0"),
+        ({"lr": math.inf}, "algorithm.lr must be > 0 and finite, got inf"),
+        ({"memory_gib": math.nan}, "algorithm.memory_gib must be > 0 and finite, got nan"),
+        ({"memory_gib": math.inf}, "algorithm.memory_gib must be > 0 and finite, got inf"),
+        ({"temperature": math.inf}, "algorithm.temperature must be > 0 and finite, got inf"),
         (
             {"weighting": "loss"},
             r"algorithm.weighting must be one of \('none', 'return', 'advantage'\), got 'loss'",
         ),
-        ({"weighting_beta": 0.0}, "algorithm.weighting_beta must be > 0, got 0.0"),
+        ({"weighting_beta": 0.0}, "algorithm.weighting_beta must be > 0 and finite, got 0.0"),
+        ({"weighting_beta": math.inf}, "algorithm.weighting_beta must be > 0 and finite, got inf"),
         ({"max_weight": 0.5}, "algorithm.max_weight must be >= 1, got 0.5"),
         ({"gamma": 1.5}, "algorithm.gamma must be >= 0 and <= 1, got 1.5"),
         ({"demos_share": 1.5}, "algorithm.demos_share must be >= 0 and <= 1, got 1.5"),
@@ -264,6 +269,10 @@ def test_a_dataset_that_is_not_there_is_named(dataset_root, monkeypatch):
 def test_bad_values_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         ImitationConfig(**options)
+
+
+def test_the_largest_weight_may_be_without_end():
+    assert ImitationConfig(weighting="advantage", max_weight=math.inf).max_weight == math.inf
 
 
 def test_a_camera_that_no_dataset_has_is_not_asked_for(dataset_root):

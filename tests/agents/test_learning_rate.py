@@ -108,7 +108,7 @@ def test_a_fixed_lr_survives_an_early_stop():
 )
 def test_a_loaded_lr_lies_between_the_ends_that_are_given_now(became, schedule, expected):
     ppo = make_ppo()
-    ppo.policy_lr = became
+    ppo.lr.value = became
     now = PPOConfig(policy_lr_min=1e-5, policy_lr_max=5e-4, lr_schedule=schedule)
     set_optimizer(ppo.optimizer, now, {"policy_lr": 5e-5, "value_lr": 1e-3}, ppo.optimizer_settings)
     assert ppo.policy_lr == expected
@@ -117,7 +117,7 @@ def test_a_loaded_lr_lies_between_the_ends_that_are_given_now(became, schedule, 
 
 def test_a_loaded_lr_may_be_held_beyond_the_one_that_the_run_began_with():
     ppo = make_ppo()
-    ppo.policy_lr, saved = 3e-4, {"policy_lr": 5e-5, "value_lr": 1e-3}
+    ppo.lr.value, saved = 3e-4, {"policy_lr": 5e-5, "value_lr": 1e-3}
     set_optimizer(ppo.optimizer, PPOConfig(policy_lr_min=1e-4), saved, ppo.optimizer_settings)
     assert ppo.policy_lr == 3e-4
     set_optimizer(ppo.optimizer, PPOConfig(policy_lr_max=4e-5), saved, ppo.optimizer_settings)

@@ -242,6 +242,16 @@ def test_a_policy_from_scratch_is_not_wrapped(tmp_path):
         wrap(make_vla("pi0", tmp_path), PeftConfig())
 
 
+def test_methods_that_are_none_or_take_less_are_named(tmp_path):
+    policy = make_vla(KINDS[0], tmp_path)
+    policy.config.pretrained_path = tmp_path
+    with pytest.raises(ValueError, match=r"--peft\.method_type=LOAR is no method of PEFT; valid .*, LORA, "):
+        wrap(policy, PeftConfig(method_type="LOAR"))
+    with pytest.raises(ValueError, match=r"--peft\.method_type=IA3 does not take all .*argument 'r'\); LORA does"):
+        wrap(policy, PeftConfig(method_type="IA3"))
+    assert any(param.requires_grad for param in policy.parameters())
+
+
 def test_adapters_around_a_policy_that_trains_by_itself_leave_it_one(tmp_path):
     """The methods are those of the policy below; `isinstance` of the protocol does not see them."""
     policy = make_pocketvla("gaussian")

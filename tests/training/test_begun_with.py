@@ -2,10 +2,17 @@
 
 import json
 import sys
+from types import SimpleNamespace
 
 import pytest
+import torch
+from dummies import DummyPolicyConfig
+from huggingface_hub.errors import LocalTokenNotFoundError
+from lerobot_env_cronos import CronosEnvConfig
 from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
 
+from cronos_lerobot.processes import Processes, choose_gpu
+from cronos_lerobot.scripts import train as script
 from cronos_lerobot.scripts.errors import parse_command_line
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.resume import was_never_told_where_to_push
@@ -134,3 +141,86 @@ def test_a_resumed_run_keeps_to_what_its_first_start_was_told(base, monkeypatch)
         assert was_never_told_where_to_push(base.parent) == (told is None)
         assert validated(monkeypatch, *resume).policy.repo_id == told
         assert validated(monkeypatch, *resume, "--policy.repo_id=me/rl").policy.repo_id == "me/rl"
+
+
+class Alone(Processes):
+    """One process that says when it has left."""
+
+    left = False
+
+    def leave(self):
+        self.left = True
+
+
+@pytest.fixture
+def trained(tmp_path, monkeypatch):
+    """What calls `train` of a run that is trained at once, with these settings and this error of its push."""
+
+    def train(error, **options):
+        def push_to_hub(repo_id, private):
+            raise error
+
+        policy = SimpleNamespace(push_to_hub=push_to_hub)
+        trainer = SimpleNamespace(
+            load=lambda: None, open=lambda: None, train=lambda stop: True,
+            agent=SimpleNamespace(policy=policy, acting=policy),
+        )  # fmt: skip
+        processes = Alone()
+        monkeypatch.setattr(script, "join_processes", lambda device: processes)
+        monkeypatch.setattr(script, "make_policy_and_processors", lambda config: (policy, None, None))
+        monkeypatch.setattr(script, "make_env", lambda *arguments: SimpleNamespace(close=lambda: None))
+        monkeypatch.setattr(script, "Trainer", lambda *arguments: trainer)
+        policy_config = DummyPolicyConfig(push_to_hub=True, repo_id="me/rl", private=True)
+        config = CronosTrainConfig(CronosEnvConfig(), policy_config, tmp_path / "run", **options)
+        try:
+            script.train(config)
+        finally:
+            assert processes.left
+
+    return train
+
+
+def test_a_run_that_the_hub_refuses_says_what_pushes_it(trained, tmp_path):
+    command = f"cronos-publish policy --path={tmp_path / 'run'} --repo_id=me/rl --private=true"
+    no_token = LocalTokenNotFoundError("Token is required,\nbut no token found.")
+    for error, why in (
+        (no_token, "there is no token for .*: set HF_TOKEN, or run `hf auth login`"),
+        (OSError(28, "No space left on device"), "No space left on device"),
+    ):
+        whole = f"^error: the run in {tmp_path / 'run'} is whole but could not be pushed; `{command}` pushes it: "
+        with pytest.raises(SystemExit, match=f"{whole}.*{why}$"):
+            trained(error)
+    with pytest.raises(SystemExit, match=r"--save_checkpoint=false kept none of it: there is no token for "):
+        trained(no_token, save_checkpoint=False)
+    with pytest.raises(ZeroDivisionError):
+        trained(ZeroDivisionError())
+
+
+def test_the_gpu_of_a_number_is_the_current_one_before_anything_is_drawn(tmp_path, monkeypatch):
+    """LeRobot keeps and restores the generator of the current one alone."""
+    called = []
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "set_device", lambda device: called.append(str(device)))
+    for device in ("cuda", "cpu", "mps", None):
+        choose_gpu(device)
+    assert not called
+    with pytest.raises(ValueError, match=r"--policy\.device=cuda:2: .* no such GPU; valid ones: cuda:0, cuda:1\."):
+        choose_gpu("cuda:2")
+
+    def seeded(seed):
+        raise ValueError(f"seeded after {called}")
+
+    monkeypatch.setattr(script, "set_seed", seeded)
+    config = CronosTrainConfig(CronosEnvConfig(), DummyPolicyConfig(), tmp_path / "run")
+    config.policy.device = "cuda:1"
+    with pytest.raises(SystemExit, match=r"seeded after \['cuda:1'\]"):
+        script.train(config)
+
+
+def test_what_is_not_installed_is_one_line(tmp_path, monkeypatch):
+    def make(config):
+        raise ImportError("'peft' is required but not installed.\nInstall it with: pip install 'lerobot[peft]'")
+
+    monkeypatch.setattr(script, "make_policy_and_processors", make)
+    with pytest.raises(SystemExit, match=r"^error: 'peft' is required but not installed\. Install it with: pip "):
+        script.train(CronosTrainConfig(CronosEnvConfig(), DummyPolicyConfig(), tmp_path / "run"))

@@ -1,7 +1,11 @@
 import dataclasses
+import json
 import sys
+from pathlib import Path
 
 import pytest
+import yaml
+from draccus.utils import DecodingError
 from dummies import DummyPolicyConfig
 from flags import parse_flags
 from lerobot.policies.act.configuration_act import ACTConfig
@@ -64,6 +68,38 @@ def test_who_resumes_says_so_and_no_file_does(tmp_path, monkeypatch):
     assert not looked_at
     assert CronosTrainConfig.from_pretrained(tmp_path, cli_args=["--resume=true"]).resume
     assert len(looked_at) == 1
+
+
+@pytest.mark.parametrize("word", ["True", "yes", "on", "'true'"])
+def test_whatever_resumes_is_checked(word, tmp_path, monkeypatch):
+    """Of YAML's words for it draccus takes all beside a file of YAML, and none beside one of JSON."""
+    CronosTrainConfig(policy=DummyPolicyConfig()).save_pretrained(tmp_path)
+    looked_at = []
+    monkeypatch.setattr(config, "import_plugins", lambda checkpoint, arguments: looked_at.append("plugins"))
+    monkeypatch.setattr(config, "check_types", lambda checkpoint, arguments: looked_at.append("types"))
+    with pytest.raises(DecodingError, match="into a bool"):
+        CronosTrainConfig.from_pretrained(tmp_path, cli_args=[f"--resume={word}"])
+    assert not looked_at
+    file = tmp_path / "train_config.yaml"
+    file.write_text(yaml.safe_dump(json.loads((tmp_path / "train_config.json").read_text())))
+    assert CronosTrainConfig.from_pretrained(file, cli_args=[f"--resume={word}"]).resume
+    assert looked_at == ["plugins", "types"]
+    assert not CronosTrainConfig.from_pretrained(file, cli_args=["--resume=no"]).resume
+    assert looked_at == ["plugins", "types"]
+
+
+def test_a_config_file_at_the_root_is_of_no_checkpoint(tmp_path, monkeypatch):
+    """Such as /tmp/train_config.json: above its folder there is none that could be a run's."""
+    cfg = CronosTrainConfig(env=CronosEnvConfig(), policy=DummyPolicyConfig())
+    cfg.save_pretrained(tmp_path)
+    monkeypatch.setattr(config, "_checkpoint_of", lambda file: Path("/"))
+    monkeypatch.setattr(sys, "argv", ["cronos-train", "--resume=true", f"--config_path={tmp_path}"])
+    message = r"^/ is no checkpoint of a run: it has no training_state\.$"
+    with pytest.raises(NotADirectoryError, match=message):
+        CronosTrainConfig.from_pretrained(tmp_path, cli_args=["--resume=true"])
+    cfg.resume = True
+    with pytest.raises(NotADirectoryError, match=message):
+        cfg.validate()
 
 
 def test_steps_are_rounded_up_to_whole_updates():

@@ -49,7 +49,6 @@ class Adapter(nn.Module):
         super().__init__()
         self.policy = policy
         self.config = policy.config
-        self.takes_uint8_images = getattr(policy, "takes_uint8_images", False)
 
     @property
     def encode_observation(self) -> Callable[[Batch], Batch] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -87,8 +88,8 @@ class ImitationConfig(RLAlgorithmConfig):
         if not self.max_weight >= 1:
             raise ValueError(f"algorithm.max_weight must be >= 1, got {self.max_weight}.")
         for name in ("lr", "memory_gib", "temperature", "weighting_beta"):
-            if (value := getattr(self, name)) is not None and not value > 0:
-                raise ValueError(f"algorithm.{name} must be > 0, got {value}.")
+            if (value := getattr(self, name)) is not None and not 0 < value < math.inf:
+                raise ValueError(f"algorithm.{name} must be > 0 and finite, got {value}.")
         if not 0 <= self.ema_decay < 1:
             raise ValueError(f"algorithm.ema_decay must be >= 0 and < 1, got {self.ema_decay}.")
         for name in ("demos_share", "gamma"):

@@ -163,10 +163,6 @@ class PPO:
         """The policy's learning rate now."""
         return self.lr.value
 
-    @policy_lr.setter
-    def policy_lr(self, lr: float) -> None:
-        self.lr.value = lr
-
     def _train_policy(self, buffer: RolloutBuffer, metrics: UpdateMetrics) -> float:
         """Train policy and value together; returns the epochs that were run, fractions included."""
         config, steps = self.config, 0

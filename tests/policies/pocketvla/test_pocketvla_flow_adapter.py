@@ -142,5 +142,4 @@ def test_nothing_is_beside_the_policy():
     adapter = make_adapter()
     assert adapter.own_parameters() == {}
     adapter.load_own_parameters({})
-    assert adapter.takes_uint8_images
     assert FLOW["head"] == adapter.config.head
