@@ -197,7 +197,7 @@ class Trainer:
         self._is_open = True
 
     def _run(self, stop: StopRequest) -> bool:
-        last_save = self.loop.n
+        last_save, has_checkpoint = self.loop.n, self.config.checkpoint_path is not None
         updated = False
         env_state: dict[str, np.ndarray] | None = None
         self.stopwatch.lap()
@@ -221,11 +221,11 @@ class Trainer:
                 self._last_interventions = self.loop.b
             if self.config.save_checkpoint and (ends or _due(self.loop.n, last_save, self.config.save_freq)):
                 self._save(env_state)
-                last_save = self.loop.n
+                last_save, has_checkpoint = self.loop.n, True
             if ends:
                 return False
         self._say_end()
-        if self.config.save_checkpoint and (last_save < self.loop.n or not self._has_checkpoint()):
+        if self.config.save_checkpoint and (last_save < self.loop.n or not has_checkpoint):
             self._save(self.env.get_state() if env_state is None else env_state)
         # After the checkpoint: a run that goes on from it, with more steps or a larger budget, is as one that was
         # never ended, and has no evaluation here unless it was due.
@@ -347,9 +347,6 @@ class Trainer:
         }
         self.logger.log_checkpoint(save_checkpoint(self.run_state, self.config, observers, env_state))
         self.stopwatch.lap()
-
-    def _has_checkpoint(self) -> bool:
-        return self.config.checkpoint_path is not None
 
 
 def _shapes(env: EnvConfig | None) -> dict[str, tuple[int, ...]]:
