@@ -53,6 +53,11 @@ class ResultStore:
             changes = "; ".join(f"{name}: {there.get(name)} there, {here.get(name)} now" for name in names)
             raise ValueError(f"{self.folder} holds another evaluation ({changes}); choose another --output_dir")
 
+    def forget_if_empty(self) -> None:
+        """Free a folder that has no part for another evaluation."""
+        if not self.names():
+            (self.folder / IDENTITY).unlink(missing_ok=True)
+
     def read(self, name: str) -> dict[str, Any] | None:
         """Return a finished part, or None."""
         path = self._path(name)

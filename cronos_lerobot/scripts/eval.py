@@ -56,6 +56,8 @@ def evaluate(config: CronosEvalConfig) -> None:
     set_seed(config.seed)
     logging.info(f"Output folder: {config.output_dir}")
     try:
+        with error_line():
+            evaluation.prepare()
         results = evaluation.run()
     except KeyboardInterrupt:
         sys.exit(f"\ninterrupted: the same command with --output_dir={config.output_dir} goes on from here")
