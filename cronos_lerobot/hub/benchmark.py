@@ -16,11 +16,13 @@ from lerobot_env_cronos.benchmark.files import CONFIGS, CONFIGURATIONS, make_tab
 from lerobot_env_cronos.benchmark.load import benchmark_scene
 from lerobot_env_cronos.config import DEFAULT_SCENE
 from lerobot_env_cronos.scene.scenes import BODIES, STEPS_PER_TASK
+from lerobot_env_cronos.simulation.gl import RenderingError
 
 from cronos_lerobot.hub import env_file
 from cronos_lerobot.hub.cards import render_card
 from cronos_lerobot.hub.config import BenchmarkConfig
 from cronos_lerobot.hub.pictures import configuration_pictures, configuration_sheet, task_sheet
+from cronos_lerobot.hub.push import PublishError
 from cronos_lerobot.hub.runs import describe_source
 
 FRAMEWORK = "cronos-lerobot"
@@ -54,7 +56,10 @@ def choose_benchmark(config: BenchmarkConfig) -> Benchmark:
 
 def write_benchmark_repository(config: BenchmarkConfig, folder: Path, benchmark: Benchmark) -> str:
     """Write the tree of the repository of a benchmark, that of the config, into `folder`; returns what it is."""
-    pictures = configuration_pictures(benchmark) if config.pictures else None
+    try:
+        pictures = configuration_pictures(benchmark) if config.pictures else None
+    except RenderingError as error:
+        raise PublishError(f"{error}. --pictures=false publishes without pictures") from error
     for (name, split), table in make_tables(benchmark).items():
         path = folder / name / f"{split}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)

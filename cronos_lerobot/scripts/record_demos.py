@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 from lerobot.datasets.utils import INFO_PATH
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
@@ -22,6 +23,7 @@ from lerobot_env_cronos import CronosVectorEnv, Task, get_scene
 from lerobot_env_cronos.config import CronosEnvConfig
 from lerobot_env_cronos.episodic import find_task
 from lerobot_env_cronos.hub_config import is_of_this_package
+from lerobot_env_cronos.simulation.gl import RenderingError
 from tqdm import tqdm
 
 from cronos_lerobot.data.demo_starts import check_starts
@@ -129,6 +131,8 @@ def _open(
     source = None if cfg.start.policy is None else find_policy(cfg.start.policy).folder
     policy = None if source is None else load_spectator(str(source), cfg.env)
     env = CronosVectorEnv(cfg.num_envs, cfg.env.scene, **cfg.env.gym_kwargs)
+    # Before there is a dataset: whether pictures can be drawn here.
+    env.observe(np.arange(1))
     writer = open_writer(cfg, env, source)
     if policy is not None:
         policy.seed(cfg.seed + writer.num_episodes)
@@ -215,7 +219,7 @@ def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv, source: Path | Non
 def main() -> None:
     """Entry point of `cronos-record-demos`."""
     init_logging()
-    with error_line():
+    with error_line(RenderingError):
         register_third_party_plugins()
         cfg = parse_command_line(RecordDemosConfig)
         opened = _open(cfg)

@@ -69,7 +69,7 @@ class FilamentRenderer:
 
     Raises:
         KeyError: the model has no such camera.
-        RuntimeError: there is no Vulkan device.
+        RenderingError: there is no Vulkan device.
     """
 
     def __init__(self, model: mujoco.MjModel, height: int, width: int, camera: str):
@@ -117,7 +117,7 @@ def _open(model: mujoco.MjModel, camera: int) -> list[Any]:
     if sys.platform == "linux":
         # Without a device, or a display for OpenGL, Filament ends the process.
         if not count_vulkan_devices():
-            raise RuntimeError(HELP)
+            raise gl.RenderingError(HELP)
         config.graphics_api = mjrf.GraphicsApi.GRAPHICS_API_VULKAN
     # One for each renderer: MuJoCo draws no second scene in it.
     renderer = Renderer(mjrf.Context(config))

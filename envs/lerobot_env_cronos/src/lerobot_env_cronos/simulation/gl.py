@@ -17,6 +17,11 @@ FORKED = (
     "`--env.obs_type=environment_state_agent_pos` needs no OpenGL"
 )
 
+
+class RenderingError(RuntimeError):
+    """This machine, or this process, cannot draw; the message says what it lacks."""
+
+
 _drawn_by: int | None = None
 
 
@@ -24,13 +29,13 @@ def claim_process() -> None:
     """Note that this process draws.
 
     Raises:
-        RuntimeError: it inherited OpenGL from a process that did, so drawing would wait for threads that are gone.
+        RenderingError: it inherited OpenGL from one that did, so drawing would wait for threads that are gone.
     """
     global _drawn_by
     if _drawn_by is None:
         _drawn_by = os.getpid()
     if _drawn_by != os.getpid():
-        raise RuntimeError(FORKED)
+        raise RenderingError(FORKED)
 
 
 def choose_platform() -> None:

@@ -54,7 +54,7 @@ def make_renderer(
 
     Raises:
         KeyError: the model has no such camera.
-        RuntimeError: it cannot draw on this machine, or in this process; says why.
+        RenderingError: it cannot draw on this machine, or in this process; says why.
     """
     gl.claim_process()
     if name == "classic":
@@ -70,7 +70,7 @@ class ClassicRenderer:
 
     Raises:
         KeyError: the model has no such camera.
-        RuntimeError: no OpenGL context can be opened.
+        RenderingError: no OpenGL context can be opened.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ def _open(model: mujoco.MjModel, height: int, width: int, camera: int, shadows: 
     try:
         return Canvas(model, height, width, camera, shadows)
     except Exception as error:  # The platforms raise whatever their bindings do.
-        raise RuntimeError(gl.HELP.format(platform=os.environ.get("MUJOCO_GL"))) from error
+        raise gl.RenderingError(gl.HELP.format(platform=os.environ.get("MUJOCO_GL"))) from error
 
 
 def _close(canvas: Canvas, opened_by: int) -> None:
