@@ -140,7 +140,7 @@ for _experiment in (
         (
             *SCREENED,
             *(wide(row) for row in SCREENED if not row.learned_reset),
-            *map(with_resets, (EPISODIC, CURRICULUM, *(row for row in SCREENED if row.learned_reset))),
+            *map(with_resets, (EPISODIC, CURRICULUM, METHOD, *(row for row in SCREENED if row.learned_reset))),
         ),
         budgets=_BUDGETS,
         by_base=True,
