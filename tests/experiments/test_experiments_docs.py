@@ -104,6 +104,7 @@ def test_pages_are_drawn_anew_by_the_commands_beside_the_archives():
         "table1",
         "table1",
         "few_resets",
+        "few_resets",
         "few_resets_kitchen_3x3",
         "few_resets_playroom_2x2",
         "few_resets_best",
@@ -113,7 +114,8 @@ def test_pages_are_drawn_anew_by_the_commands_beside_the_archives():
         rows = command[command.index("--rows") + 1 :] if "--rows" in command else names(command[1])
         scale = next(word.removeprefix("--scale=") for word in command if word.startswith("--scale="))
         seen = "pixels" if "--obs_type=pixels" in command else "state"
-        page = results / f"{command[1]}_{scale}_{seen}" / f"{command[1]}.json"
+        base = "_second_base" if "--output_dir=outputs/few_resets_second_base" in command else ""
+        page = results / f"{command[1]}{base}_{scale}_{seen}" / f"{command[1]}.json"
         assert rows == [row["row"] for row in json.loads(page.read_text())["rows"]]
 
 

@@ -69,7 +69,8 @@ def test_each_plug_stands_alone_and_together_on_both_bases():
     ]  # fmt: skip
     wides = [f"{name}_wide" for name in narrow if "lsr" not in name]
     # What learned resets add is told beside the same without them, from the base that was shown reset tasks.
-    resets = [f"{name}_wide_resets" for name in ("t80", "t1280_eer_cl", "t1280_eer_cl_lsr")]
+    shown = ("t80", "t1280_eer_cl", "t4400_eer_staggered_early_decay", "t1280_eer_cl_lsr")
+    resets = [f"{name}_wide_resets" for name in shown]
     assert names == [*narrow, *wides, *resets]
     # The narrow rows of the paper are Table 1's own runs.
     assert set(EXPERIMENTS["few_resets"].rows[:5]) < set(EXPERIMENTS["table1"].rows)
