@@ -22,6 +22,7 @@ from cronos_lerobot.agents.chunk_player import make_player
 from cronos_lerobot.agents.history import ObservationHistory, observation_steps
 from cronos_lerobot.agents.processing import PolicyProcessors, make_processors, observation_columns
 from cronos_lerobot.agents.steering.steered import with_steering
+from cronos_lerobot.evaluation.policy_source import damage_named
 
 
 class Actor(Protocol):
@@ -201,17 +202,21 @@ def load_actor(
         env: the environment that it acts in.
         temperature: of the sampling, if the policy has one.
         rename_map: observations to rename for the policy.
+
+    Raises:
+        ValueError: a file of the checkpoint is damaged.
     """
     renamed = rename_map or {}
-    policy: Any = make_policy(config, env_cfg=env, rename_map=renamed)
-    processors = make_pre_post_processors(
-        config,
-        str(config.pretrained_path),
-        preprocessor_overrides={
-            "device_processor": {"device": str(policy.config.device)},
-            "rename_observations_processor": {"rename_map": renamed},
-        },
-    )
+    with damage_named(config.pretrained_path):
+        policy: Any = make_policy(config, env_cfg=env, rename_map=renamed)
+        processors = make_pre_post_processors(
+            config,
+            str(config.pretrained_path),
+            preprocessor_overrides={
+                "device_processor": {"device": str(policy.config.device)},
+                "rename_observations_processor": {"rename_map": renamed},
+            },
+        )
     env_processors = make_env_pre_post_processors(env_cfg=env, policy_cfg=config)
     own = make_processors(policy, *processors)
     return make_actor(with_steering(policy, config.pretrained_path), own, temperature, env_processors)

@@ -6,19 +6,20 @@ import hashlib
 import io
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import redirect_stderr
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import draccus
 from huggingface_hub import HfApi, snapshot_download
-from huggingface_hub.constants import CONFIG_NAME
+from huggingface_hub.constants import CONFIG_NAME, SAFETENSORS_SINGLE_FILE
 from huggingface_hub.errors import HFValidationError
 from huggingface_hub.utils import validate_repo_id
 from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import LAST_CHECKPOINT_LINK
+from safetensors import SafetensorError
 
 FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 """What a policy is loaded from: configs, weights, tokenizers."""
@@ -101,6 +102,17 @@ def pin_policy(name: str, given: str | None) -> tuple[str, str | None]:
     except (OSError, HFValidationError):
         # It may be in the cache; who loads it says what is wrong.
         return repository, wanted
+
+
+@contextmanager
+def damage_named(path: Path | str | None) -> Generator[None]:
+    """Around the loading of a policy: a ValueError names the file of it that is damaged."""
+    try:
+        yield
+    except SafetensorError as error:
+        raise ValueError(f"{path}/{SAFETENSORS_SINGLE_FILE} or a processor's file is damaged: {error}") from error
+    except json.JSONDecodeError as error:
+        raise ValueError(f"a configuration of a processor in {path} is damaged: {error}") from error
 
 
 def load_policy_config(path: str, overrides: list[str], revision: str | None = None) -> PreTrainedConfig:

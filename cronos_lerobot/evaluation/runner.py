@@ -12,9 +12,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot_env_cronos import CronosEnvConfig, SequentialVectorEnv, check_environment_id, get_scene, gymnasium_id
-from safetensors import SafetensorError
 from tqdm import tqdm
 
 from cronos_lerobot.evaluation.actors import Actor, ExpertActor, load_actor
@@ -86,15 +84,9 @@ class Evaluation:
             return
         try:
             _ = self._env_and_actor
-        except Exception as error:
+        except Exception:
             self.store.forget_if_empty()
-            if not isinstance(error, SafetensorError | json.JSONDecodeError):
-                raise
-            assert self.config.policy is not None
-            what = SAFETENSORS_SINGLE_FILE if isinstance(error, SafetensorError) else "a configuration"
-            raise ValueError(
-                f"{what} of {self.config.policy.pretrained_path}, or a file of its processors, is damaged: {error}"
-            ) from error
+            raise
 
     def run(self) -> dict[str, Any]:
         """Run the parts that are not there yet, write videos and results.json; returns the results.

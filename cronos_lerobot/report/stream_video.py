@@ -21,7 +21,6 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
-from safetensors import SafetensorError
 from tqdm import tqdm
 
 from cronos_lerobot.agents.base import ActionSample, plain_sample
@@ -296,8 +295,6 @@ def main() -> None:
             config, agent = make_spectator(args.policy_path, args.device, args.scene)
     except (ValueError, OSError, ModuleNotFoundError) as error:
         parser.error(str(error))
-    except SafetensorError as error:
-        parser.error(f"--policy.path={args.policy_path}: its weights are damaged: {error}")
     env = CronosVectorEnv(1, config.scene, **config.gym_kwargs)
     try:
         stream = film_stream(env, agent or ExpertSpectator(env), protocol, args.segments, args.seed)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
@@ -12,7 +11,6 @@ from typing import Any
 
 from httpx import HTTPError
 from huggingface_hub import file_exists, hf_hub_download
-from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.policies import make_policy, make_pre_post_processors
@@ -20,7 +18,6 @@ from lerobot.utils.constants import ACTION
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, SequentialVectorEnv, get_scene
 from lerobot_env_cronos.hub_config import is_of_this_package
 from lerobot_env_cronos.simulation.simulation import num_cores
-from safetensors import SafetensorError
 
 from cronos_lerobot.agents.imitation.config import DemosConfig
 from cronos_lerobot.agents.processing import EMPTY_CAMERA
@@ -31,7 +28,7 @@ from cronos_lerobot.evaluation.policy_env import (
     scene_of_dataset,
     trained_scene,
 )
-from cronos_lerobot.evaluation.policy_source import UNDECISIVE, load_policy_config
+from cronos_lerobot.evaluation.policy_source import UNDECISIVE, damage_named, load_policy_config
 from cronos_lerobot.training.config import CronosTrainConfig
 
 
@@ -103,7 +100,7 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
         check_demonstrations(config.algorithm, env_config.scene)
     if not (path or getattr(policy_config, "checkpoint", None)):
         logging.warning("Training a policy from scratch: its states are not normalised, its success starts at 0.")
-    try:
+    with damage_named(path):
         with _pretrained(policy_config, path):
             loaded = make_policy(policy_config, env_cfg=env_config)
         assert config.policy is not None
@@ -126,10 +123,6 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
         return policy, *make_pre_post_processors(
             policy_config, str(path), pretrained_revision=revision, preprocessor_overrides=device
         )
-    except SafetensorError as error:
-        raise ValueError(f"{path}/{SAFETENSORS_SINGLE_FILE} or a processor's file is damaged: {error}") from error
-    except json.JSONDecodeError as error:
-        raise ValueError(f"a configuration of a processor in {path} is damaged: {error}") from error
 
 
 def _config_to_build(config: CronosTrainConfig) -> PreTrainedConfig:

@@ -12,12 +12,11 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, get_scene
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.expert.reach import find_reach
-from lerobot_env_cronos.simulation import rendering
 
 from cronos_lerobot.data.demos import DemoCollector, DemoConfig, StartConfig
 from cronos_lerobot.data.perturbations import ActionNoise, MissConfig, NoiseConfig, drop_against_another
 from cronos_lerobot.data.writer import SegmentWriter
-from cronos_lerobot.scripts.record_demos import RecordDemosConfig, main, record_demos
+from cronos_lerobot.scripts.record_demos import RecordDemosConfig, record_demos
 
 NUM_ENVS = 4
 
@@ -344,18 +343,6 @@ def test_one_task_only(env, tmp_path):
 def test_wrong_options_are_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()
-
-
-def test_without_opengl_it_says_so_and_makes_no_dataset(tmp_path, monkeypatch):
-    def fail(*_):
-        raise ImportError("EGL")
-
-    monkeypatch.setattr(rendering, "Canvas", fail)
-    flags = ["--env.type=cronos", "--env.num_threads=1", "--num_envs=1", "--dataset.repo_id=me/d"]
-    monkeypatch.setattr(sys, "argv", ["cronos-record-demos", *flags, f"--dataset.root={tmp_path / 'd'}"])
-    with pytest.raises(SystemExit, match=r"^error: cannot open an OpenGL context"):
-        main()
-    assert not (tmp_path / "d").exists()
 
 
 def test_the_command_records_resumes_and_overwrites(tmp_path, caplog, monkeypatch):

@@ -1,7 +1,6 @@
 """`cronos-eval` and `lerobot-eval` on the real scenes with tiny policies, and the scripted expert."""
 
 import json
-import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -221,25 +220,6 @@ def test_observations_and_scene_follow_from_the_policy(tmp_path, monkeypatch):
     assert not env["privileged_state"]
     instructions = [task.instruction for task in get_scene("playroom_2x2").tasks]
     assert list(results["independent"]["train"]["per_task"]) == instructions
-
-
-@pytest.mark.parametrize("name", ["model.safetensors", "policy_preprocessor.json"])
-def test_a_policy_that_cannot_be_loaded_is_one_line_and_takes_no_folder(name, pocketvla, tmp_path, monkeypatch):
-    broken = shutil.copytree(pocketvla, tmp_path / "policy")
-    whole = (broken / name).read_bytes()
-    (broken / name).write_bytes(whole[: len(whole) // 2])
-    flags = [f"--policy.path={broken}", "--env.obs_type=environment_state_agent_pos", "--eval.n_episodes=1"]
-    flags += [
-        "--eval.suites=independent",
-        "--eval.splits=train",
-        "--eval.videos=0",
-        f"--output_dir={tmp_path / 'o'}",
-    ]
-    with pytest.raises(SystemExit, match=rf"^error: .*{broken}"):
-        cronos_eval(monkeypatch, *flags)
-    (broken / name).write_bytes(whole)
-    cronos_eval(monkeypatch, *flags)
-    assert len(outcomes(tmp_path / "o")) == 1
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.dataset_tools import delete_episodes
 from lerobot_env_cronos.config import CronosEnvConfig
-from lerobot_env_cronos.simulation import rendering
 from safetensors.numpy import save_file
 
 from cronos_lerobot.data.file_check import check_dataset
@@ -67,18 +66,6 @@ def test_what_is_still_being_recorded_is_not_published_nor_gone_on_with_meanwhil
     monkeypatch.setattr("cronos_lerobot.hub.streams.write_stream_repository", write_meanwhile)
     main()
     SegmentWriter.resume("me/demos", copy).finalize()
-
-
-def test_without_opengl_a_benchmark_can_do_without_pictures(tmp_path, monkeypatch):
-    def fail(*_):
-        raise ImportError("EGL")
-
-    monkeypatch.setattr(rendering, "Canvas", fail)
-    flags = ["--repo_id=me/d", "--dry_run=true", f"--output_dir={tmp_path / 'out'}"]
-    monkeypatch.setattr(sys, "argv", ["cronos-publish", "benchmark", *flags])
-    with pytest.raises(SystemExit, match=r"^error: cannot open an OpenGL context.*--pictures=false publishes"):
-        main()
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_dataset_that_may_only_be_read_is_published(copy, monkeypatch):

@@ -240,7 +240,7 @@ def test_an_order_that_asks_a_training_is_refused_in_a_line(name, tmp_path, monk
     [
         ("--segments=0", "--segments must be at least 1, got 0"),
         ("--seed=-1", "--seed must be at least 0, got -1"),
-        ("--fps=20", "--policy.path={}: its weights are damaged: Error while deserializing header"),
+        ("--fps=20", "{}/model.safetensors or a processor's file is damaged: Error while deserializing header"),
     ],
 )
 def test_flags_and_weights_that_cannot_be_are_refused_in_a_line(flag, said, tmp_path, monkeypatch, capsys):
