@@ -60,7 +60,7 @@ def check_dataset(root: Path) -> Origin:
         ValueError: another version of the environment made it, or none.
     """
     _check_meta_is_there(root)
-    rows = [row for path in sorted(root.glob("meta/episodes/*/*.parquet")) for row in _rows(root, path)]
+    rows = read_rows(root)
     try:
         meta = LeRobotDatasetMetadata("local/dataset", root=root)
     except (KeyError, TypeError, json.JSONDecodeError, pa.ArrowInvalid) as error:
@@ -139,12 +139,20 @@ def _check_meta_is_there(root: Path) -> None:
             raise DatasetFileError(f"{root}/{name} is missing")
 
 
-def _rows(root: Path, path: Path) -> list[dict[str, Any]]:
-    try:
-        table = pq.read_table(path)
-    except (pa.ArrowInvalid, OSError) as error:
-        raise DatasetFileError(f"{path.relative_to(root)} is damaged: {error}") from error
-    return table.drop_columns([name for name in table.column_names if name.startswith("stats/")]).to_pylist()
+def read_rows(root: Path) -> list[dict[str, Any]]:
+    """Read what `meta/episodes` says of each episode, without statistics, file by file.
+
+    Raises:
+        DatasetFileError: names the file that is damaged.
+    """
+    rows = []
+    for path in sorted(root.glob("meta/episodes/*/*.parquet")):
+        try:
+            table = pq.read_table(path)
+        except (pa.ArrowInvalid, OSError) as error:
+            raise DatasetFileError(f"{path.relative_to(root)} is damaged: {error}") from error
+        rows += table.drop_columns([name for name in table.column_names if name.startswith("stats/")]).to_pylist()
+    return rows
 
 
 def _check_data(root: Path, relative: str, lengths: Counter, meta: LeRobotDatasetMetadata) -> None:

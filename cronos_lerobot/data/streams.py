@@ -27,6 +27,7 @@ from datasets.exceptions import DatasetsError
 from huggingface_hub import HfFileSystem
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
+from cronos_lerobot.data.file_check import read_rows
 from cronos_lerobot.data.origin import read_origin
 from cronos_lerobot.data.schema import (
     EXPERT,
@@ -133,9 +134,10 @@ class StreamDataset:
             self._dataset = None if streaming else LeRobotDataset(repo_id, root=root, revision=revision)
             self.meta = self._dataset.meta if self._dataset else LeRobotDatasetMetadata(repo_id, root, revision)
         except (DatasetsError, pa.ArrowInvalid) as error:
+            if root is not None:
+                read_rows(Path(root))
             # What Arrow found is the cause of what `datasets` raises.
-            why = error.__cause__ or error
-            raise ValueError(f"{repo_id} cannot be read, a file of {root or 'it'} is damaged: {why}") from error
+            raise ValueError(f"a file of {repo_id} is damaged: {error.__cause__ or error}") from error
         if STREAM_ID not in self.meta.features:
             raise ValueError(f"{repo_id} has no recorded streams: it lacks the columns {list(STREAM_COLUMNS)}")
         self.origin = read_origin(self.meta.root, self.meta.features, f"dataset {repo_id}")

@@ -167,12 +167,8 @@ def print_statistics(config: StatisticsConfig) -> None:
 
 def check(config: CheckConfig) -> None:
     """`cronos-streams check`."""
-    root = config.dataset.root
-    # First, as it names the file that is damaged.
-    if root is not None and (root / "data").is_dir():
-        check_dataset(root)
     streams = config.dataset.open(streaming=True)
-    if root is None and (streams.meta.root / "data").is_dir():
+    if (streams.meta.root / "data").is_dir():
         check_dataset(streams.meta.root)
     streams.check()
     frames = sum(segment.length for segment in streams.segments)

@@ -1,3 +1,4 @@
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -7,6 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import synthetic_streams
+from forked_commands import run_forked
 from lerobot.datasets import LeRobotDataset, StreamingLeRobotDataset
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
 from synthetic_segments import FPS, features, observation_space, segment
@@ -263,9 +265,25 @@ def test_a_damaged_list_of_segments_is_said_in_one_line(root, tmp_path, monkeypa
     damaged.write_bytes(damaged.read_bytes()[: damaged.stat().st_size // 2])
     flags = ["--dataset.repo_id=me/stream", f"--dataset.root={tmp_path / 'd'}"]
     monkeypatch.setattr(sys, "argv", ["cronos-streams", command, *flags])
-    what = "meta/episodes/chunk-000/file-001.parquet" if command == "check" else f"a file of {tmp_path / 'd'}"
-    with pytest.raises(SystemExit, match=rf"^error: .*{what} is damaged: .*arquet"):
+    with pytest.raises(SystemExit, match=r"^error: meta/episodes/chunk-000/file-001.parquet is damaged: .*arquet"):
         main()
+
+
+def test_streams_of_a_scene_of_ones_own_are_checked(root, tmp_path):
+    """Its module is imported before anything of the recording is looked up."""
+    shutil.copytree(root, tmp_path / "d")
+    for there in (tmp_path / "d/meta").glob("*.json"):
+        there.write_text(there.read_text().replace("kitchen_2x2", "kitchen_of_ones_own"))
+    (tmp_path / "own_module.py").write_text(
+        "from dataclasses import replace\n"
+        "from lerobot_env_cronos import get_scene, register_scene\n"
+        "register_scene(replace(get_scene('kitchen_2x2'), name='kitchen_of_ones_own'))\n"
+    )
+    command = ["cronos-streams", "check", "--dataset.repo_id=me/stream", f"--dataset.root={tmp_path / 'd'}"]
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    done = run_forked([*command, "--dataset.discover_packages_path=own_module"], env=environment)
+    assert (done.returncode, done.stdout[:6]) == (0, "whole:"), done.stderr
+    assert "unknown scene 'kitchen_of_ones_own'" in run_forked(command, env=environment).stderr
 
 
 @pytest.mark.parametrize("command", ["check", "statistics"])
