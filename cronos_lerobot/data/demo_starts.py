@@ -18,10 +18,11 @@ class StartConfig:
     """Where a demonstration starts."""
 
     layouts: str = "train"
-    """`train`: the scene's 64 training configurations in turn; `random`: freshly drawn in the spawn area; `reach`:
+    """`train`: the training configurations in turn; `random`: freshly drawn in the spawn area; `reach`:
     freshly drawn wherever the arm can do the scene's tasks, at any yaw."""
     num_configurations: int = NUM_CONFIGURATIONS
-    """Of the training configurations the first so many; a policy cloned from one has only ever seen that one."""
+    """Of the training configurations the first so many; a policy cloned from one has only ever seen that one. A
+    scene's own are 64, and a benchmark has as many as it was made with."""
     arm_pose: str = "home"
     """`home`; `random`: at a random place above the table; `after_task`: where another task left it; `either`:
     in every second episode after another task where that left it, and at home in the others."""
@@ -50,10 +51,8 @@ class StartConfig:
             raise ValueError(f"unknown start.layouts {self.layouts!r}; valid: {list(LAYOUTS)}")
         if self.arm_pose not in ARM_POSES:
             raise ValueError(f"unknown start.arm_pose {self.arm_pose!r}; valid: {list(ARM_POSES)}")
-        if not 1 <= self.num_configurations <= NUM_CONFIGURATIONS:
-            raise ValueError(
-                f"start.num_configurations must be 1 to {NUM_CONFIGURATIONS}, got {self.num_configurations}"
-            )
+        if self.num_configurations < 1:
+            raise ValueError(f"start.num_configurations must be at least 1, got {self.num_configurations}")
         if self.layouts != "train" and self.num_configurations != NUM_CONFIGURATIONS:
             raise ValueError(
                 f"start.num_configurations={self.num_configurations} is of start.layouts=train, got"
@@ -83,12 +82,24 @@ class StartConfig:
         return self.occupied_receptacles or self.misplaced_objects or after_task or bool(self.policy)
 
 
-def check_starts(start: StartConfig, scene: Scene, tasks: Iterable[Task]) -> None:
-    """Check that a scene has what `start` wants done before each task.
+def check_starts(start: StartConfig, scene: Scene, tasks: Iterable[Task], available: int) -> None:
+    """Check that a scene has what `start` wants done before each task, and so many configurations.
+
+    Args:
+        start: what is wanted.
+        scene: of the demonstrations.
+        tasks: to demonstrate.
+        available: training configurations that there are.
 
     Raises:
         ValueError: it has not.
     """
+    # With the default a smaller benchmark gives all that it has.
+    if start.num_configurations > max(available, NUM_CONFIGURATIONS):
+        raise ValueError(
+            f"--start.num_configurations={start.num_configurations}, but there are {available} training"
+            f" configurations: give {available} or fewer"
+        )
     for task in tasks:
         if (task.receptacle is None or start.is_after_another) and not tasks_before(task, scene, start):
             raise ValueError(

@@ -143,7 +143,7 @@ class DemoCollector:
         self._noise = ActionNoise(config.noise, env.num_envs)
         self._misses = GraspMisses(config.misses, env)
         self._failures_in_a_row = 0
-        check_starts(config.start, env.scene, tasks)
+        check_starts(config.start, env.scene, tasks, len(env.benchmark.configurations["train"]))
 
     def collect(self, num_episodes: int, on_episode: Callable[[int], object] = lambda frames: None) -> None:
         """Write `num_episodes` more episodes: in the end each task has the same number, as far as that divides.

@@ -12,7 +12,7 @@ import av
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.datasets.utils import DEFAULT_TASKS_PATH, EPISODES_DIR, INFO_PATH
+from lerobot.datasets.utils import INFO_PATH
 from lerobot.utils.constants import ACTION, DONE, REWARD
 from lerobot_env_cronos import get_scene
 from lerobot_env_cronos.scene.scenes import CONTROL_HZ
@@ -34,16 +34,13 @@ from cronos_lerobot.data.schema import (
     SUCCESS_FRAME,
     TRUNCATED,
 )
+from cronos_lerobot.dataset_metadata import DatasetFileError, check_meta_is_there
 
 EPISODE_COLUMNS = {
     True: (CONFIGURATION, SUCCESS),
     False: (STREAM_ID, SEGMENT_INDEX, POSITION, STEP, INTERVENTION, POLICY_VERSION, SUCCESS, SUCCESS_FRAME),
 }
 """What the rows of `meta/episodes` have besides LeRobot's columns: of demonstrations, of streams."""
-
-
-class DatasetFileError(ValueError):
-    """A file of a dataset is missing or damaged, or is not what a dataset of ours holds."""
 
 
 def check_dataset(root: Path) -> Origin:
@@ -57,14 +54,18 @@ def check_dataset(root: Path) -> Origin:
 
     Raises:
         DatasetFileError: names the file or the column.
-        ValueError: another version of the environment made it, or none.
+        ValueError: another version of the environment made it, or none, or another of LeRobot.
     """
-    _check_meta_is_there(root)
+    if not (root / INFO_PATH).is_file():
+        raise DatasetFileError(f"{root / INFO_PATH} is missing")
+    check_meta_is_there(root, f"the dataset in {root}")
     rows = read_rows(root)
     try:
         meta = LeRobotDatasetMetadata("local/dataset", root=root)
     except (KeyError, TypeError, json.JSONDecodeError, pa.ArrowInvalid) as error:
         raise DatasetFileError(f"{root}/meta cannot be read: {error}") from error
+    if not meta.total_episodes:
+        raise DatasetFileError(f"the dataset in {root} has no episode yet")
     origin = read_origin(root, meta.features, f"the dataset in {root}")
     check_columns(meta, origin)
     rows = [row for row in rows if row["episode_index"] < meta.total_episodes]
@@ -126,17 +127,6 @@ def _check_tasks(meta: LeRobotDatasetMetadata, origin: Origin) -> None:
     known = {task.instruction for task in (*scene.tasks, *scene.reset_tasks)}
     if unknown := sorted(set(meta.tasks.index if meta.tasks is not None else []) - known):
         raise DatasetFileError(f"the dataset has tasks that {scene.name} has not: {unknown}")
-
-
-def _check_meta_is_there(root: Path) -> None:
-    """What LeRobot does not find in a folder it asks the Hub for."""
-    for name, found in (
-        (INFO_PATH, (root / INFO_PATH).is_file()),
-        (DEFAULT_TASKS_PATH, (root / DEFAULT_TASKS_PATH).is_file()),
-        (EPISODES_DIR, any((root / EPISODES_DIR).glob("*/*.parquet"))),
-    ):
-        if not found:
-            raise DatasetFileError(f"{root}/{name} is missing")
 
 
 def read_rows(root: Path) -> list[dict[str, Any]]:

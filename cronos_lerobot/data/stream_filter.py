@@ -139,7 +139,7 @@ def filter_streams(
     """
     root = Path(root)
     _check_free(root)
-    if not (source.meta.root / "data").is_dir():
+    if not source.is_local:
         raise ValueError(f"{source.repo_id} is streamed from the Hub; open it with streaming=False to filter it")
     for name, given, there in (
         ("streams", wanted.streams, source.streams),

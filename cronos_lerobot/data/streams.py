@@ -17,6 +17,7 @@ from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import IO, Any, cast
+from urllib.parse import quote
 
 import fsspec
 import numpy as np
@@ -25,7 +26,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from datasets.exceptions import DatasetsError
 from huggingface_hub import HfFileSystem
-from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets import LeRobotDataset
+from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
 
 from cronos_lerobot.data.file_check import read_rows
 from cronos_lerobot.data.origin import read_origin
@@ -44,6 +46,7 @@ from cronos_lerobot.data.schema import (
 )
 from cronos_lerobot.data.stream_check import COLUMNS, check
 from cronos_lerobot.data.video import Clip, read_frames
+from cronos_lerobot.dataset_metadata import open_metadata
 from cronos_lerobot.protocol.interventions import Intervention
 
 _SUMMARY = (STREAM_ID, SEGMENT_INDEX, POSITION, STEP, INTERVENTION, POLICY_VERSION, SUCCESS, SUCCESS_FRAME)
@@ -112,13 +115,14 @@ class StreamDataset:
     Args:
         repo_id: the dataset's name, "owner/name".
         root: its folder; None looks where LeRobot keeps its datasets, then on the Hub.
-        revision: of the repo on the Hub.
+        revision: of the repo on the Hub; what is in a folder has none.
         streaming: read single segments from the files where they are, on the Hub with range requests, without
             downloading the rest; `dataset` is then out of reach.
 
     Raises:
         ValueError: the dataset has no recorded streams, or no segment of them yet, or another version of the
-            environment made it.
+            environment or of LeRobot made it, or a revision is asked of a folder.
+        DatasetFileError: a file of `meta/` in `root` is missing.
     """
 
     def __init__(
@@ -130,9 +134,16 @@ class StreamDataset:
         streaming: bool = False,
     ) -> None:
         self.repo_id = repo_id
+        if revision is not None and root is not None:
+            raise ValueError(f"revision={revision} is of the Hub, and root={root} a folder: give one of them")
         try:
+            self.meta = open_metadata(repo_id, root, revision)
+            if revision is not None and not self._is_snapshot:
+                raise ValueError(
+                    f"revision={revision} is of the Hub, and {repo_id} is in {self.meta.root}: leave revision out,"
+                    " or move that folder"
+                )
             self._dataset = None if streaming else LeRobotDataset(repo_id, root=root, revision=revision)
-            self.meta = self._dataset.meta if self._dataset else LeRobotDatasetMetadata(repo_id, root, revision)
         except (DatasetsError, pa.ArrowInvalid) as error:
             if root is not None:
                 read_rows(Path(root))
@@ -146,10 +157,26 @@ class StreamDataset:
             raise ValueError(f"{repo_id} has lost columns of a recorded stream: {lacking}")
         if not self.meta.total_episodes:
             raise ValueError(f"{repo_id} in {self.meta.root} has no episode yet")
-        # Metadata that came from the Hub lies in LeRobot's cache, without the data.
-        is_local = (self.meta.root / "data").is_dir()
-        self._files: Any = fsspec.filesystem("file") if is_local else HfFileSystem()
-        self._base = str(self.meta.root) if is_local else f"datasets/{repo_id}@{self.meta.revision}"
+        self._files: Any = fsspec.filesystem("file") if self.is_local else HfFileSystem()
+        # A branch may have a slash.
+        there = f"datasets/{repo_id}@{quote(self.meta.revision, safe='')}"
+        self._base = str(self.meta.root) if self.is_local else there
+
+    @cached_property
+    def is_local(self) -> bool:
+        """Whether all of it is on this machine: LeRobot's cache may have the metadata and some of the files."""
+        if not self._is_snapshot:
+            return True
+        episodes = range(self.meta.total_episodes)
+        files = {self.meta.get_data_file_path(episode) for episode in episodes}
+        for camera in self.meta.video_keys:
+            files |= {self.meta.get_video_file_path(episode, camera) for episode in episodes}
+        return all((self.meta.root / file).is_file() for file in files)
+
+    @property
+    def _is_snapshot(self) -> bool:
+        """Whether it came from the Hub, into LeRobot's cache."""
+        return HF_LEROBOT_HUB_CACHE.resolve() in self.meta.root.resolve().parents
 
     @property
     def dataset(self) -> LeRobotDataset:

@@ -27,6 +27,7 @@ from cronos_lerobot.data.origin import Origin, check_same, marked, read_origin, 
 from cronos_lerobot.data.schema import Features, frame_format
 from cronos_lerobot.data.storage import INCOMPLETE, Shard, next_shard_index, truncate
 from cronos_lerobot.data.video import MAX_FILE_DURATION_S, VideoFile, fast_encoder
+from cronos_lerobot.dataset_metadata import open_metadata
 from cronos_lerobot.locks import FolderLock
 
 FLUSH_INTERVAL_S = 20.0
@@ -136,6 +137,7 @@ class SegmentWriter:
 
         Raises:
             FileNotFoundError: there is no dataset in `root`.
+            DatasetFileError: a file of its `meta/` is missing.
             ValueError: the dataset holds fewer episodes than `state`, or is of another origin.
             FolderInUseError: another process writes to it.
         """
@@ -144,7 +146,7 @@ class SegmentWriter:
         writer = cls.__new__(cls)
         with ExitStack() as on_failure:
             writer._lock = on_failure.enter_context(FolderLock(root))
-            meta = LeRobotDatasetMetadata(repo_id, root=Path(root))
+            meta = open_metadata(repo_id, Path(root))
             if origin is not None:
                 there = read_origin(meta.root, meta.features, f"the dataset in {root}")
                 check_same(there, origin, f"the dataset in {root}", may_differ)

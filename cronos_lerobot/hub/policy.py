@@ -37,8 +37,10 @@ from cronos_lerobot.report import figures
 from cronos_lerobot.report.png import to_png
 from cronos_lerobot.report.runs import TrainingRun, group_runs
 
-REPLACES = ["curves/*", "*.safetensors", "*.json", "*.model", "*.txt"]
+REPLACES = ["curves/*", "*.safetensors", "*.json", "tokenizer.model", "merges.txt", "vocab.txt"]
 """Also what a policy of another kind has left: an actor that steers or adapters would be loaded with this one."""
+LICENSE = "apache-2.0"
+"""As LeRobot says of a policy that names none."""
 FIGURES = {
     "evaluation": ("Periodic evaluation, with 95 % intervals", figures.evaluation_figure),
     "training": ("Success of the training streams' segments", figures.training_figure),
@@ -165,6 +167,8 @@ def _card(
         base_model=base_model,
         base_is_local=base is not None and base_model is None,
         adapters_of=adapters_of,
+        license=_license(config, policy, base_model),
+        tags=[str(tag) for tag in policy.get("tags") or []],
         is_steered=(checkpoint.model / STEERING).is_file(),
         scene=scene,
         lerobot_eval_flags=lerobot_eval_flags(policy, env, scene, renderer),
@@ -174,6 +178,11 @@ def _card(
         caveats=describe_caveats(results, policy, renderer) if results else [],
         results_source=describe_source(results["benchmark"]["source"]) if results else None,
     )
+
+
+def _license(config: PolicyConfig, policy: dict[str, Any], base_model: str | None) -> str | None:
+    """The license of a policy; None where a base's, which is not known here, may forbid any other."""
+    return config.license or policy.get("license") or (None if base_model else LICENSE)
 
 
 def _has_config(checkpoint: Checkpoint) -> bool:

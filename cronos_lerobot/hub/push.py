@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from glob import escape
 from pathlib import Path
 
 import httpx
@@ -62,7 +64,8 @@ def push_folder(
         folder: the tree to push.
         target: where to.
         message: of the commit.
-        replaces: patterns of files that are removed where the folder does not have them.
+        replaces: patterns of files that are removed where the folder does not have them; one without a folder is
+            of files at the root alone.
         tag: to put onto the result, moved if it is there.
         creates: make the repository if it is not there.
 
@@ -85,17 +88,27 @@ def push_folder(
             api.create_branch(
                 repo_id, repo_type=kind, branch=target.branch, revision=target.revision, exist_ok=True
             )
+        there = api.list_repo_files(repo_id, repo_type=kind, revision=target.branch) if replaces else []
         api.upload_folder(
             repo_id=repo_id,
             repo_type=kind,
             folder_path=folder,
             revision=target.branch,
             commit_message=message,
-            delete_patterns=list(replaces) or None,
+            delete_patterns=[escape(file) for file in replaced(there, replaces)] or None,
         )
         if tag:
             _move_tag(api, target, tag)
     return target.url
+
+
+def replaced(there: Iterable[str], patterns: Sequence[str]) -> list[str]:
+    """Return the files of a repository that patterns name; the `*` of one without a folder passes no folder."""
+    return [
+        file
+        for file in there
+        if any(fnmatchcase(file, pattern) and ("/" in pattern or "/" not in file) for pattern in patterns)
+    ]
 
 
 def check_holds(target: Target, file: str) -> None:

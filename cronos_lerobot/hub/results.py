@@ -112,7 +112,7 @@ def _load(config: ResultsConfig, results: dict[str, Any]) -> Benchmark:
     """The benchmark's repository, checked to be what was evaluated."""
     evaluated = results["benchmark"]
     name = config.benchmark or evaluated["source"]
-    if name.count("/") != 1 or Path(name).is_dir():
+    if name.partition("@")[0].count("/") != 1 or Path(name).is_dir():
         raise ValueError(f"--benchmark=<owner>/<repository>[@<revision>] is required; evaluated was {name}")
     benchmark = load_benchmark(name, results["scene"])
     here = {"environment": gymnasium_id(benchmark.scene.name), "fingerprint": benchmark.fingerprint}
@@ -220,7 +220,10 @@ def _published(config: ResultsConfig, revision: str | None) -> list[dict[str, An
             path = api.hf_hub_download(config.repo_id, FILE, revision=commit)
         except RemoteEntryNotFoundError:
             return []
-    entries = yaml.safe_load(Path(path).read_text()) or []
+    try:
+        entries = yaml.safe_load(Path(path).read_text()) or []
+    except yaml.YAMLError:
+        entries = None
     if not isinstance(entries, list) or not all(
         isinstance(entry, dict) and "dataset" in entry for entry in entries
     ):

@@ -77,7 +77,7 @@ class SceneReset(ResetStrategy):
 
     Args:
         rng: draws the configuration of the train split, one for each stream.
-        num_configurations: draws only from the first so many of the split's 64.
+        num_configurations: draws only from the first so many of the split.
     """
 
     def __init__(self, rng: np.random.Generator, num_configurations: int = NUM_CONFIGURATIONS) -> None:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cronos_lerobot.experiments.scales import BASE_KINDS, DIVERSE_DEMO_FLAGS, WIDE
-from cronos_lerobot.locks import FolderInUseError
 from cronos_lerobot.scripts import probe
 from cronos_lerobot.scripts.pipeline import Step, StepFailedError, remember, run_steps
 
@@ -248,7 +247,7 @@ def main() -> None:
     try:
         scale = choose_scale(args.output_dir) if args.scale == "auto" else args.scale
         run_steps(make_steps(SCALES[scale], args.output_dir), args.output_dir)
-    except (FileExistsError, FolderInUseError) as error:
+    except OSError as error:
         sys.exit(f"error: {error}")
     except StepFailedError as error:
         sys.exit(f"error: {error}\n{again}")

@@ -20,7 +20,6 @@ from cronos_lerobot.experiments.jobs import Job, is_done
 from cronos_lerobot.experiments.runner import usable_cores
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
 from cronos_lerobot.experiments.slurm import SlurmError, SlurmOptions
-from cronos_lerobot.locks import FolderInUseError
 from cronos_lerobot.scripts.launchers import (
     add_launcher_flags,
     finish,
@@ -291,7 +290,7 @@ def run_jobs(jobs: list[Job], args: argparse.Namespace, slurm: SlurmOptions | No
             parallel = args.jobs or max(1, usable_cores() // args.threads)
             return run_here(jobs, parallel, args.threads)
         return run_on_slurm(jobs, slurm, args.root, args.threads, args.jobs)
-    except (SlurmError, FolderInUseError) as error:
+    except (SlurmError, OSError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt as end:
         sys.exit(f"\n{end}")
@@ -361,7 +360,10 @@ def main() -> None:
     done = True
     if not args.report_only:
         done = finish(run_jobs(jobs, args, slurm))
-    write_reports(chosen, options, args.output_dir)
+    try:
+        write_reports(chosen, options, args.output_dir)
+    except OSError as error:
+        sys.exit(f"error: {error}")
     if not done:
         sys.exit(1)
 

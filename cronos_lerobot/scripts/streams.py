@@ -61,7 +61,7 @@ class SourceConfig:
     root: Path | None = None
     """Its folder; null looks where LeRobot keeps its datasets, then on the Hub."""
     revision: str | None = None
-    """Branch, tag or commit on the Hub."""
+    """Branch, tag or commit on the Hub; refused of a dataset that is in a folder."""
     discover_packages_path: str | None = None
     """Module to import first, one that registers the scene of the streams."""
 
@@ -168,7 +168,7 @@ def print_statistics(config: StatisticsConfig) -> None:
 def check(config: CheckConfig) -> None:
     """`cronos-streams check`."""
     streams = config.dataset.open(streaming=True)
-    if (streams.meta.root / "data").is_dir():
+    if streams.is_local:
         check_dataset(streams.meta.root)
     streams.check()
     frames = sum(segment.length for segment in streams.segments)

@@ -23,6 +23,7 @@ MAINS = {
     "cronos-publish": "cronos_lerobot.scripts.publish",
     "cronos-train": "cronos_lerobot.scripts.train",
     "cronos-eval": "cronos_lerobot.scripts.eval",
+    "cronos-streams": "cronos_lerobot.scripts.streams",
     "lerobot-eval": "lerobot.scripts.lerobot_eval",
 }
 PRELOADED = (

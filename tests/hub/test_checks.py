@@ -16,7 +16,8 @@ from safetensors.numpy import save_file
 from cronos_lerobot.data.file_check import check_dataset
 from cronos_lerobot.data.writer import SegmentWriter
 from cronos_lerobot.hub.config import PolicyConfig, PublishConfig, StreamConfig
-from cronos_lerobot.hub.policy import write_policy_repository
+from cronos_lerobot.hub.policy import REPLACES, write_policy_repository
+from cronos_lerobot.hub.push import replaced
 from cronos_lerobot.hub.results import check_policy
 from cronos_lerobot.hub.streams import not_being_recorded, write_stream_repository
 from cronos_lerobot.locks import FolderInUseError, FolderLock
@@ -179,3 +180,10 @@ def test_results_of_something_else_are_refused(evaluated):
 def test_results_of_a_folder_called_like_a_repository_are_refused():
     with pytest.raises(ValueError, match="are of a folder called me/eer, not of the repository"):
         check_policy({"policy": "me/eer", "policy_revision": None}, "me/eer")
+
+
+def test_a_policy_that_is_pushed_again_leaves_nothing_that_would_be_loaded_with_it():
+    there = ["steering.safetensors", "adapter_model.safetensors", "adapter_config.json", "tokenizer.model",
+             "curves/old.png", ".eval_results/me_bench.yaml", "README.md", ".gitattributes", "requirements.txt",
+             "LICENSE.txt", "checkpoints/5000/model.safetensors", "onnx/config.json"]  # fmt: skip
+    assert replaced(there, REPLACES) == there[:5]

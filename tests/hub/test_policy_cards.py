@@ -123,6 +123,19 @@ def test_a_cards_commands_are_right_for_every_policy(
         adapter = json.loads((tmp_path / "out/adapter_config.json").read_text())
         assert adapter == {"base_model_name_or_path": "me/clone", "revision": None, "r": 2}
         assert (front["base_model"], front["base_model_relation"]) == ("me/clone", "adapter")
+    # That of the other repository is not known here.
+    assert front.get("license") == (None if files is ADAPTER else "apache-2.0")
+
+
+def test_a_policy_keeps_its_own_license_and_tags(tmp_path, monkeypatch):
+    monkeypatch.setattr(hub_policy, "FIGURES", {})
+    model = write_checkpoint(tmp_path, "act", CronosEnvConfig(**STATE), PPOConfig())
+    path = tmp_path / "run/checkpoints/000032/pretrained_model/config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"license": "gemma", "tags": ["my-lab"]}))
+    for flags, license_ in (({}, "gemma"), ({"license": "mit"}, "mit")):
+        front = yaml.safe_load(dry_run(model, tmp_path / license_, **flags).split("---")[1])
+        assert front["license"] == license_
+        assert front["tags"][-1] == "my-lab"
 
 
 @pytest.mark.parametrize(

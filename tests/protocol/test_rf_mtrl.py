@@ -262,8 +262,7 @@ def test_loop_state_survives_json():
         ({"curriculum": [(None, 4)]}, "increasing"),
         ({"reset_budget": 0}, "reset_budget"),
         ({"reward": "dense"}, "difference"),
-        ({"num_configurations": 0}, "num_configurations must be 1 to 64"),
-        ({"num_configurations": 65}, "num_configurations must be 1 to 64"),
+        ({"num_configurations": 0}, "num_configurations must be >= 1, got 0"),
         ({"extra_resets": ["stuck", "lost", "stuck"]}, r"must name each strategy once, got \['stuck'\] more"),
     ],
 )

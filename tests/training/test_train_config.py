@@ -111,7 +111,7 @@ def test_steps_are_rounded_up_to_whole_updates():
     ("arguments", "message"),
     [
         (["--steps=0"], "steps must be >= 1"),
-        (["--eval.n_episodes=65"], "1 to 64"),
+        (["--eval.n_episodes=0"], "eval.n_episodes must be >= 1, got 0"),
         (["--eval.split=test"], "held_out"),
         (["--protocol.update_interval=100"], "multiple of protocol.task_switch_interval=80"),
         (["--protocol.curriculum=[[null,320]]"], "must have increasing until_steps > 0"),

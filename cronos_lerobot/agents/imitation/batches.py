@@ -19,6 +19,7 @@ from cronos_lerobot.agents.base import Batch
 from cronos_lerobot.agents.imitation.config import DemosConfig
 from cronos_lerobot.agents.imitation.memory import Segment, SegmentMemory
 from cronos_lerobot.agents.processing import EMPTY_CAMERA
+from cronos_lerobot.dataset_metadata import open_metadata
 
 
 def segment_batch(draws: Sequence[tuple[Segment, int]], config: PreTrainedConfig) -> Batch:
@@ -101,7 +102,7 @@ class Demonstrations:
 def _open_metadata(config: DemosConfig) -> LeRobotDatasetMetadata:
     assert config.repo_id is not None
     try:
-        return LeRobotDatasetMetadata(config.repo_id, root=config.root)
+        return open_metadata(config.repo_id, config.root)
     except (OSError, httpx.HTTPError) as error:
         folder = config.root
         if folder is not None and (folder / INFO_PATH).is_file():
