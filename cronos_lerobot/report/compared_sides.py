@@ -105,8 +105,27 @@ def _add(found: dict[str, Outcomes], key: str, one: Outcomes) -> None:
 
 def identity(outcomes: Outcomes) -> str:
     """What tells a policy, as it was evaluated, from another, wherever it lies."""
-    what = outcomes.fingerprint or outcomes.policy
-    return f"{what} {sorted((name, str(outcomes.setting.get(name))) for name in WORTH_SAYING)}"
+    return f"{outcomes.fingerprint or outcomes.policy} {_setting(outcomes)}"
+
+
+def is_same(one: Outcomes, other: Outcomes) -> bool:
+    """Whether two are of one policy, evaluated alike; a run's own evaluation, by its checkpoint."""
+    if one.fingerprint and other.fingerprint:
+        return identity(one) == identity(other)
+    return _checkpoint(one) == _checkpoint(other) and _setting(one) == _setting(other)
+
+
+def _setting(outcomes: Outcomes) -> list[tuple[str, str]]:
+    return sorted((name, str(outcomes.setting.get(name))) for name in WORTH_SAYING)
+
+
+def _checkpoint(outcomes: Outcomes) -> tuple[str, int | str]:
+    """The run and the checkpoint, whatever they are called: `last` is where it leads to."""
+    run, checkpoint = run_and_checkpoint(outcomes)
+    if not checkpoint:
+        return run, ""
+    folder = (Path(run) / "checkpoints" / checkpoint).resolve()
+    return str(folder.parent), int(folder.name) if folder.name.isdigit() else folder.name
 
 
 def _order(checkpoint: str) -> tuple[int, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -104,7 +104,7 @@ def segments_figure(groups: list[Group]) -> Figure | None:
     return figure if ax.lines else None
 
 
-def segment_curve(rates: dict[int, Rate]) -> Curve:
+def segment_curve(rates: Mapping[int, Rate]) -> Curve:
     """Success by segment, a point for each of `segment_spans`."""
     spans = segment_spans(rates)
     ends = np.array([rate.interval for rate in spans.values()])

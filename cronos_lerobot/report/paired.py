@@ -137,8 +137,10 @@ def compare_trainings(pairs: Pairs, power: float) -> Difference | None:
     The variance is that of two crossed factors, training and configuration, both drawn at random (Searle, Casella
     and McCulloch 1992, "Variance Components", chapter 4): that between the trainings of each side, plus that
     between the configurations, less the interaction, which both of them have in them. A side of one policy, and
-    what trainings have in common, such as the base that they begin with, is taken as it is. The
-    t-interval has Satterthwaite's degrees of freedom.
+    what trainings have in common, such as the base that they begin with, is taken as it is: where the trainings
+    are of several bases, it does not count how those differ. The t-interval has Satterthwaite's degrees of
+    freedom, and is no narrower than that of the configurations alone where trainings differ less than chance has
+    it.
     """
     sides = [side for side in (pairs.a, pairs.b) if len(side) > 1]
     if not sides:
@@ -150,19 +152,23 @@ def compare_trainings(pairs: Pairs, power: float) -> Difference | None:
     both = sum(_interaction(side, pairs.clusters) for side in sides) if k > 1 else 0.0
     configurations = cluster_variance(pairs.differences, pairs.clusters) if k > 1 else 0.0
     more = max(0.0, configurations - both)
-    variance = trainings + more
     spread = sqrt(sum(v * len(side) for v, side in zip(of_side, sides, strict=True)))
+    variance = trainings + more
     counts = f"{len(pairs.a)} against {len(pairs.b)} trainings"
     method = f"t-interval and p by training and {pairs.unit} ({counts}, {k} {pairs.units})"
     per_side = len(sides)
     needed = samples_needed(spread, value, power, lambda n: per_side * (n - 1))
-    if not variance:
-        return Difference(value, None, None, method, None, None)
     terms = [v * v / (len(side) - 1) for v, side in zip(of_side, sides, strict=True)]
-    df = variance**2 / (sum(terms) + (more**2 / (k - 1) if more else 0.0))
-    half = float(student_t.ppf(1 - ALPHA / 2, df)) * sqrt(variance)
-    p = 2 * float(student_t.sf(abs(value) / sqrt(variance), df))
-    found = (float(student_t.ppf(1 - ALPHA / 2, df)) + float(student_t.ppf(power, df))) * sqrt(variance)
+    estimates = [(variance, variance**2 / (sum(terms) + (more**2 / (k - 1) if more else 0.0)))] if variance else []
+    # A variance between trainings that is estimated below 0 is none: no surer than of these policies alone.
+    if configurations and trainings < both * (1 - 1e-9):
+        estimates.append((configurations, k - 1))
+    if not estimates:
+        return Difference(value, None, None, method, None, None)
+    t = [(float(student_t.ppf(1 - ALPHA / 2, df)), float(student_t.ppf(power, df))) for _, df in estimates]
+    half = max(low * sqrt(v) for (low, _), (v, _) in zip(t, estimates, strict=True))
+    found = max((low + high) * sqrt(v) for (low, high), (v, _) in zip(t, estimates, strict=True))
+    p = max(2 * float(student_t.sf(abs(value) / sqrt(v), df)) for v, df in estimates)
     return Difference(value, (value - half, value + half), p, method, needed, found)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cronos_lerobot.evaluation.outcomes import WORTH_SAYING, Outcomes
-from cronos_lerobot.report.compared_sides import Side, identity, paired_episodes, run_and_checkpoint, short_names
+from cronos_lerobot.report.compared_sides import Side, is_same, paired_episodes, run_and_checkpoint, short_names
 from cronos_lerobot.report.paired import ALPHA, Difference, Pairs, compare_policies, compare_trainings, holm
 
 FORMAT = 1
@@ -104,9 +104,9 @@ def check_apart(a: Side, b: Side) -> None:
         ValueError: one is, evaluated alike.
     """
     for pair in [pair for pair in a.suites if pair in b.suites]:
-        ours = {identity(outcomes) for outcomes in b.trainings(*pair)}
+        theirs = b.trainings(*pair)
         for outcomes in a.trainings(*pair):
-            if identity(outcomes) in ours:
+            if any(is_same(outcomes, other) for other in theirs):
                 raise ValueError(
                     f"A and B both have {outcomes.policy}, evaluated alike: there is nothing to compare"
                 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,11 +10,13 @@ import numpy as np
 
 from cronos_lerobot.protocol.metrics import interpolate
 from cronos_lerobot.report.runs import Group, TrainingRun
-from cronos_lerobot.report.statistics import Rate
+from cronos_lerobot.report.statistics import Rate, SeedRate
 
 Record = dict[str, Any]
 LAST_PART = 0.25
 """Share of a run, at its end, that stands for what it has come to."""
+LONGEST_CYCLE = 1 / 3
+"""Share of a run that a whole cycle between two scene resets may be, to stand for its end."""
 
 
 @dataclass(frozen=True)
@@ -79,21 +81,31 @@ def mean_curve(curves: list[tuple[Any, Any]]) -> Curve:
     return Curve(grid, mean, mean - spread, mean + spread, is_band_over_seeds=len(values) > 1)
 
 
-def segment_rates(group: Group, last_part: float = LAST_PART) -> dict[int, Rate]:
-    """Success by number of task switches since the scene reset, in the last part of the runs of a group."""
-    rates: dict[int, Rate] = {}
+def segment_rates(group: Group, last_part: float = LAST_PART) -> dict[int, SeedRate]:
+    """Success by number of task switches since the scene reset, in the last part of the runs of a group.
+
+    Of one run the segments count as independent episodes.
+    """
+    runs: list[dict[int, Rate]] = []
     for run in group.runs:
+        runs.append(rates := {})
         for update in _last_updates(run, last_part):
             for position, (successes, n) in update["rollout"]["success_by_segment"].items():
                 rates[int(position)] = rates.get(int(position), Rate(0, 0)) + Rate(successes, n)
-    return dict(sorted(rates.items()))
+    return _of_seeds(runs)
+
+
+def _of_seeds(runs: Sequence[dict[Any, Rate]]) -> dict[Any, SeedRate]:
+    """The rates of several runs, key by key; a run without a key has no episode of it."""
+    keys = sorted({key for rates in runs for key in rates})
+    return {key: SeedRate.of(rates.get(key, Rate(0, 0)) for rates in runs) for key in keys}
 
 
 SINGLE = 16
 """Segments since a scene reset that are shown one by one: all that T = 1280 has."""
 
 
-def segment_spans(rates: dict[int, Rate]) -> dict[tuple[int, int], Rate]:
+def segment_spans(rates: Mapping[int, Rate]) -> dict[tuple[int, int], Rate]:
     """The rates of `segment_rates` as they are read: by (first, last) segment, counted from 1.
 
     Few streams come to the hundredth segment at the same time, and nobody reads a hundred columns: from the 17th
@@ -104,29 +116,36 @@ def segment_spans(rates: dict[int, Rate]) -> dict[tuple[int, int], Rate]:
         number = position + 1
         first = number if number <= SINGLE else 2 ** ((number - 1).bit_length() - 1) + 1
         span = (first, number if number <= SINGLE else 2 * (first - 1))
-        spans[span] = spans.get(span, Rate(0, 0)) + rate
+        spans[span] = spans[span] + rate if span in spans else rate
     return spans
 
 
-def task_rates(group: Group, parts: int = 4) -> dict[tuple[int, str], Rate]:
-    """Success while training by part of the run (0 is the first) and instruction, learned resets' among them."""
-    rates: dict[tuple[int, str], Rate] = {}
+def task_rates(group: Group, parts: int = 4) -> dict[tuple[int, str], SeedRate]:
+    """Success while training by part of the run (0 is the first) and instruction, learned resets' among them.
+
+    Of one run the segments count as independent episodes.
+    """
+    runs: list[dict[tuple[int, str], Rate]] = []
     for run in group.runs:
+        runs.append(rates := {})
         for i, update in enumerate(run.updates):
             for instruction, (successes, n) in update["rollout"]["success_by_task"].items():
                 key = (i * parts // len(run.updates), instruction)
                 rates[key] = rates.get(key, Rate(0, 0)) + Rate(successes, n)
-    return dict(sorted(rates.items()))
+    return _of_seeds(runs)
 
 
 def _last_updates(run: TrainingRun, last_part: float) -> list[Record]:
-    """The last part of a run, at least one whole cycle between two scene resets where there is one."""
+    """The last part of a run, or a whole cycle between two scene resets where that is a little longer.
+
+    A whole cycle has every segment, and one that is the larger part of a run would not be of its end.
+    """
     if not run.updates:
         return []
     end = run.updates[-1]["interaction_steps"]
     protocol = run.config.get("protocol", {})
     cycle = (protocol.get("scene_reset_interval") or 0) * run.config.get("num_envs", 0)
-    start = min(end * (1 - last_part), end - cycle)
+    start = min(end * (1 - last_part), end - cycle if cycle <= end * LONGEST_CYCLE else end)
     return [update for update in run.updates if update["interaction_steps"] > start]
 
 

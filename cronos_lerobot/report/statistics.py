@@ -83,10 +83,14 @@ class SeedRate(Rate):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % t-interval of the mean over the seeds, within 0 and 1; by episodes of one, or of some all alike."""
-        summary = summarise_rates([rate.value for rate in self.seeds])
+        """95 % t-interval of the mean over the seeds, within 0 and 1; of one, or of some all alike, that of one.
+
+        Seeds are evaluated on the same episodes: together they are no more of them.
+        """
+        seeds = [rate for rate in self.seeds if rate.n]
+        summary = summarise_rates([rate.value for rate in seeds])
         over_seeds = summary.ci95 if summary else None
-        return over_seeds or sum_rates(self.seeds).interval
+        return over_seeds or seeds[0].interval
 
     def __add__(self, other: Rate) -> Rate:
         """Both sets of episodes together, seed by seed if they are of as many."""

@@ -73,8 +73,8 @@ def seed_rows(groups: Iterable[Group]) -> list[Row]:
         row |= {name: sum(e.get(name, 0) for e in last) if are_there else None for name in APART}
         row |= _summary_columns("interventions", summarise(at_end))
         are_whole = all(run.begins_alike for run in runs)
-        row |= _summary_columns("D / steps", summarise(by_steps) if are_whole else None)
-        row |= _summary_columns("C / interventions", summarise(by_resets) if are_whole else None)
+        row |= _summary_columns("D / steps", summarise_rates(by_steps) if are_whole else None)
+        row |= _summary_columns("C / interventions", summarise_rates(by_resets) if are_whole else None)
         rows.append(row)
     return rows
 

@@ -264,6 +264,22 @@ def test_policies_are_told_apart_by_what_they_are_not_by_their_names(tmp_path, m
         compare(monkeypatch, tmp_path / "c", tmp_path / "c")
 
 
+def test_a_runs_own_evaluation_is_that_of_its_last_checkpoint(tmp_path, monkeypatch):
+    run = write_run(tmp_path / "run", 1, ["1000"])
+    (run / "checkpoints/0010240").mkdir(parents=True)
+    (run / "checkpoints/last").symlink_to("0010240")
+    settings = {"obs_type": None, "renderer": None, "versions": None}
+    for number, name in enumerate(("last", "0010240", "0005120")):
+        policy = f"{run}/checkpoints/{name}/pretrained_model"
+        write_evaluation(
+            tmp_path / str(number), policy, tasks=["1000"], split="train", policy_fingerprint="1f", **settings
+        )
+    for folder in (tmp_path / "0", tmp_path / "1"):
+        with pytest.raises(SystemExit, match=r"A and B both have .*pretrained_model, evaluated alike"):
+            compare(monkeypatch, folder, run)
+    compare(monkeypatch, tmp_path / "2", run)
+
+
 def test_what_was_left_out_and_what_is_not_alike_is_said(tmp_path, monkeypatch, capsys):
     a = write_evaluation(tmp_path / "a", "me/a", tasks=["110"], temperature=0)
     b = write_evaluation(tmp_path / "b", "me/b", tasks=["11010"], versions={"mujoco": "5"})

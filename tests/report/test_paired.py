@@ -137,6 +137,18 @@ def test_variances_of_a_table_by_hand():
     assert found.ci95 == pytest.approx((1.5 - half, 1.5 + half), abs=1e-4)
 
 
+def test_trainings_that_differ_less_than_chance_has_it_are_no_surer_than_these_policies():
+    # Both trainings have 3 of 4; their columns .5, .5, 1, 1 vary by 1/12, the mean of the four by 1/48. Left over
+    # are four cells of +-.5, 1 over 3 degrees of freedom, of the mean of eight 1/24: between trainings is -1/24.
+    after = np.array([[1, 0, 1, 1], [0, 1, 1, 1]])
+    found = compare_trainings(Pairs(np.zeros((1, 4), int), after, np.arange(4)), power=0.8)
+    assert found is not None
+    half = 3.1824 * np.sqrt(1 / 48)
+    assert found.ci95 == pytest.approx((0.75 - half, 0.75 + half), abs=1e-4)
+    # A t-test of the columns.
+    assert found.p == pytest.approx(ttest_1samp([0.5, 0.5, 1, 1], 0).pvalue)
+
+
 def test_a_base_that_all_trainings_begin_with_is_one_policy():
     """Whether it is taken from each of them or stands against all: it does not average out over them."""
     rng = np.random.default_rng(2)

@@ -26,8 +26,11 @@ def test_gain_of_nothing_covers_zero():
 
 
 def test_seeds_that_are_all_alike_do_not_say_that_every_training_is():
-    # Wilson's of 18 of 20, (.9 + z^2 / 40 -+ z sqrt(.09 / 20 + z^2 / 1600)) / (1 + z^2 / 20).
-    assert SeedRate.of([Rate(9, 10)] * 2).interval == pytest.approx((0.6990, 0.9721), abs=1e-4)
+    # Wilson's of 9 of 10, (.9 + z^2 / 20 -+ z sqrt(.09 / 10 + z^2 / 400)) / (1 + z^2 / 10): the second evaluation
+    # is of the same episodes.
+    assert SeedRate.of([Rate(9, 10)] * 2).interval == pytest.approx((0.5958, 0.9821), abs=1e-4)
+    # A seed without an episode says nothing.
+    assert SeedRate.of([Rate(9, 10), Rate(0, 0)]).interval == Rate(9, 10).interval
 
 
 def test_chains_from_one_configuration_go_together():
@@ -46,7 +49,7 @@ def test_chains_from_one_configuration_go_together():
 
 def test_gains_that_are_all_alike_have_an_interval_of_their_evaluations():
     before, after = SeedRate.of([Rate(3, 10)] * 2), SeedRate.of([Rate(8, 10)] * 2)
-    assert Gain(before, after).interval == newcombe_interval(Rate(6, 20), Rate(16, 20))
+    assert Gain(before, after).interval == newcombe_interval(Rate(3, 10), Rate(8, 10))
 
 
 def test_intervals_over_seeds_end_where_rates_and_gains_do():
