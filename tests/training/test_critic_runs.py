@@ -10,7 +10,8 @@ from forked_processes import ScriptedPolicy, together
 from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
 from test_distributed import settings
 from test_distributed import train as train_in
-from test_trainer import STREAMS, KilledError, MortalEnv, assert_same_run, config, make_trainer, metrics, train
+from test_trainer import STREAMS, KilledError, MortalEnv, assert_same_run, make_trainer, metrics, train
+from test_trainer import config as evaluated_config
 
 from cronos_lerobot.agents.base import ValuingAgent
 from cronos_lerobot.agents.ppo.agent import PPOAgent
@@ -26,6 +27,11 @@ from cronos_lerobot.training.seeding import NamedGenerators
 EVERYTHING = {"scene_reset": "critic", "reset_budget": 12, "scene_reset_interval": None}
 STAGGERED = {"reset_phase": "staggered", "scene_reset_interval": 16}
 LEARNABLE = {"reset_starts": "learnable", "scene_reset_interval": 8}
+
+
+def config(folder, **options):
+    """Runs without evaluations."""
+    return evaluated_config(folder, **{"eval_freq": 0} | options)
 
 
 def critic_protocol(**options):
@@ -102,7 +108,7 @@ def test_metrics_say_what_values_chose(tmp_path):
 
 
 def test_runs_without_values_log_nothing_of_them(tmp_path):
-    train(config(tmp_path / "run"))
+    train(evaluated_config(tmp_path / "run"))
     lines = metrics(tmp_path / "run")
     assert all("critic" not in line for line in lines)
     assert {line["kind"] for line in lines} == {"update", "evaluation"}
@@ -116,7 +122,7 @@ def told_apart(answer):
 
 
 def in_processes(folder, minibatch_size, **options):
-    cfg = settings(folder, minibatch_size, **options)
+    cfg = settings(folder, minibatch_size, eval_freq=0, **options)
     asked = EVERYTHING | {"reset_budget": 60, "reset_starts": "learnable"}
     cfg.protocol = critic_protocol(**asked, heuristic_reset=True)
     return cfg
@@ -155,10 +161,8 @@ def test_resumed_run_of_two_processes_equals_the_unbroken_one(tmp_path):
 def test_values_may_be_switched_on_when_a_run_is_resumed(tmp_path):
     """Periodic resets until then are none of the critic's."""
     first = {"task_order": "random", "scene_reset_interval": 16, "critic": CriticConfig()}
-    train(
-        config(tmp_path / "run", steps=64, protocol=critic_protocol(**first), eval_freq=0), env=DummyEnv(STREAMS)
-    )
-    resumed = config(tmp_path / "run", protocol=critic_protocol(**EVERYTHING), eval_freq=0)
+    train(config(tmp_path / "run", steps=64, protocol=critic_protocol(**first)), env=DummyEnv(STREAMS))
+    resumed = config(tmp_path / "run", protocol=critic_protocol(**EVERYTHING))
     resumed.checkpoint_path = (tmp_path / "run/checkpoints/last").resolve()
     train(resumed, env=DummyEnv(STREAMS))
     last = json.loads((tmp_path / "run/metrics.jsonl").read_text().splitlines()[-1])

@@ -68,9 +68,8 @@ class ClonedPolicy(DummyPolicy):
 
 def settings(folder, **options):
     algorithm = ImitationConfig(steps_per_update=5, batch_size=8, warmup_segments=3, tail_steps=1)
-    return config(
-        folder, **{"policy": ClonedConfig(), "algorithm": algorithm, "steps": 6 * STEPS_PER_UPDATE} | options
-    )
+    defaults = {"policy": ClonedConfig(), "algorithm": algorithm, "steps": 6 * STEPS_PER_UPDATE, "eval_freq": 0}
+    return config(folder, **defaults | options)
 
 
 def train(cfg, env_class=DummyEnv, processes=None, policy_seed=0):
@@ -279,7 +278,7 @@ ACT = (
     "--env.type=cronos", *(f"--env.{name}={value}" for name, value in OBSERVATIONS.items()), "--num_envs=4",
     "--protocol.task_switch_interval=10", "--protocol.update_interval=20", "--protocol.scene_reset_interval=20",
     "--save_freq=80", "--eval_freq=0", "--tensorboard=false", "--algorithm.type=imitation",
-    "--algorithm.warmup_segments=0", "--algorithm.demos_share=0.5", "--algorithm.demos.repo_id=me/demos",
+    "--algorithm.demos_share=0.5", "--algorithm.demos.repo_id=me/demos",
     "--algorithm.steps_per_update=4", "--algorithm.batch_size=8",
 )  # fmt: skip
 

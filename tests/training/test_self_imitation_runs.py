@@ -33,9 +33,8 @@ def settings(folder, coef=0.5, **options):
         minibatch_size=16, policy_lr=1e-2, policy_lr_max=1.0, value_warmup_updates=1,
         self_imitation=SelfImitationConfig(coef=coef, batch_size=8, max_age=2, tail_steps=1),
     )  # fmt: skip
-    return config(
-        folder, **{"policy": ClonedConfig(), "algorithm": algorithm, "steps": 6 * STEPS_PER_UPDATE} | options
-    )
+    defaults = {"policy": ClonedConfig(), "algorithm": algorithm, "steps": 6 * STEPS_PER_UPDATE, "eval_freq": 0}
+    return config(folder, **defaults | options)
 
 
 def updates(folder):

@@ -75,9 +75,8 @@ def settings(folder, **options):
         "utd": 1,
     }
     algorithm = SteeringConfig(**own | options.pop("algorithm", {}))
-    return config(
-        folder, **{"policy": NoiseConfig(), "algorithm": algorithm, "steps": 6 * STEPS_PER_UPDATE} | options
-    )
+    defaults = {"policy": NoiseConfig(), "algorithm": algorithm, "steps": 6 * STEPS_PER_UPDATE, "eval_freq": 0}
+    return config(folder, **defaults | options)
 
 
 def train(cfg, env_class=DummyEnv, processes=None, policy_seed=0):

@@ -86,7 +86,7 @@ def test_sigma_learns_the_spread_of_the_demonstrations():
         policy.head.project.weight.zero_()
     policy.head.project.weight.requires_grad_(False)
     spread = torch.tensor([0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.1])
-    batch = make_batch(1024) | {"action": torch.randn(1024, 7) * spread}
+    batch = make_batch(512) | {"action": torch.randn(512, 7) * spread}
     optimizer = torch.optim.Adam([policy.head.raw_sigma], lr=0.1)
     for _ in range(70):
         optimizer.zero_grad()
