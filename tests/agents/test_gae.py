@@ -20,8 +20,7 @@ def test_only_an_update_boundary_at_the_end():
     assert gae([1, 0, 1], [2, 4, 2], [0, 0, 1], [-9, -9, 8]) == [0.4375, -2.25, 3]
 
 
-@pytest.mark.parametrize("kind", ["task switch", "end-effector reset", "scene reset"])
-def test_a_cut_keeps_the_other_side_out(kind):
+def test_a_cut_keeps_the_other_side_out():
     # Row 1 ends a segment; its bootstrap 6 is the value before the switch or reset, row 2 is another world.
     # delta_2 = 1 + .5 * 8 - 2 = 3; delta_1 = 0 + .5 * 6 - 4 = -1; delta_0 = 1 + .5 * 4 - 2 = 1
     # A_1 = -1, without .25 * A_2; A_0 = 1 + .25 * -1 = .75
