@@ -1,48 +1,88 @@
-"""docs/training.md names every flag of cronos-train, with the default that it has."""
+"""docs/training.md has a table for each group of cronos-train's flags, with every flag and the default it has.
 
-import json
+Those of `--record.*` are in docs/streams.md. PPO's own have no table.
+"""
+
 import re
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
+import pytest
+import yaml
+
+from cronos_lerobot.agents.imitation.config import ImitationConfig
+from cronos_lerobot.agents.ppo.config import SelfImitationConfig
+from cronos_lerobot.agents.steering.config import SteeringConfig
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.training.config import CronosTrainConfig, PeriodicEvaluationConfig
+from cronos_lerobot.training.record_config import RecordConfig
 
-DOCS = (Path(__file__).parents[2] / "docs/training.md").read_text()
-DOCUMENTED = {
-    flag.removeprefix("--"): default
-    for line in DOCS.splitlines()
-    if line.startswith("| `")
-    for cells in [line.strip("|").split("|")]
-    for flag, default in zip(re.findall(r"`([^`]+)`", cells[0]), [*cells[1].split(","), ""], strict=False)
+DOCS = Path(__file__).parents[2] / "docs"
+HEAD = "| flag | default | meaning |"
+TABLES = {
+    ("training", "The protocol", 0): (ProtocolConfig(), ""),
+    ("training", "The run", 0): (CronosTrainConfig(), "--"),
+    ("training", "The run", 1): (PeriodicEvaluationConfig(), "--eval."),
+    ("training", "Successes that are kept", 0): (SelfImitationConfig(), "--algorithm.self_imitation."),
+    ("training", "Imitation", 0): (ImitationConfig(), "--algorithm."),
+    ("training", "Steering", 0): (SteeringConfig(), "--algorithm."),
+    ("streams", "Record", 0): (RecordConfig(), "--record."),
 }
+"""By file, heading and number: the settings, and what is before their names in the table."""
+ELSEWHERE = {"protocol", "eval", "policy", "checkpoint_path"}
+"""Of the run: tables of their own, what is given by its path or type, and what is no flag."""
 
 
-def test_every_flag_has_its_default():
-    expected = {f.name: getattr(ProtocolConfig(), f.name) for f in fields(ProtocolConfig)}
-    critic = expected.pop("critic")
-    expected |= {f"critic.{f.name}": getattr(critic, f.name) for f in fields(critic)}
-    evaluation = PeriodicEvaluationConfig()
-    expected |= {f"eval.{f.name}": getattr(evaluation, f.name) for f in fields(PeriodicEvaluationConfig)}
-    config = CronosTrainConfig()
-    simple = (
-        "steps",
-        "num_envs",
-        "seed",
-        "save_freq",
-        "save_checkpoint",
-        "keep_checkpoints",
-        "resume",
-        "eval_freq",
-    )
-    expected |= {name: getattr(config, name) for name in (*simple, "log_freq", "tensorboard", "torch_threads")}
-    for name, value in expected.items():
-        text = value if isinstance(value, str) else json.dumps(value)
-        assert DOCUMENTED[name].strip(" `") == text, name
+def tables(page):
+    """The rows (flags, defaults) of a page's tables of flags, by heading and number under it."""
+    found, heading, rows = {}, "", None
+    for line in (DOCS / f"{page}.md").read_text().splitlines():
+        if line.startswith("#"):
+            heading = line.strip("# ")
+        elif line == HEAD:
+            number = sum(place[0] == heading for place in found)
+            rows = found[heading, number] = []
+        elif not line.startswith("|"):
+            rows = None
+        elif rows is not None and not line.startswith("|---"):
+            flags, defaults, *_ = line.strip("|").split("|")
+            rows.append((re.findall(r"`([^`]+)`", flags), [one.strip(" `") for one in defaults.split(", ")]))
+    return found
 
 
-def test_no_flag_is_left_out():
-    groups = {"protocol", "eval", "checkpoint_path"}  # the first two have tables of their own; the last is no flag
-    names = {field.name for field in fields(CronosTrainConfig)} - groups
-    documented = {re.split(r"[.]", flag)[0] for flag in DOCUMENTED}
-    assert names <= documented, names - documented
+def leaves(settings):
+    """Every setting, those of groups by dotted name."""
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        if is_dataclass(value):
+            yield from ((f"{field.name}.{name}", one) for name, one in leaves(value))
+        else:
+            yield field.name, value
+
+
+def says(text, value):
+    """Whether a cell of the column of defaults is this one; what holds in place of null has a <name> in it."""
+    if "<" in text:
+        return value is None
+    # YAML takes 3e-4 for a word.
+    said = float(text) if re.fullmatch(r"\d+e-\d+", text) else yaml.safe_load(text)
+    return str(value) == text or (said == value and isinstance(said, bool) == isinstance(value, bool))
+
+
+@pytest.mark.parametrize("place", TABLES, ids=lambda place: f"{place[1]}, {place[2]}")
+def test_every_flag_is_there_with_its_default(place):
+    settings, prefix = TABLES[place]
+    values, told = dict(leaves(settings)), []
+    for flags, defaults in tables(place[0])[place[1:]]:
+        assert all(flag.startswith(prefix) for flag in flags), flags
+        names = [flag.removeprefix(prefix) for flag in flags]
+        told += names
+        # All flags of a row may have the same.
+        for name, text in zip(names, defaults if len(defaults) > 1 else defaults * len(names), strict=True):
+            assert name.split(".")[0] in {field.name for field in fields(settings)}, name
+            if name in values:
+                assert says(text, values[name]), f"{name}: {text}, but it is {values[name]}"
+    assert len(told) == len(set(told))
+    groups = {name.removesuffix(".*") for name in told if name.endswith(".*")} | ELSEWHERE
+    missing = [name for name in values if name not in told and name.split(".")[0] not in groups]
+    assert not missing
