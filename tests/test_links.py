@@ -1,9 +1,12 @@
 """Links of the pages lead to files and headings that are there."""
 
 import re
+from itertools import chain
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+PAGES = ("*.md", "docs/*.md", "docs/results/**/*.md", "envs/**/README.md", "policies/**/README.md")
+"""Not the templates of cards, whose links are of the repositories that they are for."""
 
 
 def prose(page: Path) -> str:
@@ -19,7 +22,7 @@ def anchors(page: Path) -> set[str]:
 
 def test_links_lead_somewhere():
     broken, seen = [], 0
-    for page in (*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")):
+    for page in chain(*(ROOT.glob(pattern) for pattern in PAGES)):
         for link in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
             path, _, anchor = link.partition("#")
             if "://" in link:
@@ -27,6 +30,6 @@ def test_links_lead_somewhere():
             seen += 1
             target = page.parent / path if path else page
             if not target.exists() or (anchor and anchor not in anchors(target)):
-                broken.append(f"{page.name}: {link}")
+                broken.append(f"{page.relative_to(ROOT)}: {link}")
     assert seen > 300
     assert not broken
