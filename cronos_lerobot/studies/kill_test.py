@@ -194,7 +194,8 @@ class KillTest:
     def run(self, kills: int) -> Tally:
         """Kill, check and resume, then compare with a run that was never killed.
 
-        The first kill comes when there is a checkpoint, the others at random moments.
+        The first kill comes when there is a checkpoint, the second when a segment has ended that is not flushed,
+        which may take more than one, the others at random moments.
 
         Raises:
             KillTestError: a recording lost, tore or doubled something.
@@ -204,7 +205,9 @@ class KillTest:
         warm_up.start()
         warm_up.join()
         start = self._time_to_checkpoint()
-        for _ in range(kills - 1):
+        if kills > 1:
+            self._kill_unflushed()
+        while self.tally.kills < kills:
             self._kill_after(self._random.uniform(0.0, 1.5) * start)
             self._check()
         # A whole number of updates beyond what any of its lives has seen.
@@ -232,7 +235,19 @@ class KillTest:
             time.sleep(0.01)
         self._kill(process)
         self._check()
-        return time.monotonic() - start
+        return self._killed_at - start
+
+    def _kill_unflushed(self) -> None:
+        """Resume the run and kill it as soon as a segment has ended, until a kill has come before the flush."""
+        dropped = self.tally.segments_dropped
+        while self.tally.segments_dropped == dropped:
+            process = self._start(self.folder, 10**9)
+            while not any(line["time"] >= self._started_at for line in self._journal()):
+                if process.exitcode is not None:
+                    raise RuntimeError(f"the run ended by itself: {self.folder / 'run.log'}")
+                time.sleep(0.01)
+            self._kill(process)
+            self._check()
 
     def _kill_after(self, seconds: float) -> None:
         process = self._start(self.folder, 10**9)
@@ -255,7 +270,9 @@ class KillTest:
 
     def _journal(self) -> list[dict[str, Any]]:
         path = self.folder / "journal.jsonl"
-        return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+        # The last line may be half there.
+        whole = path.read_text().rpartition("\n")[0] if path.is_file() else ""
+        return [json.loads(line) for line in whole.splitlines()]
 
     def _check(self) -> None:
         """Check both recordings as the kill left them."""
