@@ -61,6 +61,9 @@ class AgentConfig(RLAlgorithmConfig):
         refuses them."""
         return {}
 
+    def check_reward(self, reward: str) -> None:
+        """Raise a ValueError, if the agent makes no sense of this `--protocol.reward`."""
+
     def check_start(self) -> None:
         """Raise a ValueError, if a run cannot begin so; one that is resumed goes on from what it has become."""
 
@@ -127,6 +130,13 @@ def check_settings(config: RLAlgorithmConfig, given: Iterable[str], *, resume: b
         value, default = map(attrgetter(name), (config, type(config)()))
         if value is not None and value != default:
             raise ValueError(f"--algorithm.{name}={value} has no effect here: it needs {unread[name]}.")
+
+
+def check_reward(config: Any, reward: str) -> None:
+    """Raise a ValueError, if the agent makes no sense of this `--protocol.reward`, as its config says."""
+    check = getattr(config, "check_reward", None)
+    if check is not None:
+        check(reward)
 
 
 def make_agent(context: AgentContext) -> LearningAgent:

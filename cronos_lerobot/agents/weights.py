@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from huggingface_hub import hf_hub_download
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.configs.default import PeftConfig
 from safetensors.torch import load_model
@@ -61,15 +62,26 @@ def _adapters_for(policy: Any, config: PeftConfig) -> Any:
         ) from error
 
 
-def train_in_float32(policy: Any) -> None:
+def train_in_float32(policy: Any, path: str | Path | None = None, revision: str | None = None) -> None:
     """Give what is trained of a policy float32, where the other layers bear it: SmolVLA's is made in bfloat16.
 
     What its network is built around is frozen, and stays as it is.
+
+    Args:
+        policy: just loaded, without adapters.
+        path: where it was loaded from, a folder or a repository, whose weights LeRobot has rounded.
+        revision: of the repository.
     """
-    if policy.config.type in MIXED:
-        for param in policy.parameters():
-            if param.requires_grad:
-                param.data = param.data.float()
+    if policy.config.type not in MIXED or is_wrapped(policy):
+        return
+    rounded = [param for param in policy.parameters() if param.requires_grad and param.dtype.itemsize < 4]
+    for param in rounded:
+        param.data = param.data.float()
+    if rounded and path:
+        file = Path(path) / SAFETENSORS_SINGLE_FILE
+        if not file.is_file():
+            file = Path(hf_hub_download(str(path), SAFETENSORS_SINGLE_FILE, revision=revision))
+        load_model(policy, str(file), strict=False)
 
 
 def check_precision(params: Iterable[torch.Tensor], config: Any, algorithm: str) -> None:

@@ -22,6 +22,7 @@ from cronos_lerobot.agents.chunk_player import make_player
 from cronos_lerobot.agents.history import ObservationHistory, observation_steps
 from cronos_lerobot.agents.processing import PolicyProcessors, make_processors, observation_columns
 from cronos_lerobot.agents.steering.steered import with_steering
+from cronos_lerobot.agents.weights import train_in_float32
 from cronos_lerobot.evaluation.policy_source import damage_named
 
 
@@ -209,6 +210,8 @@ def load_actor(
     renamed = rename_map or {}
     with damage_named(config.pretrained_path):
         policy: Any = make_policy(config, env_cfg=env, rename_map=renamed)
+        # As it was trained.
+        train_in_float32(policy, config.pretrained_path, config.pretrained_revision)
         processors = make_pre_post_processors(
             config,
             str(config.pretrained_path),

@@ -19,7 +19,7 @@ from lerobot_env_cronos.scene.scenes import BODIES, STEPS_PER_TASK
 from lerobot_env_cronos.simulation.gl import RenderingError
 
 from cronos_lerobot.hub import env_file
-from cronos_lerobot.hub.cards import render_card
+from cronos_lerobot.hub.cards import is_packaged, render_card
 from cronos_lerobot.hub.config import BenchmarkConfig
 from cronos_lerobot.hub.pictures import configuration_pictures, configuration_sheet, task_sheet
 from cronos_lerobot.hub.push import PublishError
@@ -127,6 +127,7 @@ def _card(benchmark: Benchmark, config: BenchmarkConfig, title: str) -> str:
         window_steps=STEPS_PER_TASK,
         has_pictures=config.pictures,
         has_env_hub=config.env_hub,
+        is_own_scene=not is_packaged(scene.name),
         is_packaged=benchmark.fingerprint == load_benchmark(None, scene.name).fingerprint,
         column_prefix=scene.bodies[0].replace(" ", "_"),
         chain_length=len(benchmark.groups("sequential", "train")[0].tasks),

@@ -6,6 +6,7 @@ import operator
 import os
 import shlex
 from collections.abc import Iterable
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,11 @@ def table(rows: Iterable[Iterable[Any]], *header: str) -> str:
     """A Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def is_packaged(scene: str) -> bool:
+    """Whether a scene comes with the package of the environments; any other is registered by somebody's module."""
+    return resources.files("lerobot_env_cronos").joinpath(f"data/{scene}.json").is_file()
 
 
 def describe_sampling(temperature: float | None) -> str:

@@ -12,6 +12,7 @@ from lerobot_env_cronos.scene.scenes import SCENES
 from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS
 
 from cronos_lerobot.evaluation.policy_env import observations_of, task_observation_of
+from cronos_lerobot.hub.cards import is_packaged
 
 DEFAULTS = {field.name: field.default for field in fields(CronosEnvConfig)}
 
@@ -32,7 +33,12 @@ def lerobot_eval_flags(
     wanted |= {"renderer": renderer} if renderer and "observation_height" in wanted else {}
     changed = {name: value for name, value in wanted.items() if value != DEFAULTS[name]}
     shown = ({"scene": scene} if scene else {}) | {"obs_type": wanted["obs_type"]} | changed
-    return ["--env.type=cronos", *(_flag(name, value) for name, value in shown.items())]
+    return [*_module_flags(scene), "--env.type=cronos", *(_flag(name, value) for name, value in shown.items())]
+
+
+def _module_flags(scene: str | None) -> list[str]:
+    """What a scene that does not come with the package takes."""
+    return [] if scene is None or is_packaged(scene) else ["--env.discover_packages_path=<module of the scene>"]
 
 
 def cronos_eval_flags(policy: dict[str, Any], env: dict[str, Any], scene: str | None) -> list[str]:
@@ -40,7 +46,8 @@ def cronos_eval_flags(policy: dict[str, Any], env: dict[str, Any], scene: str | 
     told = _task_observation(_features(policy), env, scene)
     shown = {"scene": scene} if scene and not env.get("scene") else {}
     shown |= {"task_observation": told} if told != DEFAULTS["task_observation"] else {}
-    return ["--env.type=cronos", *(_flag(name, value) for name, value in shown.items())] if shown else []
+    flags = ["--env.type=cronos", *(_flag(name, value) for name, value in shown.items())] if shown else []
+    return [*_module_flags(scene), *flags]
 
 
 def _flag(name: str, value: Any) -> str:

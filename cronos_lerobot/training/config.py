@@ -23,7 +23,7 @@ from lerobot_env_cronos.hub_config import is_of_this_package
 
 from cronos_lerobot.agents import builtin  # noqa: F401  (registers the agents)
 from cronos_lerobot.agents.ppo.config import PPOConfig
-from cronos_lerobot.agents.registry import check_agent, check_settings
+from cronos_lerobot.agents.registry import check_agent, check_reward, check_settings
 from cronos_lerobot.evaluation.policy_source import PINNED, load_policy_config, pin_policy
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.experts import check_expert
@@ -187,6 +187,7 @@ class CronosTrainConfig:
             self._check_unread()
             self._check_base()
         check_agent(self.algorithm.type)
+        check_reward(self.algorithm, self.protocol.reward)
         given = (flag.removeprefix("--").split("=")[0] for flag in parser.get_cli_overrides("algorithm") or [])
         check_settings(self.algorithm, given, resume=self.resume)
         self._pin_benchmark(self.env)

@@ -109,7 +109,7 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
         if config.peft is not None and not config.resume:
             check_adapters(loaded, policy_config)
         if config.peft is None:
-            train_in_float32(loaded)
+            train_in_float32(loaded, path, policy_config.pretrained_revision)
         policy = wrap(loaded, config.peft)
         if path is None:
             return policy, *make_pre_post_processors(policy_config)

@@ -105,6 +105,7 @@ def test_pages_are_drawn_anew_by_the_commands_beside_the_archives():
         "table1",
         "few_resets",
         "few_resets",
+        "few_resets",
         "few_resets_kitchen_3x3",
         "few_resets_playroom_2x2",
         "few_resets_best",

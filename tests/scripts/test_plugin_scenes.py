@@ -6,6 +6,7 @@ import sys
 import pytest
 from forked_commands import run_forked
 
+from cronos_lerobot.hub.eval_flags import lerobot_eval_flags
 from cronos_lerobot.scripts import streams
 
 PLUGIN = """
@@ -63,3 +64,21 @@ def test_a_command_imports_installed_plugins_before_it_looks_for_a_scene(tmp_pat
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
     done = run_forked([sys.executable, "-c", CODE.format(module=module)], env=environment, check=True)
     assert "study_1x1" in done.stdout.rpartition("scenes:")[2].split()
+
+
+def test_the_cards_of_a_scene_of_ones_own_name_its_module(tmp_path):
+    (tmp_path / "my_scenes.py").write_text(PLUGIN)
+    publish = [
+        "cronos-publish", "benchmark", "--discover_packages_path=my_scenes", "--scene=study_1x1",
+        "--repo_id=me/study", "--pictures=false", "--dry_run=true", f"--output_dir={tmp_path / 'out'}",
+    ]  # fmt: skip
+    run_forked(publish, env=os.environ | {"PYTHONPATH": str(tmp_path)}, check=True)
+    card = (tmp_path / "out/README.md").read_text()
+    assert "The scene is none of the package's: it takes the module that registers it." in card
+    assert (
+        "lerobot-eval --policy.path=<policy> --env.discover_packages_path=<its module> --env.type=cronos" in card
+    )
+    assert "import <its module>  # that registers study_1x1\n\nenvs = make_env(" in card
+    flags = lerobot_eval_flags({}, {}, "study_1x1")
+    assert flags[:2] == ["--env.discover_packages_path=<module of the scene>", "--env.type=cronos"]
+    assert lerobot_eval_flags({}, {}, "kitchen_3x3")[0] == "--env.type=cronos"

@@ -35,8 +35,12 @@ def test_it_learns_from_pixels_and_is_a_lerobot_policy(kind, tmp_path, monkeypat
     with tiny_gemma(), tokenizer_from(tokenizer):
         clone = save_policy(tmp_path / "clone", kind, PIXELS, **SIZES)
     use_tokenizer(clone, tokenizer)
+    flags = (f"--policy.path={clone}", *VLA_FLAGS, "--steps=40", f"--output_dir={run}")
     with tiny_gemma():
-        cronos_train(monkeypatch, f"--policy.path={clone}", *VLA_FLAGS, "--steps=40", f"--output_dir={run}")
+        refused = pytest.raises(SystemExit, match=r"checkpointing=true has no effect in PPO.*minibatch_size")
+        with refused:
+            cronos_train(monkeypatch, *flags, "--policy.gradient_checkpointing=true")
+        cronos_train(monkeypatch, *flags)
     updates = [line["agent"] for line in metrics(run) if line["kind"] == "update"]
     assert len(updates) == 2
     assert all(update["policy_grad_norm"] > 0 for update in updates)

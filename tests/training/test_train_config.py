@@ -113,6 +113,15 @@ def test_steps_are_rounded_up_to_whole_updates():
         (["--steps=0"], "steps must be >= 1"),
         (["--eval.n_episodes=0"], "eval.n_episodes must be >= 1, got 0"),
         (["--eval.split=test"], "held_out"),
+        (
+            [
+                "--env.type=cronos",
+                "--algorithm.type=imitation",
+                "--algorithm.weighting=return",
+                "--protocol.reward=level",
+            ],
+            "weighting=return with --protocol.reward=level would weigh late successes most",
+        ),
         (["--protocol.update_interval=100"], "multiple of protocol.task_switch_interval=80"),
         (["--protocol.curriculum=[[null,320]]"], "must have increasing until_steps > 0"),
         (["--protocol.extra_resets=[nobody]"], "registered"),

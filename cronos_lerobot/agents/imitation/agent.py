@@ -112,14 +112,14 @@ class ImitationAgent(LearningAgent):
             self.memory.add(segment)
 
     def update(self) -> dict[str, float]:
-        """Take the update's optimizer steps, once there are enough successes."""
+        """Take the update's optimizer steps, once there are enough successes or if there are demonstrations."""
         memory = self.memory
         successes = sum(segment.success for segment in memory.segments)
         found = self._processes.concatenate(np.array([[successes, memory.num_frames, len(memory)]]))
         metrics = {"segments": float(found[:, 0].sum()), "frames": float(found[:, 1].sum())}
         metrics |= self._weigh()
         # Failed segments that are remembered may push successes out again.
-        self._is_warm |= bool(found[:, 0].sum() >= self.config.warmup_segments)
+        self._is_warm |= self._demos is not None or bool(found[:, 0].sum() >= self.config.warmup_segments)
         self._has_success = bool(found[:, 0].any())
         # All processes take a step, or none; one that has nothing to clone takes that of the others.
         shares = self._shares(found[:, 2] > 0)

@@ -57,7 +57,8 @@ class ImitationConfig(RLAlgorithmConfig):
     """The policy that acts, is evaluated and saved is an average of the trained weights over about
     1 / (1 - ema_decay) optimizer steps; 0 is the trained weights themselves, and saves the memory of a copy."""
     warmup_segments: int = 32
-    """Successful segments, of all processes together, before the first optimizer step."""
+    """Successful segments, of all processes together, before the first optimizer step; none where demonstrations
+    are cloned, too."""
     tail_steps: int = 4
     """Control steps of a segment that are kept after its first success."""
     memory_gib: float = 4.0
@@ -106,6 +107,14 @@ class ImitationConfig(RLAlgorithmConfig):
         if self.weighting != "advantage":
             needs["max_weight"] = "--algorithm.weighting=advantage"
         return needs
+
+    def check_reward(self, reward: str) -> None:
+        """A success is remembered only until shortly after it, and `level` pays for all the time after."""
+        if self.weighting != "none" and reward == "level":
+            raise ValueError(
+                f"--algorithm.weighting={self.weighting} with --protocol.reward=level would weigh late successes"
+                " most, which lose less of their reward: give --protocol.reward=difference."
+            )
 
     @classmethod
     def from_policy_config(cls, policy_cfg: Any) -> ImitationConfig:

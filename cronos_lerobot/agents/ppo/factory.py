@@ -56,6 +56,12 @@ def _check_followed(policy: Any, config: Any, options: AdapterOptions) -> None:
                 f"--algorithm.{name}={given} is not for --policy.type={policy.config.type}, which "
                 + (f"reads {' and '.join(sorted(read))}." if read else "has no adapter that would read it.")
             )
+    if isinstance(policy, Adapter) and getattr(policy.config, "gradient_checkpointing", False):
+        raise ValueError(
+            "--policy.gradient_checkpointing=true has no effect in PPO, which learns from policies as they act, "
+            f"and LeRobot's {policy.config.type} computes anew only in training mode: give a smaller "
+            "--algorithm.minibatch_size, with --algorithm.grad_accumulation."
+        )
     if config.entropy_coef and not getattr(policy, "has_entropy", True):
         raise ValueError(
             f"--algorithm.entropy_coef={config.entropy_coef}: no entropy is known of what "
