@@ -1,21 +1,15 @@
-"""Shared by all tests: the OpenGL platform is chosen before any test imports mujoco."""
+"""Shared by all tests: what each process of pytest does before it looks for them."""
 
-import email
-import inspect
-from functools import cache
-from importlib import metadata
-from types import SimpleNamespace
-
-import lerobot_env_cronos  # noqa: F401
-from draccus.wrappers import docstring, field_wrapper
-
-# For each command line Draccus reads the source of every field's class and the signature of every action anew, and
-# LeRobot, which looks for plugins, what every installed package says of itself: most of a test's second.
-docstring.get_attribute_docstring = cache(docstring.get_attribute_docstring)
-field_wrapper.inspect = SimpleNamespace(getfullargspec=cache(inspect.getfullargspec))
-metadata.email = SimpleNamespace(message_from_string=cache(email.message_from_string))
+import importlib
 
 LONGEST = ("test_wheels.py", "test_demo.py", "test_cronos_reproduce.py", "test_slurm.py", "test_distributed.py")
+
+
+def pytest_configure(config):
+    """The OpenGL platform is chosen before any test imports mujoco; who only hands tests to workers needs none."""
+    if config.getoption("dist", "no") == "no":
+        importlib.import_module("lerobot_env_cronos")
+        importlib.import_module("faster")
 
 
 def pytest_collection_modifyitems(items):

@@ -24,6 +24,10 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import IO, Any
 
+import faster  # noqa: F401
+from draccus.argparsing import ArgumentParser
+from lerobot.configs.train import TrainPipelineConfig
+
 PRELOADED = (
     "lerobot.scripts.lerobot_train", "lerobot.scripts.lerobot_eval", "lerobot.rl.algorithms.configs",
     "lerobot.policies.act.modeling_act", "lerobot.policies.diffusion.modeling_diffusion",
@@ -144,6 +148,8 @@ def _run_child(request: dict[str, Any], outputs: Sequence[int]) -> None:
 def _serve() -> None:
     for module in PRELOADED:
         importlib.import_module(module)
+    # What it has read of LeRobot's configs, no child reads again.
+    ArgumentParser(config_class=TrainPipelineConfig)
     assert not [name for name in sys.modules if name.startswith(OURS)]
     # The thread is PyArrow's allocator's, which is made for forks.
     warnings.filterwarnings("ignore", ".*multi-threaded, use of fork", DeprecationWarning)

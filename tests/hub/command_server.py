@@ -17,6 +17,7 @@ import traceback
 from pathlib import Path
 from typing import Any
 
+from draccus.argparsing import ArgumentParser
 from lerobot.utils.import_utils import register_third_party_plugins
 
 MAINS = {
@@ -27,8 +28,8 @@ MAINS = {
     "lerobot-eval": "lerobot.scripts.lerobot_eval",
 }
 PRELOADED = (
-    *MAINS.values(), "cronos_lerobot.hub.benchmark", "cronos_lerobot.hub.policy", "cronos_lerobot.hub.streams",
-    "cronos_lerobot.hub.results", "lerobot_policy_pocketvla", "datasets",
+    "faster", *MAINS.values(), "cronos_lerobot.hub.benchmark", "cronos_lerobot.hub.policy",
+    "cronos_lerobot.hub.streams", "cronos_lerobot.hub.results", "lerobot_policy_pocketvla", "datasets",
 )  # fmt: skip
 
 
@@ -68,9 +69,12 @@ def run_child(request: dict[str, Any], output: int) -> None:
 
 def main() -> None:
     """Serve until the input ends."""
+    sys.path.append(str(Path(__file__).parents[1]))
     for module in PRELOADED:
         importlib.import_module(module)
     register_third_party_plugins()
+    # What it has read of the configs, no child reads again.
+    ArgumentParser(config_class=importlib.import_module("cronos_lerobot.training.config").CronosTrainConfig)
     print("ready", flush=True)
     for line in sys.stdin:
         request = json.loads(line)

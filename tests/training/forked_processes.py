@@ -10,6 +10,7 @@ import traceback
 from pathlib import Path
 
 import cloudpickle
+import faster  # noqa: F401
 import numpy as np
 import pytest
 import torch
