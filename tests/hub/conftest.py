@@ -78,9 +78,9 @@ class Commands:
         self._server.wait()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def served() -> Iterator[Hub]:
-    """A Hub for all tests of a module."""
+    """A Hub for all tests, each file with repositories of its own."""
     hub, server = serve()
     yield hub
     server.shutdown()
@@ -94,7 +94,7 @@ def hub(served: Hub) -> Iterator[Hub]:
     served.faults = Faults()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def commands(served: Hub, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Commands]:
     """Commands against the Hub."""
     running = Commands(served, tmp_path_factory.mktemp("home") / "huggingface")

@@ -51,23 +51,24 @@ def commits(served, commands):
     """Two benchmarks of one name, one after the other: commits of the dataset and of the model repository, tag."""
     found = []
     for seed in (5, 6):
-        output = commands.run("cronos-publish", "benchmark", "--repo_id=me/bench", *SMALL, f"--seed={seed}")
-        assert f"{served.url}/datasets/me/bench\n{served.url}/me/bench\n" in output
-        tag = re.search(r"me/bench@(benchmark-[0-9a-f]{16}) is this benchmark", output)[1]
-        found.append([served.repositories[kind, "me/bench"].branches["main"] for kind in ("datasets", "models")])
-        assert [served.repositories[kind, "me/bench"].tags[tag] for kind in ("datasets", "models")] == found[-1]
+        output = commands.run("cronos-publish", "benchmark", "--repo_id=me/env_bench", *SMALL, f"--seed={seed}")
+        assert f"{served.url}/datasets/me/env_bench\n{served.url}/me/env_bench\n" in output
+        tag = re.search(r"me/env_bench@(benchmark-[0-9a-f]{16}) is this benchmark", output)[1]
+        both = [served.repositories[kind, "me/env_bench"] for kind in ("datasets", "models")]
+        found.append([repository.branches["main"] for repository in both])
+        assert [repository.tags[tag] for repository in both] == found[-1]
         found[-1].append(tag)
     return found
 
 
 def test_it_gives_the_environments_of_the_repository_at_that_revision(commits, hub, commands):
     (_, old, tag), (data, _, _) = commits
-    assert hub.tree("models", "me/bench") == hub.tree("datasets", "me/bench")
+    assert hub.tree("models", "me/env_bench") == hub.tree("datasets", "me/env_bench")
     commands.forget()
     code = f"""{SAME}
-old, new = of_the_hub("me/bench@{old}"), of_the_hub("me/bench")
-tagged = of_the_data("me/bench@{tag}"), of_the_hub("me/bench@{tag}")
-are_same = (old, old) == tagged, new == of_the_data("me/bench@{data}"), old == new
+old, new = of_the_hub("me/env_bench@{old}"), of_the_hub("me/env_bench")
+tagged = of_the_data("me/env_bench@{tag}"), of_the_hub("me/env_bench@{tag}")
+are_same = (old, old) == tagged, new == of_the_data("me/env_bench@{data}"), old == new
 print(json.dumps([sorted(new), *are_same]))
 """
     names, old_is_old, new_is_new, is_same = json.loads(commands.run("python", code).splitlines()[-1])
@@ -83,7 +84,7 @@ print(json.dumps([sorted(new), *are_same]))
 def test_its_name_is_enough_but_for_trust(commits, hub, commands):
     code = """
 from lerobot.envs import make_env
-envs = make_env("me/bench", n_envs=3, trust_remote_code=True)
+envs = make_env("me/env_bench", n_envs=3, trust_remote_code=True)
 print([(suite, len(some)) for suite, some in sorted(envs.items())], envs["independent_train"][0].num_envs)
 """
     expected = "('independent_train', 4), ('sequential_held_out', 2), ('sequential_train', 2)] 3"
@@ -98,7 +99,7 @@ def test_without_the_plugin_a_sentence_says_what_to_install(commits, commands):
 import sys
 sys.modules["lerobot_env_cronos"] = None
 from lerobot.envs import make_env
-make_env("me/bench", trust_remote_code=True)
+make_env("me/env_bench", trust_remote_code=True)
 """
     outcome = commands.try_("python", code)
     assert outcome.code == 1
