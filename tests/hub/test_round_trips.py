@@ -104,7 +104,7 @@ def test_lerobot_eval_runs_the_benchmark_from_the_hub(bench, policy, commands, t
         "lerobot-eval", f"--policy.path={policy}", "--policy.device=cpu", "--env.type=cronos",
         "--env.benchmark=me/bench@main", "--env.suite=sequential", "--env.split=held_out", "--env.task=1",
         "--env.observation_height=32", "--env.observation_width=32", "--eval.n_episodes=2", "--eval.batch_size=2",
-        f"--output_dir={tmp_path / 'eval'}",
+        "--env.render_size=[32, 32]", f"--output_dir={tmp_path / 'eval'}",
     )  # fmt: skip
     info = json.loads((tmp_path / "eval/eval_info.json").read_text())
     assert [(task["task_group"], task["task_id"]) for task in info["per_task"]] == [("sequential_held_out", 1)]
@@ -131,7 +131,7 @@ def test_lerobot_eval_runs_the_repositorys_own_code(bench, policy, commands, tmp
     flags = (
         f"--policy.path={policy}", "--policy.device=cpu", *hub_env,
         "--env.suite=sequential", "--env.split=held_out", "--env.task=1", "--env.observation_height=32",
-        "--env.observation_width=32", "--eval.n_episodes=2", "--eval.batch_size=2",
+        "--env.observation_width=32", "--env.render_size=[32, 32]", "--eval.n_episodes=2", "--eval.batch_size=2",
     )  # fmt: skip
     refused = commands.try_("lerobot-eval", *flags, f"--output_dir={tmp_path / 'refused'}")
     assert refused.code == 1
