@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, get_scene
+from lerobot_env_cronos.benchmark.command_line import find_scene
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.simulation.rendering import RENDERERS
 from lerobot_env_cronos.simulation.simulation import Simulation
@@ -190,6 +191,7 @@ def main() -> None:
     parser.add_argument("--reference", type=float, help="another bound [steps/s], for one more ratio in `train`")
     args = parser.parse_args()
     register_third_party_plugins()
+    find_scene(parser, args.scene)
     print(f"{args.num_envs} streams of {args.scene}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
     bound = physics_rate(args.num_envs, args.scene, args.seconds)
     print(f"{'pure physics (bound)':28s} {bound:8.0f} steps/s  1.00")

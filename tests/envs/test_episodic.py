@@ -1,5 +1,6 @@
 """Evaluation episodes, Gymnasium's checker, and LeRobot's plugin interface."""
 
+import re
 import warnings
 
 import gymnasium as gym
@@ -97,13 +98,36 @@ def test_policy_features_match_what_the_env_observes():
         ("fps", 30),
         ("num_threads", -3),
         ("observation_height", -1),
+        ("camera_name", "sideways"),
+        ("render_size", (0, 640)),
+        ("render_size", (480, -640)),
+        ("render_size", (480,)),
+        ("render_size", (480, 640, 3)),
     ],
 )
 def test_config_errors_name_the_bad_value(field, value, caplog):
-    with pytest.raises(ValueError, match=str(value)):
+    with pytest.raises(ValueError, match=re.escape(str(value))):
         CronosEnvConfig(**{field: value})
     # draccus hides the exception's text from command lines, so it is logged as well.
     assert str(value) in caplog.text
+
+
+@pytest.mark.parametrize("obs_type", ["pixels_agent_pos", STATE])
+def test_every_camera_is_looked_up_when_the_config_is_made(obs_type):
+    """Videos are drawn from the first one, whatever the policy sees."""
+    CronosEnvConfig(camera_name="bridge, front", obs_type=obs_type)
+    with pytest.raises(ValueError, match=r"unknown env.camera_name 'side'; valid values: \['front', 'bridge'\]"):
+        CronosEnvConfig(camera_name="front,side", obs_type=obs_type)
+
+
+@pytest.mark.parametrize("chained", [{"advance": "on_success"}, {"end_effector_reset": True}])
+def test_a_warning_says_that_single_tasks_follow_no_flags_of_chains(chained, caplog):
+    CronosEnvConfig(suite="sequential", **chained).create_envs(1)
+    CronosEnvConfig().create_envs(1)
+    assert not caplog.records
+    CronosEnvConfig(**chained).create_envs(1)
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "are of chains, --env.suite=sequential: --env.suite=independent does not" in caplog.text
 
 
 def test_a_diverged_step_is_no_success_whatever_it_shows(monkeypatch):

@@ -17,7 +17,10 @@ from lerobot_env_cronos.benchmark.configurations import (
 )
 from lerobot_env_cronos.expert.ceiling import run_segment
 from lerobot_env_cronos.expert.expert import ScriptedExpert
+from lerobot_env_cronos.scene.bodies import SHAPES
+from lerobot_env_cronos.scene.model import build_model
 from lerobot_env_cronos.scene.scenes import BODIES
+from lerobot_env_cronos.scene.visuals.objects import LOOKS
 
 BLOCK = Body("red block", (0.03, 0.03, 0.03), 600, "box", (0.8, 0.1, 0.1))
 COASTER = Body("blue coaster", (0.09, 0.09, 0.005), 900, "disc", (0.1, 0.3, 0.8))
@@ -94,6 +97,25 @@ def test_plain_bodies_have_mass_and_colour_and_can_be_placed():
     assert run_segment(env, ScriptedExpert(env).act, stop_early=True).mean() >= 0.9
 
 
+def test_a_shape_of_ones_own_may_have_a_colour(monkeypatch):
+    monkeypatch.setitem(SHAPES, "brick", SHAPES["box"])
+    monkeypatch.setitem(LOOKS, "brick", lambda spec, spec_body, body: LOOKS["box"](spec, spec_body, body))
+    register_scene(SCENE, bodies=[replace(BLOCK, shape="brick"), COASTER])
+    with pytest.raises(ValueError, match=r"shapes that take one: \['box', 'brick', 'disc'\]"):
+        register_scene(replace(SCENE, name="other"), bodies=[replace(BLOCK, name="blue block", shape="bear")])
+
+
+def test_bodies_may_be_named_like_parts_of_others_and_of_the_room():
+    """All of them are drawn, each once."""
+    names = ("ketchup bottle cap", "ketchup bottle label", "room", "table edge", "gripper_link arm")
+    bodies = [replace(BLOCK, name=name, size=(0.02, 0.02, 0.02)) for name in names]
+    register_scene(replace(SCENE, objects=("ketchup bottle", *names)), bodies=[*bodies, COASTER])
+    model = build_model(SCENES["study_2x1"])
+    for name in names:
+        material = model.geom(f"{name} visual").matid[0]
+        np.testing.assert_allclose(model.mat_rgba[material], [0.8, 0.1, 0.1, 1.0], atol=1e-6)
+
+
 def test_registering_again_changes_nothing():
     register_scene(SCENE, bodies=[BLOCK, COASTER])
     before = dict(SCENES), dict(BODIES)
@@ -133,8 +155,16 @@ def test_registering_again_changes_nothing():
             [COASTER],
             "cloth is an object, 110 mm wide where it is narrowest; the",
         ),
-        (SCENE, [replace(BLOCK, size=(0.06, 0.06, 0.05), shape="cloth"), COASTER], "red block is .* 60 mm wide"),
-        (SCENE, [replace(BLOCK, size=(0.08, 0.08, 0.06), shape="bear"), COASTER], "red block is .* 60 mm wide"),
+        (
+            SCENE,
+            [replace(BLOCK, size=(0.06, 0.06, 0.05), shape="cloth", colour=None), COASTER],
+            "red block is .* 60 mm wide",
+        ),
+        (
+            SCENE,
+            [replace(BLOCK, size=(0.08, 0.08, 0.06), shape="bear", colour=None), COASTER],
+            "red block is .* 60 mm wide",
+        ),
         (
             replace(SCENE, objects=("red block", "red_block")),
             [BLOCK, COASTER, replace(BLOCK, name="red_block")],
@@ -144,6 +174,29 @@ def test_registering_again_changes_nothing():
             SCENE,
             [replace(BLOCK, colour=(255, 0, 0)), COASTER],
             r"colour of the red block must be .* \(255, ",
+        ),
+        (SCENE, [replace(BLOCK, colour=(0.1, 0.2)), COASTER], "colour of the red block must be"),
+        (
+            SCENE,
+            [replace(BLOCK, shape="bottle"), COASTER],
+            r"red block is a bottle, which has colours of its own: .* take one: \['box', 'disc'\]",
+        ),
+        (
+            SCENE,
+            [replace(BLOCK, size=(0.03, 0.03)), COASTER],
+            r"must be positive and finite, .* got \(0.03, 0.03\)",
+        ),
+        (SCENE, [replace(BLOCK, size=(0.03, np.nan, 0.03)), COASTER], "red block must be positive and finite"),
+        (SCENE, [replace(BLOCK, size=0.03), COASTER], "red block must be positive and finite, .* got 0.03, 600"),
+        (SCENE, [replace(BLOCK, density=np.inf), COASTER], "red block must be positive and finite, .* inf"),
+        (SCENE, [replace(BLOCK, density="600"), COASTER], "red block must be positive and finite"),
+        (SCENE, [replace(BLOCK, name=" "), COASTER], "a body needs a name, .* got ' '"),
+        (SCENE, [replace(BLOCK, name="red/block"), COASTER], "a body needs a name, without a slash.*'red/block'"),
+        (SCENE, [replace(BLOCK, name="world"), COASTER], "a body cannot be named 'world'"),
+        (
+            replace(SCENE, spawn_low=(0.2, -0.25)),
+            [BLOCK, COASTER],
+            r"in a corner of \(0.2, -0.25\) to .* would not see the middle of the red block.*0.17 to 0.42",
         ),
     ],
 )
@@ -195,7 +248,7 @@ def test_bodies_that_do_not_fit_are_an_error(monkeypatch):
 
 def test_an_object_may_be_wide_where_it_is_not_held():
     """A bottle of 70 mm by its neck, 0.55 of that."""
-    register_scene(SCENE, [replace(BLOCK, size=(0.07, 0.12, 0.03), shape="bottle"), COASTER])
+    register_scene(SCENE, [replace(BLOCK, size=(0.07, 0.12, 0.03), shape="bottle", colour=None), COASTER])
     assert "study_2x1" in SCENES
 
 

@@ -13,8 +13,8 @@ from lerobot_env_cronos.expert.ceiling import has_lost_body, measure_reset_free,
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.scene.robot import HOME_QPOS
 from lerobot_env_cronos.scene.scenes import BODIES
+from lerobot_env_cronos.scene.view import is_in_view
 from lerobot_env_cronos.simulation.kinematics import forward_kinematics, inverse_kinematics
-from lerobot_env_cronos.simulation.workspace import is_in_view
 
 # kitchen_2x2 has tests of its own, on all configurations: test_expert.py.
 NEW_SCENES = ("kitchen_3x3", "playroom_2x2")

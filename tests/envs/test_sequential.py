@@ -216,6 +216,14 @@ def test_a_task_chooses_one_ordering():
     assert list(cfg.create_envs(1)["sequential_train"]) == [7]
 
 
+def test_a_mask_starts_no_chain():
+    env = SequentialVectorEnv(2, "kitchen_2x2", ordering=TASKS, obs_type=STATE)
+    with pytest.raises(ValueError, match=r"ids must be integers in 0\.\.1, rising.*np\.flatnonzero"):
+        env.start(np.array([True, False]), [TASKS[:1], TASKS[:1]], np.zeros(2, dtype=int))
+    assert env.done.all()
+    assert env._orderings == [tuple(TASKS)] * 2
+
+
 @pytest.mark.parametrize("scene", SCENES)
 def test_every_scene_has_its_chains(scene):
     cfg = CronosEnvConfig(scene=scene, suite="sequential", task="9", obs_type=STATE)

@@ -278,6 +278,40 @@ def test_errors_name_the_bad_value_and_the_valid_ones(kwargs, message):
         make(1).set_task([0], [Task("banana", PLATE)])
 
 
+INTERVENTIONS = {
+    "set_task": lambda env, ids: env.set_task(ids, [env.scene.tasks[1]] * len(ids)),
+    "observe": lambda env, ids: env.observe(ids),
+    "scene_reset": lambda env, ids: env.scene_reset(ids, np.zeros(len(ids), dtype=int)),
+    "place_bodies": lambda env, ids: env.place_bodies(ids, env.simulation.body_poses()[: len(ids)].copy()),
+    "end_effector_reset": lambda env, ids: env.end_effector_reset(ids),
+    "step_streams": lambda env, ids: env.step_streams(np.tile(STILL, (3, 1)), ids),
+}
+ANY_ORDER = ("set_task", "observe")
+
+
+@pytest.mark.parametrize("name", INTERVENTIONS)
+def test_ids_that_are_none_are_refused_and_change_nothing(name):
+    env = make(3)
+    env.reset(seed=0)
+    intervene, before, tasks = INTERVENTIONS[name], env.get_state(), list(env.tasks)
+    bad = [np.array([True, False, True]), [0.0, 1.0], [-1, 0], [0, 3], [[0], [1]]]
+    for ids in bad if name in ANY_ORDER else [*bad, [2, 1], np.array([1, 1])]:
+        with pytest.raises(ValueError, match=r"ids must be integers in 0\.\.2.*np\.flatnonzero\(mask\)"):
+            intervene(env, ids)
+    assert env.tasks == tasks
+    for key, value in env.get_state().items():
+        np.testing.assert_array_equal(value, before[key])
+    for ids in ([], np.array([], dtype=int), range(2), [0, 2], np.flatnonzero([True, False, True])):
+        intervene(env, ids)
+
+
+def test_a_body_is_put_back_in_a_stream_that_there_is():
+    env = make(2)
+    for stream in (2, -1, True):
+        with pytest.raises(ValueError, match=r"ids must be integers in 0\.\.1"):
+            env.put_back(stream, BOTTLE, np.random.default_rng(0))
+
+
 def test_no_stream_gets_its_task_where_one_is_unknown():
     env = make(2)
     env.reset(seed=0)

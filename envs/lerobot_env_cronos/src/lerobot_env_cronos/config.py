@@ -17,6 +17,7 @@ from lerobot_env_cronos.benchmark.configurations import SPLITS
 from lerobot_env_cronos.benchmark.load import benchmark_scene, load_benchmark
 from lerobot_env_cronos.benchmark.version import gymnasium_id
 from lerobot_env_cronos.episodic import EpisodicVectorEnv, IndependentVectorEnv, LazyVectorEnv
+from lerobot_env_cronos.scene.model import CAMERAS
 from lerobot_env_cronos.scene.scenes import CONTROL_HZ, get_scene
 from lerobot_env_cronos.sequential import ADVANCES, SequentialVectorEnv
 from lerobot_env_cronos.simulation.observations import (
@@ -53,9 +54,10 @@ class CronosEnvConfig(EnvConfig):
     """A benchmark of its author's own configurations and chains: <owner>/<repository>[@<revision>] of a dataset on
     the Hub, or a folder; null for this package's."""
     advance: str = "window"
-    """When a chain goes on to its next task: window (when the 80 steps are over) or on_success (at once)."""
+    """When a chain (--env.suite=sequential) goes on to its next task: window (when the 80 steps are over) or
+    on_success (at once)."""
     end_effector_reset: bool = False
-    """Send the arm home between the tasks of a chain."""
+    """Send the arm home between the tasks of a chain (--env.suite=sequential)."""
     obs_type: str = "pixels_agent_pos"
     """pixels_agent_pos, or environment_state_agent_pos for the privileged state in place of pixels."""
     task_observation: str = "none"
@@ -97,10 +99,15 @@ class CronosEnvConfig(EnvConfig):
         _check("obs_type", self.obs_type, OBS_TYPES)
         _check("renderer", self.renderer, RENDERERS)
         _check("task_observation", self.task_observation, TASK_OBSERVATIONS)
+        cameras = parse_camera_names(self.camera_name)
+        for camera in cameras:
+            _check("camera_name", camera, tuple(CAMERAS))
         if self.fps != CONTROL_HZ:
             raise ValueError(f"env.fps is fixed at {CONTROL_HZ} Hz by the protocol, got {self.fps}")
         if self.num_threads < 0:
             raise ValueError(f"env.num_threads must be at least 0 (all cores), got {self.num_threads}")
+        if len(self.render_size) != 2:
+            raise ValueError(f"env.render_size must be two numbers, height and width, got {self.render_size}")
         if min(self.observation_height, self.observation_width, *self.render_size) < 1:
             sizes = f"{self.observation_height} x {self.observation_width} and {tuple(self.render_size)}"
             raise ValueError(
@@ -117,7 +124,7 @@ class CronosEnvConfig(EnvConfig):
             size = len(environment_state_names(scene))
             self.features["environment_state"] = PolicyFeature(FeatureType.ENV, (size,))
             self.features_map["environment_state"] = OBS_ENV_STATE
-        for camera in parse_camera_names(self.camera_name) if pixels else []:
+        for camera in cameras if pixels else []:
             key = f"{OBS_IMAGES}.{camera}"
             shape = (self.observation_height, self.observation_width, 3)
             self.features[key] = PolicyFeature(FeatureType.VISUAL, shape)
@@ -145,6 +152,11 @@ class CronosEnvConfig(EnvConfig):
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """One native vector env per task or ordering, built lazily; `use_async_envs` is not needed and ignored."""
+        if self.suite == "independent" and (self.advance != "window" or self.end_effector_reset):
+            logging.getLogger(__name__).warning(
+                "--env.advance and --env.end_effector_reset are of chains, --env.suite=sequential: "
+                "--env.suite=independent does not follow them"
+            )
         makers = {i: self._maker(n_envs, chosen) for i, chosen in self._chosen().items()}
         envs: dict[int, gym.vector.VectorEnv] = {i: LazyVectorEnv(make, n_envs) for i, make in makers.items()}
         return {f"{self.suite}_{self.split}": envs}

@@ -121,11 +121,15 @@ class SequentialVectorEnv(EpisodicVectorEnv):
             ids: (k,) environments.
             orderings: the k chains' tasks, of any length above 0.
             configurations: (k,) indices into the split.
+
+        Raises:
+            ValueError: there is no such environment or configuration, or `ids` do not rise.
         """
         ids = np.asarray(ids)
+        # First of all, because it refuses what are no environments.
+        self.scene_reset(ids, configurations, self.split)
         for i, ordering in zip(ids, orderings, strict=True):
             self._orderings[i] = tuple(ordering)
-        self.scene_reset(ids, configurations, self.split)
         self.set_task(ids, [ordering[0] for ordering in orderings])
         self.done[ids] = self._is_complete[ids] = False
         self.chain_length[ids] = self.position[ids] = self._elapsed[ids] = 0

@@ -147,6 +147,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
 
         Returns the reward (n,) and `diverged` (n,); `is_success` and `is_grasped` are attributes.
         """
+        ids = self._check_ids(ids, rising=True)
         actions = np.asarray(actions, dtype=np.float64)
         if actions.shape != (self.num_envs, 7):
             raise ValueError(f"actions must have shape ({self.num_envs}, 7), got {actions.shape}")
@@ -164,7 +165,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
     def observe(self, ids: np.ndarray | None = None) -> dict[str, Any]:
         """The observation now, under the current tasks: of all streams, or with one row for each of `ids`."""
         with self.timer("observe"):
-            chosen = self._all if ids is None else np.asarray(ids)
+            chosen = self._all if ids is None else self._check_ids(ids)
             return self._observations.observe(chosen, [self.tasks[i] for i in chosen])
 
     def observe_under(self, tasks: Sequence[Task]) -> list[dict[str, Any]]:
@@ -196,11 +197,32 @@ class CronosVectorEnv(gym.vector.VectorEnv):
 
     # Interventions ----------------------------------------------------------------------------------------
 
+    def _check_ids(self, ids: Iterable[int], rising: bool = False) -> np.ndarray:
+        """Return `ids` as an array (k,) of integers.
+
+        Raises:
+            ValueError: they are no numbers of streams; a mask, say, which would count as streams 0 and 1. Or they
+                are not `rising`, each once, where MuJoCo needs them so.
+        """
+        ids = np.asarray(ids)
+        if ids is self._all:
+            return ids
+        if ids.shape == (0,):
+            return ids.astype(int)
+        valid = ids.ndim == 1 and ids.dtype.kind in "iu" and ids.min() >= 0 and ids.max() < self.num_envs
+        if not valid or (rising and (ids[1:] <= ids[:-1]).any()):
+            order = ", rising, each once" if rising else ""
+            raise ValueError(
+                f"ids must be integers in 0..{self.num_envs - 1}{order}, got {ids.tolist()}; those of a mask (n,) "
+                "bool are np.flatnonzero(mask)"
+            )
+        return ids
+
     def scene_reset(self, ids: np.ndarray, configurations: np.ndarray, split: str = "train") -> None:
         """Put every body of streams `ids` at benchmark configurations (k,) of a split, and the arm home.
 
         Raises:
-            ValueError: unknown split, or there is no such configuration.
+            ValueError: unknown split, or there is no such configuration or stream.
         """
         check_split(split)
         poses = self.benchmark.configurations[split]
@@ -211,14 +233,14 @@ class CronosVectorEnv(gym.vector.VectorEnv):
 
     def place_bodies(self, ids: np.ndarray, poses: np.ndarray) -> None:
         """Put every body of streams `ids` at `poses` (k, bodies, 7), and the arm home."""
-        ids = np.asarray(ids)
+        ids = self._check_ids(ids, rising=True)
         with self.timer("reset"):
             self.simulation.place(ids, poses)
             self._judge(ids)
 
     def end_effector_reset(self, ids: np.ndarray) -> None:
         """Put the arm of streams `ids` home, gripper open; bodies stay (a held one drops and settles)."""
-        ids = np.asarray(ids)
+        ids = self._check_ids(ids, rising=True)
         with self.timer("reset"):
             self.simulation.send_arm_home(ids)
             self._judge(ids)
@@ -232,8 +254,8 @@ class CronosVectorEnv(gym.vector.VectorEnv):
 
         On a table without a free place it is let fall over a random one.
         """
+        ids = self._check_ids([stream])
         pose = find_free_pose(self.simulation, stream, body, rng)
-        ids = np.array([stream])
         self.simulation.move_body(ids, body, pose[None])
         self._judge(ids)
 
@@ -241,11 +263,11 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         """Give streams `ids` their tasks; the reward's level starts from the state as it is.
 
         Raises:
-            ValueError: one is none of `scene.tasks` and `scene.reset_tasks`, or there are not as many as streams;
-                all streams keep theirs.
+            ValueError: one is none of `scene.tasks` and `scene.reset_tasks`, there are not as many as streams, or
+                there is no such stream; all streams keep theirs.
         """
         valid = self.scene.tasks + self.scene.reset_tasks
-        ids = np.asarray(ids)
+        ids = self._check_ids(ids)
         given = list(zip(ids, tasks, strict=True))
         if unknown := [task for task in tasks if task not in valid]:
             by_name = "a Task, not its instruction, is needed; " if isinstance(unknown[0], str) else ""

@@ -1,15 +1,15 @@
 """Benchmark configurations: frozen poses of every body, 64 for training and 64 held out per scene.
 
-They were drawn once by `python -m lerobot_env_cronos.benchmark.configurations SCENE` from a fixed seed and are
-data of this package (`data/<scene>.json`); a change of them is a new version of the environment id. Scenes from
-outside the package come with a file of their own, or theirs are drawn from the same seed when they are first used.
+They were drawn once by `python -m lerobot_env_cronos.benchmark.freeze configurations SCENE` from a fixed seed and
+are data of this package (`data/<scene>.json`); a change of them is a new version of the environment id. Scenes
+from outside the package come with a file of their own, or theirs are drawn from the same seed when they are first
+used.
 """
 
-import argparse
 import json
 from collections.abc import Callable
 from functools import cache
-from importlib import import_module, resources
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -223,18 +223,5 @@ def write_configurations(scene_name: str, folder: Path, seed: int = SEED) -> Pat
     return path
 
 
-def main() -> None:
-    """Write the configurations of a scene; for maintainers, when a new version is made."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("scene")
-    parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--output", type=Path, default=Path("."), help="folder")
-    parser.add_argument("--discover_packages_path", help="package to import first, which registers the scene")
-    args = parser.parse_args()
-    if args.discover_packages_path:
-        import_module(args.discover_packages_path)
-    print(f"wrote {write_configurations(args.scene, args.output, args.seed)}")
-
-
 if __name__ == "__main__":
-    main()
+    raise SystemExit("`python -m lerobot_env_cronos.benchmark.freeze configurations SCENE` writes a file of them")

@@ -4,12 +4,11 @@ The first is the training cycle, which streams of the heuristic task order run w
 begin. The other nine are no rotation of it, so no such stream has seen one. All ten are different, and every task
 stands at every position as often as any other, so that success at a position is not success at a task.
 
-They were drawn once by `python -m lerobot_env_cronos.benchmark.orderings SCENE` from a fixed seed and are data of
-this package (`data/orderings/<scene>.json`). A change of them is a new version. Scenes from outside the package
-have theirs drawn from the same seed when they are first used.
+They were drawn once by `python -m lerobot_env_cronos.benchmark.freeze orderings SCENE` from a fixed seed and are
+data of this package (`data/orderings/<scene>.json`). A change of them is a new version. Scenes from outside the
+package have theirs drawn from the same seed when they are first used.
 """
 
-import argparse
 import json
 from collections.abc import Sequence
 from functools import cache
@@ -151,16 +150,13 @@ def _generate(scene: Scene) -> dict:
     }  # fmt: skip
 
 
-def main() -> None:
-    """Write the orderings of a scene; for maintainers, when a new version is made."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("scene")
-    parser.add_argument("--output", type=Path, default=Path("."), help="folder")
-    args = parser.parse_args()
-    path = args.output / f"{args.scene}.json"
-    path.write_text(json.dumps(_generate(get_scene(args.scene))) + "\n")
-    print(f"wrote {path}")
+def write_orderings(scene_name: str, folder: Path) -> Path:
+    """Draw the orderings of a scene and write them to `folder/<scene>.json`; returns the path."""
+    scene = get_scene(scene_name)
+    path = folder / f"{scene.name}.json"
+    path.write_text(json.dumps(_generate(scene)) + "\n")
+    return path
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit("`python -m lerobot_env_cronos.benchmark.freeze orderings SCENE` writes a file of them")

@@ -12,12 +12,12 @@ import argparse
 import csv
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, fields
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 
-from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS, SPLITS
+from lerobot_env_cronos.benchmark.command_line import find_scene
+from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS, SPLITS, load_configurations
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW
 from lerobot_env_cronos.scene.scenes import STEPS_PER_TASK, Task
@@ -163,14 +163,20 @@ def _parse_args() -> argparse.Namespace:
     for name in ("num_streams", "num_segments"):
         if getattr(args, name) < 2:
             parser.error(f"--{name} must be at least 2, got {getattr(args, name)}")
+    scene = find_scene(parser, args.scene, args.discover_packages_path)
+    try:
+        # Bodies that do not fit, and a folder that cannot be made, are told before minutes of measuring.
+        load_configurations(scene.name, "train")
+        if args.output:
+            args.output.mkdir(parents=True, exist_ok=True)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
     return args
 
 
 def main() -> None:
     """Measure, print and write the ceiling of a scene."""
     args = _parse_args()
-    if args.discover_packages_path:
-        import_module(args.discover_packages_path)
     env = CronosVectorEnv(NUM_CONFIGURATIONS, args.scene, obs_type=STATE_OBSERVATIONS)
     independent = []
     for split in SPLITS:
@@ -194,7 +200,6 @@ def main() -> None:
     ]
     print_rates(reset_tasks)
     if args.output:
-        args.output.mkdir(parents=True, exist_ok=True)
         write_csv(args.output / "independent.csv", independent)
         write_csv(args.output / "reset_free.csv", reset_free)
         write_csv(args.output / "reset_tasks.csv", reset_tasks)

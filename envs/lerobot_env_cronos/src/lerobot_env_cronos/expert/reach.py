@@ -15,8 +15,8 @@ from lerobot_env_cronos.expert.expert import HOVER_HEIGHT
 from lerobot_env_cronos.expert.grasping import TIP_CLEARANCE
 from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, FINGERTIP_REACH, HOME_QPOS
 from lerobot_env_cronos.scene.scenes import BODIES, Scene
+from lerobot_env_cronos.scene.view import is_in_view
 from lerobot_env_cronos.simulation.kinematics import forward_kinematics, inverse_kinematics
-from lerobot_env_cronos.simulation.workspace import is_in_view
 
 SPACING_M = 0.02
 """Of the places at which the arm is tried [m]."""

@@ -5,22 +5,24 @@ fell off the table or, being a receptacle, lies on its edge, or if the front cam
 """
 
 from enum import StrEnum
+from functools import partial
 
 import numpy as np
 
-from lerobot_env_cronos.benchmark.configurations import footprint_corners, sample_place
-from lerobot_env_cronos.scene.model import camera_axes
+from lerobot_env_cronos.benchmark.configurations import Place, draw_spawn_place, footprint_corners, sample_place
 from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW
+from lerobot_env_cronos.scene.scenes import BODIES, Scene
+from lerobot_env_cronos.scene.view import is_in_view, is_spawn_area_in_view
 from lerobot_env_cronos.simulation.simulation import Simulation
 
-CAMERA = "front"
-"""The view that decides whether a body is seen; a square picture, whatever the observation."""
 MAX_RECEPTACLE_TILT_RAD = np.deg2rad(60)
 
 LOW_HAND_M, HAND_HALF_M = 0.15, 0.06
 """Below this height of the end effector, a body is not put back under the hand [m]."""
 DROP_HEIGHT_M = 0.10
 """From where a body falls for which there is no free place [m]."""
+MAX_VIEW_DRAWS = 100
+"""Draws for a place that the camera sees; in a spawn area without one the last draw is taken."""
 
 
 class Unsuitable(StrEnum):
@@ -49,17 +51,16 @@ def find_unsuitable(simulation: Simulation) -> dict[Unsuitable, np.ndarray]:
     }
 
 
-def is_in_view(points: np.ndarray, camera: str = CAMERA) -> np.ndarray:
-    """Whether points (..., 3) in the base frame [m] lie inside a square picture of `camera`: (...,) bool."""
-    origin, rotation, half_view = camera_axes(camera)
-    x, y, z = np.moveaxis((points - origin) @ rotation, -1, 0)
-    # A camera looks along its -z axis.
-    limit = -z * np.tan(half_view)
-    return (z < 0) & (np.abs(x) <= limit) & (np.abs(y) <= limit)
+def _draw_place_in_view(scene: Scene, body: str, rng: np.random.Generator) -> Place:
+    for _ in range(MAX_VIEW_DRAWS):
+        xy, yaw = draw_spawn_place(scene, body, rng)
+        if is_in_view(np.array([*xy, BODIES[body].size[2] / 2])):
+            break
+    return xy, yaw
 
 
 def find_free_pose(simulation: Simulation, stream: int, body: str, rng: np.random.Generator) -> np.ndarray:
-    """Draw a pose (7,) on the table's spawn area, clear of the other bodies and of a low hand.
+    """Draw a pose (7,) on the table's spawn area, in view, clear of the other bodies and of a low hand.
 
     If there is none, it is a random one, above the others.
     """
@@ -73,9 +74,10 @@ def find_free_pose(simulation: Simulation, stream: int, body: str, rng: np.rando
     hand = simulation.end_effector()[0][stream]
     if hand[2] < LOW_HAND_M:
         others.append(hand[:2] + HAND_HALF_M * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]))
+    draw = None if is_spawn_area_in_view(scene, BODIES[body]) else partial(_draw_place_in_view, scene)
     try:
-        return sample_place(scene, body, others, rng)[0]
+        return sample_place(scene, body, others, rng, draw)[0]
     except RuntimeError:
-        pose = sample_place(scene, body, [], rng)[0]
+        pose = sample_place(scene, body, [], rng, draw)[0]
         pose[2] += DROP_HEIGHT_M
         return pose

@@ -145,6 +145,8 @@ def add_visual(
 ) -> None:
     """Add the merged `parts` to `body` as one visual geom.
 
+    No other one has its `name`: that of a body, or of a part of one behind a slash, which names of bodies lack.
+
     With a `texture_size` (x and y, or one for both) [m] the mesh is textured as seen from above, one repeat per
     `texture_size`.
     """

@@ -1,4 +1,7 @@
-"""Looks of the objects and receptacles, one function per shape, each inside its bounding box."""
+"""Looks of the objects and receptacles, one function per shape, each inside its bounding box.
+
+What a look consists of is named `<body>` and `<body>/<part>`, so that no two bodies share a name.
+"""
 
 from collections.abc import Callable
 
@@ -31,9 +34,9 @@ def _dress_bottle(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) ->
     profile = [(-hy, 0.82), (-0.93 * hy, 0.97), (shoulder, 0.97), (cap, 0.62)]
     add_visual(spec, spec_body, body.name, "ketchup", stack(outline, profile, "y", "first"))
     label = prism(outline, -0.52 * hy, 0.02 * hy, "y", "none")
-    add_visual(spec, spec_body, f"{body.name} label", "label", label)
+    add_visual(spec, spec_body, f"{body.name}/label", "label", label)
     nozzle = [(cap, 0.66), (0.70 * hy, 0.66), (hy, 0.26)]
-    add_visual(spec, spec_body, f"{body.name} cap", "white plastic", stack(circle(hx, 8), nozzle, "y"))
+    add_visual(spec, spec_body, f"{body.name}/cap", "white plastic", stack(circle(hx, 8), nozzle, "y"))
 
 
 def _dress_shovel(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
@@ -54,9 +57,9 @@ def _dress_shovel(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) ->
     add_visual(spec, spec_body, body.name, "blade", *bars, *tines)
     outline = superellipse(SHOVEL_HANDLE_HALF_WIDTH, hz, 3.0, 8)
     grip = [(back - 0.008, 0.60), (back + 0.026, 1.0), (0.86 * hy, 1.0)]
-    add_visual(spec, spec_body, f"{body.name} handle", "handle", stack(outline, grip, "y", "first"))
+    add_visual(spec, spec_body, f"{body.name}/handle", "handle", stack(outline, grip, "y", "first"))
     end = prism(outline, 0.86 * hy, hy, "y", "last")
-    add_visual(spec, spec_body, f"{body.name} end", "white plastic", end)
+    add_visual(spec, spec_body, f"{body.name}/end", "white plastic", end)
 
 
 def _dress_plate(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
@@ -65,7 +68,7 @@ def _dress_plate(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> 
     rim = [(-hz, 0.72), (0.5 * hz, 1.0), (hz, 0.99), (0.2 * hz, 0.74)]
     add_visual(spec, spec_body, body.name, "yellow ceramic", stack(outline, rim, caps="first"))
     well = stack(0.74 * outline, [(0.1 * hz, 1.0), (0.2 * hz, 1.0)], caps="last")
-    add_visual(spec, spec_body, f"{body.name} well", "yellow glaze", well)
+    add_visual(spec, spec_body, f"{body.name}/well", "yellow glaze", well)
 
 
 def _dress_cloth(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
@@ -110,8 +113,8 @@ def _dress_bear(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> N
     pale += [roll(0.36 * hy, 0.2, 0.76, 0, 0.26 * hz, 8), roll(0.48 * hy, 0.3, 0.54, 0, -0.42 * hz, 8)]
     face.append(roll(0.17 * hy, 0.7, 0.86, 0, 0.36 * hz))
     add_visual(spec, spec_body, body.name, "fur", torso, head, *limbs)
-    add_visual(spec, spec_body, f"{body.name} pale", "light fur", *pale)
-    add_visual(spec, spec_body, f"{body.name} face", "bead", *face)
+    add_visual(spec, spec_body, f"{body.name}/pale", "light fur", *pale)
+    add_visual(spec, spec_body, f"{body.name}/face", "bead", *face)
 
 
 def _dress_water_bottle(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
@@ -122,9 +125,9 @@ def _dress_water_bottle(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Bo
     profile = [(-hy, 0.80), (-0.95 * hy, 0.99), (shoulder, 0.99), (0.5 * hy, 0.72), (neck, 0.42), (cap, 0.42)]
     add_visual(spec, spec_body, body.name, "clear plastic", stack(outline, profile, "y", "first"))
     label = prism(outline, -0.58 * hy, 0.10 * hy, "y", "none")
-    add_visual(spec, spec_body, f"{body.name} label", "bottle label", label)
+    add_visual(spec, spec_body, f"{body.name}/label", "bottle label", label)
     screw = prism(circle(0.52 * hx, 8), cap, hy, "y")
-    add_visual(spec, spec_body, f"{body.name} cap", "white plastic", screw)
+    add_visual(spec, spec_body, f"{body.name}/cap", "white plastic", screw)
 
 
 def _dress_carpet(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
@@ -173,3 +176,6 @@ LOOKS: dict[str, Callable[[mujoco.MjSpec, mujoco.MjsBody, Body], None]] = {
     "disc": _dress_disc,
 }
 """How to draw a body, by `Body.shape`."""
+
+FIXED_LOOKS = frozenset(LOOKS.values()) - {_dress_box, _dress_disc}
+"""Those of this package that have colours of their own, whatever `Body.colour`."""

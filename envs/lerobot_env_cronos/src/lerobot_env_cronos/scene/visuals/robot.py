@@ -37,7 +37,7 @@ def dress_robot(spec: mujoco.MjSpec) -> None:
         "right_finger_link": _finger(-1.0),
     }.items():
         for material, surface in parts.items():
-            add_visual(spec, spec.body(link), f"{link} {material}", material, surface)
+            add_visual(spec, spec.body(link), f"{link}/{material}", material, surface)
 
 
 def _horns(x: float, z: float, y: float, radius: float = 0.011) -> Surface:

@@ -40,7 +40,7 @@ def _add_table(spec: mujoco.MjSpec) -> None:
     low, high = table.pos - table.size, table.pos + table.size
     world, t = spec.worldbody, EDGE_TRIM_M
     for shade, tops in zip(("oak", "light oak", "dark oak"), _staves(low + t, high - t, high[2])):
-        add_visual(spec, world, f"table {shade}", shade, *tops)
+        add_visual(spec, world, f"/table {shade}", shade, *tops)
     trims = [
         box((low[0], low[1], low[2]), (low[0] + t, high[1], high[2])),
         box((high[0] - t, low[1], low[2]), (high[0], high[1], high[2])),
@@ -53,7 +53,7 @@ def _add_table(spec: mujoco.MjSpec) -> None:
         for x in (low[0] + 2 * w, high[0] - 2 * w)
         for y in (low[1] + 2 * w, high[1] - 2 * w)
     ]
-    add_visual(spec, world, "table edge", "table edge", *trims, *legs)
+    add_visual(spec, world, "/table edge", "table edge", *trims, *legs)
 
 
 def _staves(low: np.ndarray, high: np.ndarray, z: float) -> tuple[list[Surface], ...]:
@@ -78,7 +78,7 @@ def _add_walls(spec: mujoco.MjSpec) -> None:
     bottom = np.column_stack([rectangle(h, h), np.full(4, z)])
     top = bottom + np.array([0, 0, ROOM_HEIGHT_M])
     vertices, faces = loft(np.stack([bottom, top]), caps="first")
-    add_visual(spec, spec.worldbody, "room", "wall", (vertices, faces[:, ::-1]))
+    add_visual(spec, spec.worldbody, "/room", "wall", (vertices, faces[:, ::-1]))
 
 
 def _add_lights(spec: mujoco.MjSpec) -> None:
