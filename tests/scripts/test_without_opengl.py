@@ -29,3 +29,17 @@ def test_it_is_told_in_one_line_before_anything_is_made(script, flags, folder, a
     with pytest.raises(SystemExit, match=rf"^error: cannot open an OpenGL context.*{advice}"):
         script.main()
     assert not (tmp_path / "out").exists()
+
+
+def test_demonstrations_from_the_state_need_none(tmp_path, monkeypatch):
+    def fail(*_):
+        raise ImportError("EGL")
+
+    monkeypatch.setattr(rendering, "Canvas", fail)
+    flags = (
+        "--env.type=cronos --env.num_threads=1 --env.obs_type=environment_state_agent_pos --num_envs=1"
+        " --dataset.repo_id=me/d --dataset.num_episodes=1"
+    )
+    monkeypatch.setattr(sys, "argv", ["command", *flags.split(), f"--dataset.root={tmp_path / 'out'}"])
+    record_demos.main()
+    assert (tmp_path / "out/meta/info.json").is_file()
