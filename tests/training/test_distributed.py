@@ -5,7 +5,6 @@ import os
 import random
 import re
 import signal
-import subprocess
 import sys
 from pathlib import Path
 from unittest.mock import patch
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from dummies import TASKS, DummyEnv, DummyPolicy, identity_processors
+from forked_commands import run_forked
 from forked_processes import ScriptedPolicy, WanderingEnv, together
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.random_utils import set_seed
@@ -363,12 +363,11 @@ def test_accelerate_launch(tmp_path, monkeypatch):
     """The command of docs/distributed.md on two CPU processes; what it leaves goes on in one."""
     folder = tmp_path / "run"
     flags = [*SMALL, *OBSERVATIONS["state"], "--num_envs=4", "--steps=64", f"--output_dir={folder}"]
-    scripts = Path(sys.executable).parent
     launch = [
-        str(scripts / "accelerate"), "launch", "--multi_gpu", "--num_processes=2", "--num_machines=1",
+        sys.executable, "-m", "accelerate.commands.launch", "--multi_gpu", "--num_processes=2", "--num_machines=1",
         "--main_process_port=0", "--mixed_precision=no", "--dynamo_backend=no",
     ]  # fmt: skip
-    result = subprocess.run([*launch, str(scripts / "cronos-train"), *flags], capture_output=True, text=True)
+    result = run_forked([*launch, Path(sys.executable).with_name("cronos-train"), *flags])
     assert result.returncode == 0, result.stderr[-3000:]
     assert re.findall(r"^(\d+)/64 steps", result.stdout, re.MULTILINE) == ["32", "64"]
     updates = metrics(folder)
