@@ -20,7 +20,7 @@ from lerobot_env_cronos.benchmark.configurations import SPLITS
 from lerobot_env_cronos.benchmark.orderings import is_training_cycle
 from lerobot_env_cronos.benchmark.poses import are_same, find_fault, find_overlaps
 from lerobot_env_cronos.benchmark.version import check_environment_id, gymnasium_id
-from lerobot_env_cronos.scene.scenes import SCENES, STEPS_PER_TASK, Scene, Task
+from lerobot_env_cronos.scene.scenes import STEPS_PER_TASK, Scene, Task, get_scene
 
 CONFIGURATIONS = "configurations"
 CONFIGS = (CONFIGURATIONS, *SUITES)
@@ -219,12 +219,14 @@ def _find_scene(tables: dict[tuple[str, str], _Table]) -> Scene:
                 scene = check_environment_id(environment, f"{table.where}, row {i},", "publish it anew")
             except ValueError as error:
                 raise BenchmarkError(str(error)) from None
-            if scene not in SCENES:
-                raise table.fail(i, f"unknown scene {scene!r}; valid scenes: {sorted(SCENES)}")
+            try:
+                get_scene(scene)
+            except ValueError as error:
+                raise table.fail(i, str(error)) from None
             first = first or environment
             if environment != first:
                 raise table.fail(i, f"environment is {environment}, other rows have {first}")
-    return SCENES[scene]
+    return get_scene(scene)
 
 
 def _read_poses(table: _Table, scene: Scene) -> np.ndarray:
