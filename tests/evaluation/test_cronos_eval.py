@@ -49,7 +49,7 @@ def outcomes(folder: Path) -> dict:
 
 def test_everything_in_one_go_then_again_after_a_kill(pocketvla, tmp_path, monkeypatch, capsys):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
-    flags = (f"--policy.path={pocketvla}", *SMALL)
+    flags = (f"--policy.path={pocketvla}", *SMALL, "--env.render_size=[64, 64]")
     cronos_eval(monkeypatch, *flags, f"--output_dir={whole}")
     output = capsys.readouterr().out
     for text in ("put the ketchup bottle on the cloth", "SEQ 3", "chain length", "held_out (n=6)"):
@@ -305,7 +305,8 @@ def test_lerobot_reads_the_chain_length_as_the_sum_of_rewards(pocketvla):
 def test_lerobot_eval_command(pocketvla, tmp_path):
     command = ["lerobot-eval", f"--policy.path={pocketvla}", "--policy.device=cpu", "--env.type=cronos"]
     command += ["--env.suite=sequential", "--env.split=held_out", "--env.obs_type=environment_state_agent_pos"]
-    command += ["--eval.n_episodes=2", "--eval.batch_size=2", f"--output_dir={tmp_path / 'out'}"]
+    command += ["--env.render_size=[32, 32]", "--eval.n_episodes=2", "--eval.batch_size=2"]
+    command += [f"--output_dir={tmp_path / 'out'}"]
     one = run_forked([*command, "--env.task=3"])
     assert one.returncode == 0, one.stderr[-2000:]
     info = json.loads((tmp_path / "out/eval_info.json").read_text())
