@@ -161,8 +161,7 @@ def test_a_stream_is_loaded_back_whole(hub, run, commands, tmp_path):
     code = """
 from cronos_lerobot.data.streams import StreamDataset
 from lerobot.datasets import LeRobotDataset
-remote = StreamDataset("me/stream", streaming=True)
-remote.check()
+(remote := StreamDataset("me/stream", streaming=True)).check()
 # What LeRobot's cache has a part of is read from the Hub all the same.
 LeRobotDataset("me/stream", episodes=[0], download_videos=False)
 in_part = StreamDataset("me/stream", streaming=True)
@@ -188,8 +187,8 @@ print(streams.dataset[15]["observation.images.front"].shape)
     commands.run(*publish, "--branch=trial/1")
     assert set(repository.branches) == {"main", "trial/1"}
     assert repository.tags == {"v3.0": repository.branches["main"]}
-    flags = ("check", "--dataset.repo_id=me/stream", "--dataset.revision=trial/1")
-    assert "whole: 1 streams, 4 segments, 16 frames" in commands.run("cronos-streams", *flags)
+    branch = commands.run("cronos-streams", "check", "--dataset.repo_id=me/stream", "--dataset.revision=trial/1")
+    assert "whole: 1 streams, 4 segments, 16 frames" in branch
 
 
 def test_a_policy_is_loaded_back_with_its_card(hub, run, policy, commands, tmp_path):
