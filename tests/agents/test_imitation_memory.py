@@ -12,7 +12,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.factory import resolve_delta_timestamps
 
-from cronos_lerobot.agents.imitation import batches
+from cronos_lerobot import dataset_metadata
 from cronos_lerobot.agents.imitation.batches import Demonstrations, join_batches, segment_batch
 from cronos_lerobot.agents.imitation.config import DemosConfig, ImitationConfig
 from cronos_lerobot.agents.imitation.memory import OpenSegments, Segment, SegmentMemory
@@ -227,7 +227,7 @@ def test_a_dataset_that_is_not_there_is_named(dataset_root, monkeypatch):
     def unreachable(*args, **kwargs):
         raise httpx.ConnectError("[Errno -2] Name or service not known")
 
-    monkeypatch.setattr(batches, "LeRobotDatasetMetadata", unreachable)
+    monkeypatch.setattr(dataset_metadata, "LeRobotDatasetMetadata", unreachable)
     # LeRobot downloads into a root what is not there, so the Hub is asked in either case.
     root = dataset_root.with_name("datasset")
     with pytest.raises(
