@@ -62,11 +62,8 @@ def test_starts_in_the_first_configurations_alone(env, tmp_path):
     dataset, _ = collect(env, tmp_path / "one", config, num_episodes=2, tasks=tasks)
     # Four streams attempt it at once, of all configurations in the first four.
     assert dataset.meta.episodes["cronos.configuration"] == [0, 0]
-    more = DemoConfig(start=StartConfig(num_configurations=65))
-    with pytest.raises(
-        ValueError, match=r"start\.num_configurations=65, but there are 64 training configurations"
-    ):
-        collect(env, tmp_path / "more", more, tasks=tasks)
+    with pytest.raises(ValueError, match=r"start\.num_configurations=65, but there are 64 training config"):
+        collect(env, tmp_path / "more", DemoConfig(start=StartConfig(num_configurations=65)), tasks=tasks)
 
 
 def test_the_first_frame_is_of_the_new_episode(env, tmp_path):
