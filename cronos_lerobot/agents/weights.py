@@ -68,16 +68,17 @@ def train_in_float32(policy: Any, path: str | Path | None = None, revision: str 
     What its network is built around is frozen, and stays as it is.
 
     Args:
-        policy: just loaded, without adapters.
-        path: where it was loaded from, a folder or a repository, whose weights LeRobot has rounded.
+        policy: just loaded.
+        path: where it was loaded from, a folder or a repository, whose weights LeRobot has rounded, but for those
+            of adapters.
         revision: of the repository.
     """
-    if policy.config.type not in MIXED or is_wrapped(policy):
+    if policy.config.type not in MIXED:
         return
     rounded = [param for param in policy.parameters() if param.requires_grad and param.dtype.itemsize < 4]
     for param in rounded:
         param.data = param.data.float()
-    if rounded and path:
+    if rounded and path and not is_wrapped(policy):
         file = Path(path) / SAFETENSORS_SINGLE_FILE
         if not file.is_file():
             file = Path(hf_hub_download(str(path), SAFETENSORS_SINGLE_FILE, revision=revision))

@@ -166,7 +166,8 @@ class StreamDataset:
     def is_local(self) -> bool:
         """Whether all of it is on this machine: LeRobot's cache may have the metadata and some of the files."""
         if not self._is_snapshot:
-            return True
+            # A folder that was empty has the metadata alone.
+            return (self.meta.root / "data").is_dir()
         episodes = range(self.meta.total_episodes)
         files = {self.meta.get_data_file_path(episode) for episode in episodes}
         for camera in self.meta.video_keys:

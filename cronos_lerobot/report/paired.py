@@ -152,8 +152,8 @@ def compare_trainings(pairs: Pairs, power: float) -> Difference | None:
     both = sum(_interaction(side, pairs.clusters) for side in sides) if k > 1 else 0.0
     configurations = cluster_variance(pairs.differences, pairs.clusters) if k > 1 else 0.0
     more = max(0.0, configurations - both)
-    spread = sqrt(sum(v * len(side) for v, side in zip(of_side, sides, strict=True)))
     variance = trainings + more
+    spread = sqrt(sum(v * len(side) for v, side in zip(of_side, sides, strict=True)))
     counts = f"{len(pairs.a)} against {len(pairs.b)} trainings"
     method = f"t-interval and p by training and {pairs.unit} ({counts}, {k} {pairs.units})"
     per_side = len(sides)
@@ -165,11 +165,16 @@ def compare_trainings(pairs: Pairs, power: float) -> Difference | None:
         estimates.append((configurations, k - 1))
     if not estimates:
         return Difference(value, None, None, method, None, None)
-    t = [(float(student_t.ppf(1 - ALPHA / 2, df)), float(student_t.ppf(power, df))) for _, df in estimates]
-    half = max(low * sqrt(v) for (low, _), (v, _) in zip(t, estimates, strict=True))
-    found = max((low + high) * sqrt(v) for (low, high), (v, _) in zip(t, estimates, strict=True))
-    p = max(2 * float(student_t.sf(abs(value) / sqrt(v), df)) for v, df in estimates)
+    tests = [_t_test(value, one, df, power) for one, df in estimates]
+    half, p, found = map(max, zip(*tests, strict=True))
     return Difference(value, (value - half, value + half), p, method, needed, found)
+
+
+def _t_test(value: float, variance: float, df: float, power: float) -> tuple[float, float, float]:
+    """Half of Student's interval around a difference, p, and the difference that is found with that power."""
+    error, quantile = sqrt(variance), float(student_t.ppf(1 - ALPHA / 2, df))
+    p = 2 * float(student_t.sf(abs(value) / error, df))
+    return quantile * error, p, (quantile + float(student_t.ppf(power, df))) * error
 
 
 def cluster_variance(values: np.ndarray, clusters: np.ndarray) -> float:

@@ -126,11 +126,11 @@ def _open(
     scene = get_scene(cfg.env.scene)
     task = find_task(scene.name, cfg.env.task)
     tasks = tasks_of(cfg, scene) if task is None else [task]
+    env = CronosVectorEnv(cfg.num_envs, cfg.env.scene, **cfg.env.gym_kwargs)
+    check_starts(cfg.start, scene, tasks, len(env.benchmark.configurations["train"]))
     # Once: the last checkpoint of a run that goes on is soon another one.
     source = None if cfg.start.policy is None else find_policy(cfg.start.policy).folder
     policy = None if source is None else load_spectator(str(source), cfg.env)
-    env = CronosVectorEnv(cfg.num_envs, cfg.env.scene, **cfg.env.gym_kwargs)
-    check_starts(cfg.start, scene, tasks, len(env.benchmark.configurations["train"]))
     # Before there is a dataset: whether pictures can be drawn here.
     env.observe(np.arange(1))
     writer = open_writer(cfg, env, source)

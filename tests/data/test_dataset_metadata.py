@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from lerobot_policy_pocketvla import PocketVLAConfig
+from packaging.version import Version
 from synthetic_segments import FPS, features
 from synthetic_streams import record
 
@@ -54,10 +55,19 @@ def test_another_version_of_lerobots_format_is_told(root, opens, version):
         OPEN[opens](root)
 
 
-def test_a_repository_without_a_version_is_told():
-    said = pytest.raises(ValueError, match=r"me/stream on the Hub has no tag of a version, as v3\.0: name a")
-    with said, versions_explained("me/stream"):
-        raise RuntimeError("\nYour dataset must be tagged with a codebase version.\n...")
+@pytest.mark.parametrize(
+    ("tags", "message"),
+    [
+        ((), r"me/stream on the Hub has no tag of a version, as v3\.0: name a revision"),
+        (("2.1",), "me/stream has another version of LeRobot's format"),
+        (("4.0",), "me/stream has another version of LeRobot's format"),
+    ],
+)
+def test_a_repository_without_this_version_is_told(tmp_path, monkeypatch, tags, message):
+    monkeypatch.setattr("lerobot.datasets.dataset_metadata.HF_LEROBOT_HOME", tmp_path)
+    monkeypatch.setattr("lerobot.datasets.utils.get_repo_versions", lambda _: [Version(tag) for tag in tags])
+    with pytest.raises(ValueError, match=message):
+        StreamDataset("me/stream", streaming=True)
     with pytest.raises(RuntimeError, match="another"), versions_explained("me/stream"):
         raise RuntimeError("another")
 

@@ -160,13 +160,13 @@ def test_a_stream_is_loaded_back_whole(hub, run, commands, tmp_path):
     commands.forget()
     code = """
 from cronos_lerobot.data.streams import StreamDataset
-from lerobot.datasets import LeRobotDataset
+import os; from lerobot.datasets import LeRobotDataset
 (remote := StreamDataset("me/stream", streaming=True)).check()
 # What LeRobot's cache has a part of is read from the Hub all the same.
 LeRobotDataset("me/stream", episodes=[0], download_videos=False)
 in_part = StreamDataset("me/stream", streaming=True)
 assert (in_part.meta.root / "data").is_dir() and not in_part.is_local
-in_part.check()
+for one in (in_part, StreamDataset("me/stream", os.environ["HF_HOME"] + "/new", streaming=True)): one.check()
 in_part.pixels(in_part.segments_of(0)[2], "observation.images.front")
 streams = StreamDataset("me/stream")
 streams.check()

@@ -1,11 +1,8 @@
-"""The studies that measure speeds and physics say what they measure: each at its smallest."""
+"""The studies that measure speeds say what they measure: each at its smallest."""
 
 import sys
-from types import SimpleNamespace
 
-import numpy as np
-
-from cronos_lerobot.studies import physics_check, reading_speed, recorder_speed, speed
+from cronos_lerobot.studies import reading_speed, recorder_speed, speed
 
 
 def run(monkeypatch, capsys, study, *flags):
@@ -41,31 +38,3 @@ def test_what_is_written_by_all_writers_is_the_same_size_and_is_read(tmp_path, m
     flags = (f"--root={tmp_path / 'ours'}", "--repo_id=benchmark/streams", "--frames=2")
     lines = run(monkeypatch, capsys, reading_speed, *flags)
     assert [line.split()[0] for line in lines] == list(reading_speed.BACKENDS)
-
-
-def test_physics_are_compared_row_by_row(monkeypatch, capsys):
-    record_tape, trials = physics_check.record_tape, physics_check.trials
-    monkeypatch.setattr(physics_check, "record_tape", lambda num_streams: record_tape(1, steps=2))
-    found = {
-        "slip": SimpleNamespace(fast=np.array([0.001, 0.003]), still=np.array([0.0, 0.0])),
-        "rest": SimpleNamespace(depth=0.0005, drift=0.002),
-        "slide": 0.33,
-        "coast": 0.0127,
-        "random_actions": SimpleNamespace(
-            control_steps=7,
-            diverged=0,
-            episodes=2,
-            lost=1,
-            through_table=0,
-            tracking_error=0.01,
-            worst_tracking=0.1,
-        ),
-    }
-    for name, value in found.items():
-        monkeypatch.setattr(trials, name, lambda *_, value=value, **__: value)
-    lines = run(monkeypatch, capsys, physics_check, "--quick", "--random_steps=7")
-    rows = {cells[1].strip(): cells[2:4] for line in lines if len(cells := line.split("│")) == 5}
-    assert [cell.strip() for cell in rows["toy bear: 20 fast steps, median / 95 %, mm"]] == ["2.00 / 2.90"] * 2
-    assert [cell.strip() for cell in rows["stacked, depth, mm"]] == ["0.500"] * 2
-    assert [cell.strip() for cell in rows["of 2 random episodes, a body lost"]] == ["1"] * 2
-    assert rows["control steps per CPU second"][0].strip() not in ("", "0 [0, 0]")

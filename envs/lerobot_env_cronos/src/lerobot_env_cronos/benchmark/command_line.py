@@ -11,11 +11,8 @@ def find_scene(parser: argparse.ArgumentParser, name: str, package: str | None =
     try:
         if package is not None:
             import_module(package)
+        return get_scene(name)
     except ModuleNotFoundError as error:
         parser.error(f"--discover_packages_path={package}: {error}")
-    except ValueError as error:
-        parser.error(str(error))
-    try:
-        return get_scene(name)
     except ValueError as error:
         parser.error(str(error))
