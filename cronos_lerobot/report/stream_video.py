@@ -293,7 +293,7 @@ def main() -> None:
         config, agent = CronosEnvConfig(obs_type="environment_state_agent_pos", **scene), None
         if args.policy_path:
             config, agent = make_spectator(args.policy_path, args.device, args.scene)
-    except (ValueError, OSError, ModuleNotFoundError) as error:
+    except (ValueError, OSError, ImportError) as error:
         parser.error(str(error))
     env = CronosVectorEnv(1, config.scene, **config.gym_kwargs)
     try:

@@ -42,7 +42,8 @@ from cronos_lerobot.scripts.errors import error_line, parse_command_line, stop
 def evaluate(config: CronosEvalConfig) -> None:
     """Evaluate as `config` says, or go on where an earlier evaluation was stopped."""
     init_logging()
-    with error_line():
+    # What a policy needs may not be installed.
+    with error_line(ImportError):
         config.validate()
         reference = None
         if config.compare_with is not None:
@@ -56,7 +57,7 @@ def evaluate(config: CronosEvalConfig) -> None:
     set_seed(config.seed)
     logging.info(f"Output folder: {config.output_dir}")
     try:
-        with error_line():
+        with error_line(ImportError):
             evaluation.prepare()
         results = evaluation.run()
     except KeyboardInterrupt:

@@ -216,7 +216,7 @@ def main() -> None:
     """Print a row per segment and one per kind of start, and write them to a CSV."""
     args = _parse_args()
     register_third_party_plugins()
-    with error_line():
+    with error_line(ImportError):
         env_config, agent = make_spectator(args.policy_path, args.device, args.scene)
     env = CronosVectorEnv(args.num_streams, env_config.scene, **env_config.gym_kwargs)
     protocol = ProtocolConfig(
