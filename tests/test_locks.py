@@ -47,3 +47,21 @@ def test_a_killed_writer_leaves_no_lock(tmp_path):
         holder.kill()
         holder.wait()
         FolderLock(tmp_path / "run").acquire().release()
+
+
+def test_of_a_mounted_disk_the_lock_is_on_it(tmp_path, monkeypatch):
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    monkeypatch.setattr(Path, "is_mount", lambda path: path == folder)
+    with FolderLock(folder), pytest.raises(FolderInUseError):
+        FolderLock(folder).acquire()
+    assert [file.name for file in tmp_path.rglob("*")] == ["disk", ".lock"]
+
+
+def test_where_nothing_can_be_written_beside_a_folder_the_lock_is_in_it(tmp_path, monkeypatch):
+    (tmp_path / "mine").mkdir()
+    monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)
+    FolderLock(tmp_path / "mine").acquire().release()
+    assert (tmp_path / "mine/.lock").is_file()
+    # Of a folder that is not there yet there is no inside.
+    assert FolderLock(tmp_path / "new").path == tmp_path / ".new.lock"

@@ -81,7 +81,7 @@ class SuitesConfig:
 class CronosEvalConfig:
     """Evaluate a policy on single tasks and on chains of tasks.
 
-    After a kill, run the same command again: it goes on from there.
+    After a kill, the same command goes on from there, with the --output_dir that it had.
     """
 
     env: EnvConfig = field(default_factory=CronosEnvConfig)

@@ -8,8 +8,9 @@ import os
 import platform
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from lerobot_env_cronos import CronosEnvConfig, SequentialVectorEnv, check_environment_id, get_scene, gymnasium_id
@@ -40,13 +41,14 @@ MakeActor = Callable[[SequentialVectorEnv], Actor]
 
 
 class Evaluation:
-    """One evaluation and its folder.
+    """One evaluation and its folder, which is this process's until `close` or the end of `with`.
 
     Args:
         config: validated.
         make_actor: makes who acts in an environment; by default what the config says.
 
     Raises:
+        FolderInUseError: another process evaluates into the output folder.
         FileExistsError: the output folder holds something else.
         ValueError: the output folder or a part in it is of another evaluation, or of another version of the
             environments.
@@ -63,9 +65,13 @@ class Evaluation:
         self.benchmark = config.benchmark()
         self._make_actor = make_actor or self._configured_actor
         self.parts = self._make_parts()
-        self.store = ResultStore(config.output_dir, self._identity())
         self._maker = self._made_by()
-        self._missing = [part for part in self.parts if not self._is_kept(part)]
+        with ExitStack() as on_failure:
+            # What is missing is known once nobody else can make it.
+            self._lock = on_failure.enter_context(FolderLock(config.output_dir))
+            self.store = ResultStore(config.output_dir, self._identity())
+            self._missing = [part for part in self.parts if not self._is_kept(part)]
+            on_failure.pop_all()
 
     def _make_parts(self) -> list[Part]:
         return self.config.make_parts()
@@ -88,20 +94,32 @@ class Evaluation:
             self.store.forget_if_empty()
             raise
 
-    def run(self) -> dict[str, Any]:
-        """Run the parts that are not there yet, write videos and results.json; returns the results.
+    def __enter__(self) -> Self:
+        """The evaluation itself."""
+        return self
 
-        Raises:
-            FolderInUseError: another process evaluates into the folder.
-        """
-        with FolderLock(self.store.folder):
+    def __exit__(self, *error: object) -> None:
+        """Close it."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the environment and give the folder back."""
+        self._close_env()
+        self._lock.release()
+
+    def run(self) -> dict[str, Any]:
+        """Run the parts that are not there yet, write videos and results.json, close; returns the results."""
+        with self:
             return self._run_and_report()
 
     def _run_and_report(self) -> dict[str, Any]:
+        if {part.name for part in self._missing} & set(self.store.names()):
+            # Half of the parts that it names would not be those that it was made from.
+            (self.store.folder / self.file).unlink(missing_ok=True)
         try:
             self._run(self._missing)
         finally:
-            self._close()
+            self._close_env()
         results = self.results()
         note_drawings(self.store.folder, self.env_config)
         write_json(self.store.folder / self.file, results)
@@ -191,10 +209,15 @@ class Evaluation:
         It is run again if other packages made it, or if it has no states and videos are asked for now. A part of
         another commit is kept: results.json names them all.
         """
-        content = self.store.read(part.name)
+        what = f"part {part.name} in {self.store.folder}"
+        try:
+            content = self.store.read(part.name)
+        except ValueError as error:
+            logging.warning(f"{what} is damaged ({error}): it is made again")
+            return False
         if content is None:
             return False
-        there, what = content.get("made_by", {}), f"part {part.name} in {self.store.folder}"
+        there = content.get("made_by", {})
         check_environment_id(there.get("environment"), what, ANEW)
         for name in MAKERS:
             if there[name] != self._maker[name]:
@@ -231,7 +254,7 @@ class Evaluation:
             return ExpertActor(env)
         return load_actor(config.policy, self.env_config, config.eval.temperature, config.rename_map)
 
-    def _close(self) -> None:
+    def _close_env(self) -> None:
         if "_env_and_actor" in self.__dict__:
             self._env_and_actor[0].close()
 

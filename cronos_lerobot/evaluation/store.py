@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
+from zipfile import BadZipFile
 
 import numpy as np
 from lerobot_env_cronos import check_environment_id
 
 from cronos_lerobot.evaluation.chains import ChainResult, Trajectory
+from cronos_lerobot.locks import INSIDE
 
 IDENTITY = "evaluation.json"
 RESULTS = "results.json"
@@ -19,6 +22,8 @@ COMPARISON = "comparison.json"
 FORMAT = 2
 """Version of results.json; 1 was of version 0 of the environments."""
 
+OURS = (INSIDE, f".{IDENTITY}")
+"""What may lie in a folder that is no evaluation's yet: its lock, and a first file that was cut off."""
 ANEW = "evaluate anew with another --output_dir"
 
 
@@ -41,7 +46,7 @@ class ResultStore:
             there = json.loads(path.read_text())
             check_environment_id(there.get("environment"), f"the evaluation in {folder}", ANEW)
             self._compare(there, identity)
-        elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        elif folder.exists() and (not folder.is_dir() or any(f.name not in OURS for f in folder.iterdir())):
             raise FileExistsError(f"{folder} is not empty and not of an evaluation; choose another --output_dir")
         else:
             write_json(path, identity)
@@ -73,6 +78,7 @@ class ResultStore:
         partial = path.with_name(f".{path.name}")
         with partial.open("wb") as file:
             np.savez_compressed(file, **arrays)
+            _to_disk(file)
         partial.replace(path)
         # Written last: a part is finished when it is there.
         write_json(self._path(name), content)
@@ -82,9 +88,12 @@ class ResultStore:
         return sorted(path.stem for path in self._path("").parent.glob("*.json"))
 
     def has_trajectories(self, name: str) -> bool:
-        """Whether a part was written with trajectories."""
-        with np.load(self._path(name).with_suffix(".npz")) as arrays:
-            return bool(arrays.files)
+        """Whether a part was written with trajectories, and they can be read."""
+        try:
+            with np.load(self._path(name).with_suffix(".npz")) as arrays:
+                return bool(arrays.files)
+        except (OSError, ValueError, EOFError, BadZipFile):
+            return False
 
     def read_trajectory(self, name: str, key: str) -> Trajectory | None:
         """Return a trajectory that `write` kept, or None."""
@@ -147,5 +156,13 @@ def write_json(path: Path, content: Any) -> None:
     """Write a file at once or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}")
-    partial.write_text(json.dumps(content, indent=2) + "\n")
+    with partial.open("w") as file:
+        file.write(json.dumps(content, indent=2) + "\n")
+        _to_disk(file)
     partial.replace(path)
+
+
+def _to_disk(file: IO[Any]) -> None:
+    """Have the disk take what was written before its name: a crash leaves the old file or the new one."""
+    file.flush()
+    os.fsync(file.fileno())

@@ -46,7 +46,7 @@ class Side:
         """One for each policy, of several checkpoints of one run the last.
 
         As cronos-eval found it, wherever that was run, unless more of the side's runs have an evaluation of their
-        own.
+        own, or a later one.
 
         Raises:
             ValueError: a policy has two evaluations of the same episodes, or one name is of two policies.
@@ -57,14 +57,35 @@ class Side:
     def passed_over(self, suite: str, split: str) -> str | None:
         """Which evaluations `trainings` does not speak of, in words; None if there are none."""
         evaluated, own = self._by_source(suite, split)
-        if not 0 < len(evaluated) < len(self.runs):
-            return None
-        counts = f"cronos-eval has been run of {len(evaluated)} of {len(self.runs)} policies"
-        return f"{counts}: all have their runs' own evaluations here" if len(evaluated) < len(own) else counts
+        words = []
+        if early := [str(_checkpoint(one)[1]) for one in self._outdated(suite, split)]:
+            end = max(int(_checkpoint(one)[1]) for one in self.runs)
+            words.append(f"cronos-eval of checkpoint {', '.join(early)}, the runs' own evaluations go to {end}")
+        if 0 < len(evaluated) < len(self.runs):
+            counts = f"cronos-eval has been run of {len(evaluated)} of {len(self.runs)} policies"
+            has_all = len(evaluated) < len(own)
+            words.append(f"{counts}: all have their runs' own evaluations here" if has_all else counts)
+        return "; ".join(words) or None
 
     def _by_source(self, suite: str, split: str) -> tuple[list[Outcomes], list[Outcomes]]:
-        evaluated, own = (_by_policy(some, suite, split) for some in (self.evaluations, self.runs))
-        return evaluated, own
+        outdated = self._outdated(suite, split)
+        current = [one for one in self.evaluations if one not in outdated]
+        return _by_policy(current, suite, split), _by_policy(self.runs, suite, split)
+
+    def _outdated(self, suite: str, split: str) -> list[Outcomes]:
+        """Evaluations of cronos-eval of checkpoints before the end of the runs, which have their own there.
+
+        A run is known by its folder; where that has moved, an end before those of all is an early one.
+        """
+        ends = {run: int(step) for run, step in map(_checkpoint, self.runs)}
+        if not all(one.of(suite, split) for one in self.runs) or not ends:
+            return []
+        found = []
+        for one in self.evaluations:
+            run, step = _checkpoint(one)
+            if isinstance(step, int) and one.of(suite, split) and step < ends.get(run, min(ends.values())):
+                found.append(one)
+        return found
 
 
 def _by_policy(outcomes: Sequence[Outcomes], suite: str, split: str) -> list[Outcomes]:

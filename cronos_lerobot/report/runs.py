@@ -225,6 +225,8 @@ def read_training_run(folder: Path) -> TrainingRun:
             records.append(json.loads(line))
         except json.JSONDecodeError:
             continue
+    if wrong := [record for record in records if not isinstance(record, dict) or "kind" not in record]:
+        raise ValueError(f"{folder / METRICS} is not of cronos-train: it has the record {str(wrong[0])[:80]}")
     if not records:
         raise ValueError(f"{folder / METRICS} has no record yet: the run has not come to its first evaluation.")
     manifest = folder / MANIFEST

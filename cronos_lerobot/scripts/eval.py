@@ -16,8 +16,8 @@ examples:
   the ceiling
       cronos-eval --expert=true
 
-After a kill the same command goes on from there. The environment follows from the policy; --env.scene and the like
-set it by hand.
+After a kill the same command goes on from there, given the --output_dir that it logs first. The environment
+follows from the policy; --env.scene and the like set it by hand.
 """
 
 import logging
@@ -35,13 +35,13 @@ from cronos_lerobot.evaluation.results import make_tables
 from cronos_lerobot.evaluation.runner import Evaluation
 from cronos_lerobot.evaluation.stopping import StoppingEvaluation, check_pairs, decision_text
 from cronos_lerobot.evaluation.store import COMPARISON, RESULTS
-from cronos_lerobot.locks import FolderInUseError
-from cronos_lerobot.scripts.errors import error_line, parse_command_line, stop
+from cronos_lerobot.scripts.errors import error_line, parse_command_line
 
 
 def evaluate(config: CronosEvalConfig) -> None:
     """Evaluate as `config` says, or go on where an earlier evaluation was stopped."""
     init_logging()
+    is_named = config.output_dir is not None
     # What a policy needs may not be installed.
     with error_line(ImportError):
         config.validate()
@@ -55,15 +55,15 @@ def evaluate(config: CronosEvalConfig) -> None:
     if config.torch_threads is not None:
         torch.set_num_threads(config.torch_threads)
     set_seed(config.seed)
-    logging.info(f"Output folder: {config.output_dir}")
+    again = "" if is_named else f"; after a kill the same command with --output_dir={config.output_dir} goes on"
+    logging.info(f"Output folder: {config.output_dir}{again}")
     try:
-        with error_line(ImportError):
-            evaluation.prepare()
-        results = evaluation.run()
+        with evaluation:
+            with error_line(ImportError):
+                evaluation.prepare()
+            results = evaluation.run()
     except KeyboardInterrupt:
         sys.exit(f"\ninterrupted: the same command with --output_dir={config.output_dir} goes on from here")
-    except FolderInUseError as error:
-        stop(error)
     if stops:
         print(decision_text(results))
         print(f"{evaluation.store.folder / COMPARISON}: {results['seconds'] / 60:.1f} min")

@@ -229,6 +229,28 @@ def test_runs_without_a_cronos_eval_are_not_dropped_for_those_that_have_one(tmp_
     assert (suite["rows"][0]["b"], suite["passed_over"]) == (0.75, [])
 
 
+def test_an_evaluation_before_the_end_of_a_run_does_not_stand_for_it(tmp_path, monkeypatch, capsys):
+    a = write_run(tmp_path / "a", 1, ["1110", "0000"])
+    b = write_run(tmp_path / "b", 1, ["1111", "1111"])
+    for step, found, said in ((5120, 0.375, 1), (10240, 0.125, 0)):
+        policy = f"{a}/checkpoints/{step:07d}/pretrained_model"
+        shutil.rmtree(a / "evaluation", ignore_errors=True)
+        write_evaluation(a / "evaluation", policy, tasks=["1000", "0000"], split="train")
+        (suite,) = compared(monkeypatch, capsys, a, b)["comparisons"]
+        assert suite["rows"][0]["a"] == found
+        words = "A: cronos-eval of checkpoint 5120, the runs' own evaluations go to 10240"
+        assert suite["passed_over"] == [words][:said]
+
+
+def test_another_tool_s_metrics_are_left_out_and_said(tmp_path, monkeypatch, capsys):
+    a = write_evaluation(tmp_path / "a", "me/a", tasks=["1000"])
+    write_evaluation(tmp_path / "b/eval", "me/b", tasks=["1111"])
+    (tmp_path / "b/other").mkdir()
+    (tmp_path / "b/other/metrics.jsonl").write_text('{"step": 1, "loss": 0.3}\n')
+    (note,) = compared(monkeypatch, capsys, a, tmp_path / "b")["left_out"]
+    assert note.endswith("other/metrics.jsonl is not of cronos-train: it has the record {'step': 1, 'loss': 0.3}")
+
+
 def test_checkpoints_of_several_ages_are_said_and_a_run_of_two_names_is_refused(tmp_path, monkeypatch, capsys):
     a = write_evaluation(tmp_path / "a", "me/a", tasks=["1100", "0000"])
     for seed, step in ((1, "0307200"), (2, "0051200")):
