@@ -120,8 +120,13 @@ def parse_command_line(
 
 def _null_flags(arguments: list[str]) -> list[str]:
     """The flags that are given as null, without their dashes."""
-    pairs = (argument.removeprefix("--").split("=", 1) for argument in arguments if argument.startswith("--"))
-    return [name for name, *value in pairs if value in (["null"], ["~"])]
+    # `--name value` is read as `--name=value` is.
+    pairs = (
+        [*argument.removeprefix("--").split("=", 1), following]
+        for argument, following in zip(arguments, [*arguments[1:], ""], strict=True)
+        if argument.startswith("--")
+    )
+    return [name for name, value, *_ in pairs if value in ("null", "~")]
 
 
 def _takes_null(config: Any, flag: str) -> bool:

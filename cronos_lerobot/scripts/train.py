@@ -8,11 +8,12 @@ Example:
 import signal
 from collections.abc import Generator
 from contextlib import ExitStack, contextmanager, nullcontext
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
 from httpx import HTTPError
-from lerobot.utils.hub import HubMixin
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import init_logging
@@ -20,11 +21,13 @@ from lerobot_env_cronos import SequentialVectorEnv
 
 from cronos_lerobot.agents.base import LearningAgent
 from cronos_lerobot.agents.registry import check_agent
-from cronos_lerobot.agents.weights import is_wrapped
+from cronos_lerobot.hub.config import PolicyConfig
 from cronos_lerobot.hub.push import PublishError, Target, explained
 from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.processes import choose_gpu, join_processes
 from cronos_lerobot.scripts.errors import error_line, parse_command_line, reason, stop
+from cronos_lerobot.scripts.publish import publish_policy
+from cronos_lerobot.training.checkpoint import save_model
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.factory import make_env, make_eval_env, make_policy_and_processors
 from cronos_lerobot.training.stopping import StopRequest, end_by
@@ -89,7 +92,7 @@ def told_how_to_push(config: CronosTrainConfig) -> Generator[None]:
     try:
         with explained(Target(repository, "model")):
             yield
-    except (PublishError, OSError, HTTPError) as error:
+    except (PublishError, ValueError, OSError, HTTPError) as error:
         command = f"cronos-publish policy --path={config.output_dir} --repo_id={repository}"
         if config.policy.private:
             command += " --private=true"
@@ -100,17 +103,16 @@ def told_how_to_push(config: CronosTrainConfig) -> Generator[None]:
 
 
 def push_to_hub(config: CronosTrainConfig, agent: LearningAgent, preprocessor: Any, postprocessor: Any) -> None:
-    """Push what the agent trained to `--policy.repo_id`, if that was given and pushing is on."""
+    """Publish what the agent trained at `--policy.repo_id`, if that was given and pushing is on."""
     assert config.policy is not None
-    if config.policy.push_to_hub and config.policy.repo_id:
-        repository, private = config.policy.repo_id, config.policy.private
-        agent.policy.push_to_hub(repository, private=private)
-        if is_wrapped(agent.policy):
-            # PEFT pushes its adapters only. A flag of the policy's config has the name of the method.
-            HubMixin.push_to_hub(agent.policy.config, repository, private=private)
-        more = [] if agent.acting is agent.policy else [agent.acting]
-        for part in (*more, preprocessor, postprocessor):
-            part.push_to_hub(repository, private=private)
+    if not (config.policy.push_to_hub and config.policy.repo_id):
+        return
+    with TemporaryDirectory() as folder:
+        path = config.output_dir
+        if not config.save_checkpoint:
+            path = Path(folder)
+            save_model(agent, config, preprocessor, postprocessor, path)
+        publish_policy(PolicyConfig(config.policy.repo_id, path=path, private=config.policy.private))
 
 
 def main() -> None:

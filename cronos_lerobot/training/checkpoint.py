@@ -113,7 +113,7 @@ def save_checkpoint(
     _remove_partial(folder)
     partial = Path(tempfile.mkdtemp(prefix=PARTIAL, dir=folder))
     try:
-        _write_model(run, config, partial / PRETRAINED_MODEL_DIR)
+        save_model(run.agent, config, run.preprocessor, run.postprocessor, partial / PRETRAINED_MODEL_DIR)
         state_dir = partial / TRAINING_STATE_DIR
         _write_training_state(run, state_dir, observers, env_state, generators)
         torch.save(agent, state_dir / AGENT)
@@ -130,13 +130,31 @@ def save_checkpoint(
         shutil.rmtree(partial, ignore_errors=True)
         raise
     _point_last_at(final)
-    _remove_partial(folder)
     if config.keep_checkpoints is not None:
         for old in list_checkpoints(folder)[: -config.keep_checkpoints]:
             # Of a run that goes on from an earlier one, those of its former end are the later ones.
             if old != final:
-                shutil.rmtree(old)
+                # Half of one would look like one.
+                old.rename(tempfile.mkdtemp(prefix=PARTIAL, dir=folder))
+    _remove_partial(folder)
     return final
+
+
+def save_observers(checkpoint: Path, observers: dict[str, Any]) -> None:
+    """Replace what a checkpoint keeps of the loggers and recorders, at once or not at all."""
+    path = checkpoint / TRAINING_STATE_DIR / OBSERVERS
+    partial = path.with_name(f".{OBSERVERS}")
+    torch.save(to_tensors(observers), partial)
+    with partial.open("rb") as file:
+        os.fsync(file.fileno())
+    partial.replace(path)
+
+
+def go_on_from(checkpoint: Path) -> None:
+    """Point `last` at the checkpoint that a run goes on from: later ones are of an end that it no longer has."""
+    link = checkpoint.parent / LAST_CHECKPOINT_LINK
+    if link.is_symlink() and link.resolve() != checkpoint.resolve():
+        _point_last_at(checkpoint.resolve())
 
 
 def load_checkpoint(run: RunState, config: CronosTrainConfig, folder: Path) -> dict[str, Any]:
@@ -176,11 +194,14 @@ def list_checkpoints(folder: Path) -> list[Path]:
     return sorted(found, key=lambda p: int(p.name))
 
 
-def _write_model(run: RunState, config: CronosTrainConfig, folder: Path) -> None:
-    run.agent.save_pretrained(folder)
+def save_model(
+    agent: LearningAgent, config: CronosTrainConfig, preprocessor: Any, postprocessor: Any, folder: Path
+) -> None:
+    """Write what LeRobot loads of a run into `folder`, and the config that it was trained with."""
+    agent.save_pretrained(folder)
     config.save_pretrained(folder)
-    run.preprocessor.save_pretrained(folder)
-    run.postprocessor.save_pretrained(folder)
+    preprocessor.save_pretrained(folder)
+    postprocessor.save_pretrained(folder)
 
 
 def _write_training_state(
@@ -288,7 +309,8 @@ def _load_optimizer_of_other_device(optimizer: Optimizer | dict[str, Optimizer],
 
 def _remove_partial(folder: Path) -> None:
     for path in folder.glob(f"{PARTIAL}*"):
-        shutil.rmtree(path)
+        # On NFS a file that somebody has open stays, and its folder; the next checkpoint tries again.
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def _flush_to_disk(folder: Path) -> None:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import datetime as dt
 import json
 import sys
+import tempfile
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import draccus
-from draccus.cfgparsing import parse_string
+from draccus.cfgparsing import load_config, parse_string
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
@@ -193,9 +196,7 @@ class CronosTrainConfig:
         self._pin_benchmark(self.env)
         if not self.resume and (path := parser.get_path_arg("policy")):
             overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
-            flag = f"--{PINNED}="
-            given = next((text.removeprefix(flag) for text in overrides if text.startswith(flag)), None)
-            path, revision = pin_policy(path, given)
+            path, revision = pin_policy(path, parser.parse_arg(PINNED, overrides))
             self.policy = load_policy_config(path, overrides, revision)
             if not any(override.startswith("--repo_id") for override in overrides):
                 # That of the policy's own, which is not to be pushed over.
@@ -326,8 +327,8 @@ class CronosTrainConfig:
             # LeRobot's parser keeps the plugins of the command line from `cli_args`.
             import_plugins(_checkpoint_of(file), sys.argv[1:])
             check_types(_checkpoint_of(file), cli_args or [])
-        with draccus.config_type(kind):
-            config = draccus.parse(cls, file, args=cli_args or [])
+        with draccus.config_type(kind), _without_other_types(file, cli_args or []) as read:
+            config = draccus.parse(cls, read, args=cli_args or [])
         # The file of a resumed run may say it, which asks for nothing.
         config.resume = config.resume and asked is not None
         if file.name == TRAIN_CONFIG_NAME:
@@ -358,6 +359,24 @@ class CronosTrainConfig:
     # What lerobot's WandBLogger asks of a training config.
     is_reward_model_training = False
     dataset = None
+
+
+@contextmanager
+def _without_other_types(file: Path, cli_args: list[str]) -> Generator[Path]:
+    """The file, or a copy without what it says of an agent, a policy or an environment of a type not asked for.
+
+    It would be laid over the defaults of that type.
+    """
+    asked = {name: parser.get_type_arg(name, cli_args) for name in ("env", "policy", "algorithm")}
+    with file.open() as opened:
+        content = load_config(opened)
+    key = draccus.CHOICE_TYPE_KEY
+    others = [n for n, kind in asked.items() if kind and (content.get(n) or {}).get(key, kind) != kind]
+    with tempfile.TemporaryDirectory() as folder:
+        if others:
+            file = Path(folder) / file.name
+            file.write_text(json.dumps(content | {name: {key: asked[name]} for name in others}))
+        yield file
 
 
 def _is_true(value: str | None, kind: str) -> bool:

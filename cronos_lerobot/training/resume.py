@@ -210,6 +210,9 @@ def check_types(checkpoint: Path, cli_args: list[str]) -> None:
     # LeRobot's parser keeps it from `cli_args`.
     if path := parser.get_path_arg("policy"):
         raise ValueError(_refusal("policy.path", path, "its own policy"))
+    # Of the config it is what the run began with, wherever that lies now.
+    if path := parser.parse_arg("policy.pretrained_path", cli_args):
+        raise ValueError(_refusal("policy.pretrained_path", path, "its own policy"))
     for name in ("env", "policy", "algorithm"):
         given, own = parser.get_type_arg(name, cli_args), (run["config"][name] or {}).get("type")
         if given not in (None, own):

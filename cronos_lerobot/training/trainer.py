@@ -24,7 +24,13 @@ from cronos_lerobot.protocol.takeovers import AssistedAgent, Takeover, make_expe
 from cronos_lerobot.protocol.task_orders import TaskSet, bind_task_order, find_inner, make_task_order
 from cronos_lerobot.protocol.task_values import RunContext
 from cronos_lerobot.stopwatch import Stopwatch
-from cronos_lerobot.training.checkpoint import RunState, load_checkpoint, save_checkpoint
+from cronos_lerobot.training.checkpoint import (
+    RunState,
+    go_on_from,
+    load_checkpoint,
+    save_checkpoint,
+    save_observers,
+)
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.critic_log import CriticLog
 from cronos_lerobot.training.logging import RunLogger, SilentLogger, write_manifest
@@ -193,6 +199,8 @@ class Trainer:
                 self.config, self.env, states.get("recorder"), lambda why: self.logger.log("recording", why)
             )
             self.logger = RunLogger(self.config, self.loop, states.get("logger", {}).get("offset"))
+            if self.config.checkpoint_path is not None:
+                go_on_from(self.config.checkpoint_path)
             write_manifest(self.config, self.processes.count, self.loop.n)
         self._is_open = True
 
@@ -215,13 +223,22 @@ class Trainer:
             self._check_processes()
             self._log_update()
             ends = self._is_stopped(stop)
-            if not ends:
-                if self._is_evaluation_due():
-                    self._evaluate()
-                self._last_interventions = self.loop.b
-            if self.config.save_checkpoint and (ends or _due(self.loop.n, last_save, self.config.save_freq)):
+            # Before the evaluation, which may take long: a kill in it loses the evaluation alone.
+            if saves := self.config.save_checkpoint and (
+                ends or _due(self.loop.n, last_save, self.config.save_freq)
+            ):
                 self._save(env_state)
                 last_save, has_checkpoint = self.loop.n, True
+            if not ends:
+                if is_due := self._is_evaluation_due():
+                    self._evaluate()
+                self._last_interventions = self.loop.b
+                if saves:
+                    self._note_evaluation()
+                if is_due and self._is_stopped(stop):
+                    ends = True
+                    if self.config.save_checkpoint and not saves:
+                        self._save(env_state)
             if ends:
                 return False
         self._say_end()
@@ -337,16 +354,26 @@ class Trainer:
     def _save(self, env_state: dict[str, np.ndarray]) -> None:
         # Before the logger's, as a recording that fails in its flush is told there.
         recorder = self.recorder.state_dict()
-        observers = {
-            "logger": self.logger.state_dict(),
+        self._saved = self._evaluated() | {
             "recorder": recorder,
-            "last_evaluation": self._last_evaluation,
-            "last_interventions": self._last_interventions,
             "statistics": self.statistics.state_dict(),
             "critic": self.critic_log.state_dict(),
         }
-        self.logger.log_checkpoint(save_checkpoint(self.run_state, self.config, observers, env_state))
+        self._checkpoint = save_checkpoint(self.run_state, self.config, self._saved, env_state)
+        self.logger.log_checkpoint(self._checkpoint)
         self.stopwatch.lap()
+
+    def _evaluated(self) -> dict[str, Any]:
+        return {
+            "logger": self.logger.state_dict(),
+            "last_evaluation": self._last_evaluation,
+            "last_interventions": self._last_interventions,
+        }
+
+    def _note_evaluation(self) -> None:
+        """Let the checkpoint of this moment know of the evaluation that came after it."""
+        if self.processes.is_main:
+            save_observers(self._checkpoint, self._saved | self._evaluated())
 
 
 def _shapes(env: EnvConfig | None) -> dict[str, tuple[int, ...]]:

@@ -1,5 +1,6 @@
 """Policies that PEFT wraps, as `lerobot-train --peft.*` does it."""
 
+import json
 import os
 from types import SimpleNamespace
 
@@ -11,6 +12,7 @@ from huggingface_hub import HfApi
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import PeftConfig
 from lerobot.policies.factory import get_policy_class
+from lerobot_env_cronos import CronosEnvConfig
 from peft import PeftModel
 from test_act_adapter import make_act
 from test_diffusion_adapter import HORIZON, make_diffusion
@@ -49,25 +51,36 @@ def test_adapters_are_pushed_with_the_policys_config(tmp_path, monkeypatch):
     policy = make_vla(KINDS[0], tmp_path)
     policy.config.pretrained_path = "me/base"
     wrapped = wrap(policy, PeftConfig(r=2))
-    pushed = []
-
-    def push_adapters(self, repo_id, private):
-        pushed.append((repo_id, private, "adapters"))
+    created, pushed, card = [], [], []
 
     def upload(self, folder_path, repo_id, **options):
-        pushed.append((repo_id, *os.listdir(folder_path)))
+        pushed.extend((repo_id, name) for name in os.listdir(folder_path))
+        card.append((folder_path / "README.md").read_text())
 
-    def create(self, repo_id, private, **options):
-        return SimpleNamespace(repo_id=repo_id)
-
-    monkeypatch.setattr(PeftModel, "push_to_hub", push_adapters)
-    monkeypatch.setattr(HfApi, "create_repo", create)
+    monkeypatch.setattr(HfApi, "create_repo", lambda self, repo_id, **kw: created.append((repo_id, kw["private"])))
+    monkeypatch.setattr(HfApi, "list_repo_files", lambda self, repo_id, **kw: [])
     monkeypatch.setattr(HfApi, "upload_folder", upload)
-    config = CronosTrainConfig(policy=policy.config)
+    config = CronosTrainConfig(CronosEnvConfig(scene="playroom_2x2"), policy.config, save_checkpoint=False)
     config.policy.push_to_hub, config.policy.repo_id, config.policy.private = True, "me/lora", True
-    push_to_hub(config, SimpleNamespace(policy=wrapped, acting=wrapped), *identity_processors())
-    assert pushed[:2] == [("me/lora", True, "adapters"), ("me/lora", "config.json")]
-    assert len(pushed) == 4
+    config.policy.license, config.policy.tags = "mit", ["mine"]
+
+    def save(folder):
+        save_policy(wrapped, folder)
+        # The tiny one has three actions, those of the robot are seven.
+        saved = json.loads((folder / "config.json").read_text())
+        saved["output_features"]["action"]["shape"] = [7]
+        (folder / "config.json").write_text(json.dumps(saved))
+
+    push_to_hub(config, SimpleNamespace(save_pretrained=save), *identity_processors())
+    assert created == [("me/lora", True)]
+    files = {"adapter_config.json", "adapter_model.safetensors", "config.json", "train_config.json", "README.md"}
+    assert {("me/lora", name) for name in files} <= set(pushed)
+    assert ("me/lora", "model.safetensors") not in pushed
+    # Whoever evaluates it must be told the scene: policies of two scenes may look alike.
+    head, text = card[0].split("---", 2)[1:]
+    assert "license: mit" in head
+    assert "- mine" in head
+    assert "--env.scene=playroom_2x2" in text
 
 
 def test_adapters_are_refused_twice_and_where_they_would_name_a_folder(tmp_path):

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from dummies import DummyPolicyConfig
+from dummies import DummyPolicyConfig, identity_processors
 from huggingface_hub.errors import LocalTokenNotFoundError
 from lerobot_env_cronos import CronosEnvConfig
 from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
@@ -157,17 +157,20 @@ def trained(tmp_path, monkeypatch):
     """What calls `train` of a run that is trained at once, with these settings and this error of its push."""
 
     def train(error, **options):
-        def push_to_hub(repo_id, private):
+        def publish(published):
+            assert (published.repo_id, published.private) == ("me/rl", True)
             raise error
 
-        policy = SimpleNamespace(push_to_hub=push_to_hub)
+        policy = SimpleNamespace()
         trainer = SimpleNamespace(
             load=lambda: None, open=lambda: None, train=lambda stop: True,
-            agent=SimpleNamespace(policy=policy, acting=policy),
+            agent=SimpleNamespace(save_pretrained=lambda folder: None),
         )  # fmt: skip
         processes = Alone()
         monkeypatch.setattr(script, "join_processes", lambda device: processes)
-        monkeypatch.setattr(script, "make_policy_and_processors", lambda config: (policy, None, None))
+        made = (policy, *identity_processors())
+        monkeypatch.setattr(script, "make_policy_and_processors", lambda config: made)
+        monkeypatch.setattr(script, "publish_policy", publish)
         monkeypatch.setattr(script, "make_env", lambda *arguments: SimpleNamespace(close=lambda: None))
         monkeypatch.setattr(script, "Trainer", lambda *arguments: trainer)
         policy_config = DummyPolicyConfig(push_to_hub=True, repo_id="me/rl", private=True)

@@ -87,6 +87,13 @@ def test_what_is_refused_is_named_with_both_values(tmp_path):
             make_trainer(resumed(tmp_path / "run", **options)).load()
 
 
+@pytest.mark.parametrize("flag", [["--policy.pretrained_path=/other"], ["--policy.pretrained_path", "/other"]])
+def test_the_policy_that_a_run_began_with_is_not_given_again(flag, tmp_path):
+    train(config(tmp_path, steps=STEPS_PER_UPDATE))
+    with pytest.raises(ValueError, match=r"^--policy\.pretrained_path=/other, but the run that is resumed has"):
+        resume.check_types(tmp_path / "checkpoints/last", flag)
+
+
 def test_generators_of_another_device_begin_with_numbers_of_the_step():
     """A generator of CUDA has a state of 16 bytes, one of the CPU 5,056."""
 

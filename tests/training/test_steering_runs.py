@@ -4,14 +4,12 @@ import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from dummies import DummyEnv, DummyPolicyConfig, identity_processors
 from forked_processes import together
-from huggingface_hub import HfApi
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.random_utils import set_seed
@@ -21,7 +19,7 @@ from test_trainer import STEPS_PER_UPDATE, KilledError, MortalEnv, config, metri
 from cronos_lerobot.agents.steering.config import SteeringConfig
 from cronos_lerobot.agents.steering.steered import STEERING, SteeredPolicy, with_steering
 from cronos_lerobot.processes import Processes
-from cronos_lerobot.scripts.train import push_to_hub
+from cronos_lerobot.scripts import train as train_script
 from cronos_lerobot.training.trainer import Trainer
 
 
@@ -182,13 +180,10 @@ def test_what_is_evaluated_and_saved_is_steered_once_it_has_learned(tmp_path, mo
         ]
         assert torch.equal(*(sample["actions"] for sample in samples))
     pushed = []
-    monkeypatch.setattr(HfApi, "create_repo", lambda self, repo_id, **kw: SimpleNamespace(repo_id=repo_id))
-    monkeypatch.setattr(
-        HfApi, "upload_folder", lambda self, folder_path, **kw: pushed.extend(os.listdir(folder_path))
-    )
-    cfg.policy.push_to_hub, cfg.policy.repo_id = True, "me/steered"
-    push_to_hub(cfg, trainer.agent, *identity_processors())
-    assert {"config.json", "model.safetensors", STEERING} <= set(pushed)
+    monkeypatch.setattr(train_script, "publish_policy", lambda publish: pushed.extend(os.listdir(publish.path)))
+    cfg.policy.push_to_hub, cfg.policy.repo_id, cfg.save_checkpoint = True, "me/steered", False
+    train_script.push_to_hub(cfg, trainer.agent, *identity_processors())
+    assert {"config.json", "model.safetensors", "train_config.json", STEERING} <= set(pushed)
     (folders[-1] / STEERING).write_bytes(b"short")
     with pytest.raises(ValueError, match=r"steering\.safetensors is damaged"):
         with_steering(trainer.policy, folders[-1])

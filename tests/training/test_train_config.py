@@ -58,6 +58,18 @@ def test_saved_config_reads_back_and_takes_overrides(tmp_path):
         CronosTrainConfig.from_pretrained(tmp_path / "nowhere.json")
 
 
+@pytest.mark.parametrize("suffix", ["json", "yaml"])
+def test_an_agent_of_another_type_has_its_own_settings(suffix, tmp_path):
+    file = tmp_path / f"config.{suffix}"
+    file.write_text(json.dumps(CronosTrainConfig(algorithm=PPOConfig(epochs=7), steps=9).to_dict()))
+    paper = CronosTrainConfig.from_pretrained(
+        file, cli_args=["--algorithm.type=ppo_paper", "--algorithm.clip=0.3"]
+    )
+    assert (paper.algorithm, paper.steps) == (PaperPPOConfig(clip=0.3), 9)
+    same = CronosTrainConfig.from_pretrained(file, cli_args=["--algorithm.type=ppo", "--algorithm.clip=0.3"])
+    assert same.algorithm == PPOConfig(epochs=7, clip=0.3)
+
+
 def test_who_resumes_says_so_and_no_file_does(tmp_path, monkeypatch):
     dataclasses.replace(CronosTrainConfig(policy=DummyPolicyConfig()), resume=True).save_pretrained(tmp_path)
     looked_at = []
@@ -166,6 +178,10 @@ def test_steps_are_rounded_up_to_whole_updates():
                 "--protocol.reset_budget=10",
             ],
             "reset_budget=10 pays for no takeover at protocol.takeover_price=20",
+        ),
+        (
+            ["--env.type=cronos", "--algorithm.max_grad_norm", "null"],
+            "null is no value of --algorithm.max_grad_norm",
         ),
         (["--resume=true"], "Resuming needs --config_path="),
         (["--resume=true", "--config_path=/nowhere/train_config.json"], "--config_path=/nowhere/.*: no such file"),
