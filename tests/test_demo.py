@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from importlib.metadata import entry_points
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -47,21 +48,44 @@ def test_steps_that_are_done_are_skipped(folder, capsys):
     assert capsys.readouterr().out.count("done before") == 2
 
 
-def test_changed_command_runs_anew_and_so_do_all_after_it(folder):
+def test_what_is_done_is_not_removed_for_another_command(folder):
     run_steps([append_step(folder, "a"), append_step(folder, "b"), append_step(folder, "c")], folder)
     for name in "abc":
         (folder / f"{name}.txt").write_text("touched")
-    run_steps([append_step(folder, "a"), append_step(folder, "b", "new"), append_step(folder, "c")], folder)
-    assert contents(folder) == {"a": "touched", "b": "new", "c": "x"}
+    with pytest.raises(FileExistsError, match=r"b\.txt is done and was made otherwise \(.*now .*'new'.*: choose"):
+        run_steps([append_step(folder, "a"), append_step(folder, "b", "new"), append_step(folder, "c")], folder)
+    assert contents(folder) == dict.fromkeys("abc", "touched")
 
 
-def test_steps_of_other_versions_run_anew(folder, monkeypatch):
+def test_another_command_begins_what_is_not_done_anew_and_so_do_all_after_it(folder):
+    broken = Step("b", "B", ["python", "-c", "raise SystemExit(3)"], folder / "b.txt")
+    with pytest.raises(StepFailedError):
+        run_steps([append_step(folder, "a"), broken], folder)
+    for name in "ab":
+        (folder / f"{name}.txt").write_text("touched")
+    run_steps([append_step(folder, "a"), append_step(folder, "b"), append_step(folder, "c")], folder)
+    assert contents(folder) == {"a": "touched", "b": "x", "c": "x"}
+
+
+def test_what_is_done_is_not_removed_for_other_versions(folder, monkeypatch):
     run_steps([append_step(folder, "a")], folder)
     monkeypatch.setattr(pipeline, "package_versions", lambda: {"lerobot": "0.0.0"})
-    (folder / "a.txt").write_text("touched")
-    run_steps([append_step(folder, "a")], folder)
-    run_steps([append_step(folder, "a")], folder)
+    with pytest.raises(FileExistsError, match=r"lerobot .*, now 0\.0\.0"):
+        run_steps([append_step(folder, "a")], folder)
     assert contents(folder) == {"a": "x"}
+
+
+def test_a_folder_may_be_spelled_in_another_way(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code = "import sys; open(sys.argv[1].partition('=')[2], 'a').write('x')"
+
+    def steps(folder):
+        output = Path(folder, "a.txt")
+        return [Step("a", "A", ["python", "-c", code, f"--output={output}"], output)]
+
+    for folder in ("out", "./out/", tmp_path / "out"):
+        run_steps(steps(folder), Path(folder))
+    assert contents(tmp_path / "out") == {"a": "x"}
 
 
 def test_lost_output_is_made_again(folder):

@@ -317,7 +317,13 @@ def lock(job: Job) -> int | None:
     own FolderLock, which would find the folder taken.
     """
     job.record.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(job.record.with_name(f".{job.output.name}.job.lock"), os.O_RDWR | os.O_CREAT, 0o644)
+    path = job.record.with_name(f".{job.output.name}.job.lock")
+    try:
+        # The umask says whether a group may, as of the other files.
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except PermissionError:
+        # Of another user: to lock it, on a disk of this machine, takes no more than to read it.
+        descriptor = os.open(path, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -19,6 +19,7 @@ from cronos_lerobot.experiments.definitions import INTERVENTIONS, CheckpointEval
 from cronos_lerobot.experiments.jobs import Job, known_changes, other_commits, read_record, status
 from cronos_lerobot.experiments.plan import base_evaluation_jobs, checkpoint_evaluations, train_job
 from cronos_lerobot.experiments.runner import DONE, FAILED
+from cronos_lerobot.experiments.same_run import is_of_another, went_on
 from cronos_lerobot.experiments.specs import Options, RunSpec, base_folder, run_specs
 from cronos_lerobot.protocol.metrics import Gap, Summary, performance_gap, success_at, summarise, summarise_rates
 from cronos_lerobot.report.runs import Group, TrainingRun, read_training_run
@@ -307,6 +308,9 @@ def _read_seed(spec: RunSpec, result: ExperimentResult) -> SeedResult | None:
     except ValueError as error:
         result.changed.append(f"{spec.name}: {error}")
         return None
+    if why := went_on(seed.run, spec.steps):
+        result.changed.append(f"{spec.name}: {why}")
+        return None
     result.commits += [f"{spec.name}: {commit}" for commit in other_commits(job)]
     for evaluation in result.experiment.evaluations:
         for job in base_evaluation_jobs(spec, evaluation):
@@ -326,7 +330,10 @@ def _read_evaluation(
     try:
         if found := known_changes(job):
             raise ValueError("; ".join(found))
-        splits = read_results(job.output)[evaluation.suite]
+        found = read_results(job.output)
+        if checkpoint == 0 and is_of_another(found, seed.run):
+            raise ValueError(f"it is of another base policy than the one that {seed.spec.name} began with")
+        splits = found[evaluation.suite]
     except ValueError as error:
         text = f"{job.name}: {error}"
         result.changed += [text] if text not in result.changed else []

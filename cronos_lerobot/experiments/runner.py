@@ -30,6 +30,7 @@ from cronos_lerobot.experiments.jobs import (
     this_commit,
     write_record,
 )
+from cronos_lerobot.locks import FolderInUseError, FolderLock
 from cronos_lerobot.training.stopping import SAME_S
 
 POLL_S = 0.5
@@ -151,10 +152,7 @@ class Runner:
     def _start(self, job: Job) -> None:
         claim = lock(job)
         if claim is None:
-            # Another process is at it: look again until it is through.
-            if job.name not in self._elsewhere:
-                self._elsewhere.add(job.name)
-                self.display.event(job, ELSEWHERE)
+            self._wait_for_others(job)
             return
         self._look_up(job)
         if job.name in self.states:
@@ -162,8 +160,16 @@ class Runner:
             return
         record: dict[str, Any] = read_record(job)
         resumed = continuation(job)
+        try:
+            # Whoever runs the command by hand has no claim, but the folder.
+            with FolderLock(job.output):
+                if resumed is None:
+                    job.remove_output()
+        except FolderInUseError:
+            os.close(claim)
+            self._wait_for_others(job)
+            return
         if resumed is None:
-            job.remove_output()
             gone = [name for name, state in self.states.items() if state == DONE and not is_done(self.jobs[name])]
             for name in gone:
                 del self.states[name]
@@ -187,6 +193,12 @@ class Runner:
             )
         self._children.append(_Child(job, process, claim))
         self.display.event(job, "resumed" if resumed else "started")
+
+    def _wait_for_others(self, job: Job) -> None:
+        """Another process is at it: look again until it is through."""
+        if job.name not in self._elsewhere:
+            self._elsewhere.add(job.name)
+            self.display.event(job, ELSEWHERE)
 
     def _collect(self) -> None:
         for child in list(self._children):

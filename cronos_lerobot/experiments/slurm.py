@@ -7,7 +7,6 @@ both may work on one root.
 
 from __future__ import annotations
 
-import getpass
 import re
 import shutil
 import signal
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cronos_lerobot.experiments.display import LineDisplay
-from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job, changes, continuation, is_done, read_record
+from cronos_lerobot.experiments.jobs import BASE, EVALUATION, RUN, Job, changes, continuation, is_done, read_record
 from cronos_lerobot.experiments.runner import DONE, FAILED, Runner
 from cronos_lerobot.experiments.submitted import Submission, other_flags, read_submissions, write_submissions
 from cronos_lerobot.locks import FolderLock
@@ -115,13 +114,20 @@ class Task:
         threads: of each command.
         limit_s: its time limit [s].
         grace_s: how long a command may take to end after it was asked to [s].
+        requeues: how often it may still come to its time limit.
     """
 
     def __init__(
-        self, jobs: Sequence[Job], needs: Sequence[Job], threads: int, limit_s: float, grace_s: float
+        self,
+        jobs: Sequence[Job],
+        needs: Sequence[Job],
+        threads: int,
+        limit_s: float,
+        grace_s: float,
+        requeues: int = SlurmOptions.requeues,
     ) -> None:
         self.jobs, self.needs, self.threads = tuple(jobs), tuple(needs), threads
-        self.limit_s, self.grace_s = limit_s, grace_s
+        self.limit_s, self.grace_s, self.requeues = limit_s, grace_s, requeues
         self._began = time.monotonic()
         self._waiting: list[Job] = []
         """What was not done at this start."""
@@ -164,8 +170,9 @@ class Task:
     def checkpoint(self) -> Any:
         """Stop: submitit calls this shortly before the time limit, and then requeues what is returned.
 
-        None, which ends the job, where a whole time limit has finished no job and left nothing to go on with: so
-        would the next one.
+        None, which ends the job, where a whole time limit has finished no job and left nothing to go on with, as
+        the next one would; or where it has come to its limit too often. Submitit counts these alone, and takes a
+        warning of more than a fifth of the limit and ten minutes for a preemption.
         """
         from submitit.helpers import DelayedSubmission
 
@@ -179,7 +186,12 @@ class Task:
                 f"{unfinished.name} came to its time limit before its first checkpoint: give a longer --slurm.time"
             )
             return None
-        return DelayedSubmission(Task(self.jobs, self.needs, self.threads, self.limit_s, self.grace_s))
+        requeues = self.requeues - has_timed_out
+        if requeues < 0:
+            print("came to its time limit more often than --slurm.requeues allows: submit it again to go on")
+            return None
+        task = Task(self.jobs, self.needs, self.threads, self.limit_s, self.grace_s, requeues)
+        return DelayedSubmission(task)
 
 
 def _to_be_made(jobs: Sequence[Job]) -> list[Job]:
@@ -275,21 +287,22 @@ class Cluster:
                 limit_s = 60.0 * self.options.minutes - self.options.warning_s
                 # The rest of the warning is for what follows a killed command.
                 grace_s = 0.75 * self.options.warning_s
-                tasks = [Task(element, _needs(element, made), threads, limit_s, grace_s) for element in elements]
+                limits = threads, limit_s, grace_s, self.options.requeues
+                tasks = [Task(element, _needs(element, made), *limits) for element in elements]
                 parameters = self.options.parameters(threads, parallel) | {"dependency": dependency}
-                numbers = self._submit_array(f"cronos-{name}", tasks, parameters)
+                numbers = self._submit_array(_array_name(name), tasks, parameters)
                 for element, number in zip(elements, numbers, strict=True):
                     submitted.update({job.name: number for job in element})
                 return numbers
 
             try:
-                array("base", bases, None)
+                array(BASE, bases, None)
                 # `any`: what an element needs it looks for itself, and others may have theirs.
                 begun, runs = behind_runs(runs, queued, made)
-                numbers = array("run", runs, _after_any(runs, queued | submitted))
-                array("evaluation", evaluations, _after_each(numbers, len(evaluations)))
+                numbers = array(RUN, runs, _after_any(runs, queued | submitted))
+                array(EVALUATION, evaluations, _after_each(numbers, len(evaluations)))
                 if begun:
-                    array("evaluation", begun, _after_any(begun, queued))
+                    array(EVALUATION, begun, _after_any(begun, queued))
             finally:
                 # What the cluster has taken is remembered, also where it refused the rest.
                 new = {name: Submission(number, list(made[name].command)) for name, number in submitted.items()}
@@ -351,13 +364,20 @@ def _after_each(ids: list[str], number: int) -> str | None:
     return f"aftercorr:{ids[0].split('_')[0]}"
 
 
+def _array_name(stage: str) -> str:
+    return f"cronos-{stage}"
+
+
 def squeue() -> dict[str, tuple[str, str]]:
-    """State (PENDING, RUNNING ...) and reason of all elements of one's own arrays that are in the queue, by id.
+    """State (PENDING, RUNNING ...) and reason of all elements of such arrays that are in the queue, by id.
+
+    Of all users: who shares a root does not submit again what another has.
 
     Raises:
         SlurmError: squeue does not answer.
     """
-    command = ["squeue", "--noheader", "--array", "--format=%i|%T|%r", f"--user={getpass.getuser()}"]
+    names = ",".join(_array_name(stage) for stage in (BASE, RUN, EVALUATION))
+    command = ["squeue", "--noheader", "--array", "--format=%i|%T|%r", f"--name={names}"]
     answer = subprocess.run(command, capture_output=True, text=True)
     if answer.returncode:
         raise SlurmError(f"squeue: {answer.stderr.strip() or 'no answer'}")

@@ -6,6 +6,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -221,11 +222,9 @@ def read_training_run(folder: Path) -> TrainingRun:
     """
     records = []
     for line in (folder / METRICS).read_text().splitlines():
-        try:
+        with suppress(json.JSONDecodeError):
             records.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
-    if wrong := [record for record in records if not isinstance(record, dict) or "kind" not in record]:
+    if wrong := [line for line in records if not isinstance(line, dict) or "kind" not in line]:
         raise ValueError(f"{folder / METRICS} is not of cronos-train: it has the record {str(wrong[0])[:80]}")
     if not records:
         raise ValueError(f"{folder / METRICS} has no record yet: the run has not come to its first evaluation.")

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from cronos_lerobot.experiments.arithmetic import portable_arithmetic
 from cronos_lerobot.experiments.runner import raise_on_signals
-from cronos_lerobot.locks import FolderLock
+from cronos_lerobot.locks import INSIDE, FolderLock
 from cronos_lerobot.provenance import package_versions
 from cronos_lerobot.training.stopping import SAME_S
 
@@ -55,7 +55,8 @@ def run_steps(steps: Sequence[Step], folder: Path) -> None:
         folder: holds their outputs and a note of what was done with which command and versions.
 
     Raises:
-        FileExistsError: the folder holds something else.
+        FileExistsError: the folder holds something else, or a step that is done was done with another command or
+            other versions.
         FolderInUseError: another process runs the steps there.
         StepFailedError: a command failed; running the steps again goes on from there.
     """
@@ -72,11 +73,17 @@ def run_steps(steps: Sequence[Step], folder: Path) -> None:
 def _run_steps(steps: Sequence[Step], folder: Path) -> None:
     state, versions = _read_state(folder), package_versions()
     stale = False
+    for step in steps:
+        note = state.get(step.name, {})
+        if note.get("done") and step.output.exists() and (why := _differences(step, note, versions, folder)):
+            raise FileExistsError(
+                f"{step.output} is done and was made otherwise ({why}): choose another --output_dir, or delete it"
+            )
     for number, step in enumerate(steps, start=1):
         heading = f"[{number}/{len(steps)}] {step.title}"
         note = state.get(step.name, {})
         made = {"command": step.command, "versions": versions}
-        same = all(note.get(name) == value for name, value in made.items())
+        same = not _differences(step, note, versions, folder)
         if same and note.get("done") and step.output.exists() and not stale and not step.always:
             print(f"\n{heading}: done before ({step.output})", flush=True)
             continue
@@ -95,6 +102,30 @@ def _run_steps(steps: Sequence[Step], folder: Path) -> None:
         state[step.name] |= {"done": True, "seconds": round(seconds, 1)}
         _write_state(folder, state)
         print(f"    took {seconds / 60:.1f} min", flush=True)
+
+
+def _differences(step: Step, note: dict, versions: dict[str, str], folder: Path) -> str:
+    """How a step was done otherwise than it would be now, in words; empty if it was not.
+
+    The folder may be spelled in another way: paths are compared as seen from there.
+    """
+    old, new = (_seen_from(folder, command) for command in (note.get("command", []), step.command))
+    words = [word for word in old if word not in new][:2] + [f"now {word}" for word in new if word not in old][:2]
+    if old != new:
+        return ", ".join(words) or "another order of the flags"
+    there = note.get("versions", {})
+    names = [name for name in sorted(there | versions) if there.get(name) != versions.get(name)]
+    return ", ".join(f"{name} {there.get(name, 'none')}, now {versions.get(name, 'none')}" for name in names)
+
+
+def _seen_from(folder: Path, command: Sequence[str]) -> list[str]:
+    found = []
+    for word in command:
+        name, sign, value = word.rpartition("=")
+        path = Path(value).resolve()
+        below = path.relative_to(folder.resolve()) if value and path.is_relative_to(folder.resolve()) else value
+        found.append(f"{name}{sign}{below}")
+    return found
 
 
 def remember(folder: Path, name: str, find_out: Callable[[], dict]) -> dict:
@@ -167,7 +198,7 @@ def _read_state(folder: Path) -> dict[str, dict]:
     path = folder / STATE
     if path.is_file():
         return json.loads(path.read_text())
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if folder.exists() and (not folder.is_dir() or any(file.name != INSIDE for file in folder.iterdir())):
         raise FileExistsError(f"{folder} is not empty and not of an earlier run; choose another --output_dir.")
     return {}
 

@@ -12,7 +12,9 @@ from collections.abc import Iterable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import yaml
 
 from cronos_lerobot.experiments.definitions import COMMANDS, EXPERIMENTS, Base, Experiment, Row, find_rows
 from cronos_lerobot.experiments.flags import join_flags
@@ -201,6 +203,12 @@ def make_options(args: argparse.Namespace, extra: list[str], bases: Iterable[Bas
         # More than one of each configuration are as many of all.
         if name == "--eval.n_episodes" and value.isdigit() and int(value) > 64 and int(value) % 64:
             raise ValueError(f"{name}={value} must be at most 64, the configurations, or so many times 64")
+    for name, path in (("root", args.root), ("policy.path", args.policy_path)):
+        if path is not None and read_as(f"{path}/x") != f"{path}/x":
+            raise ValueError(
+                f"--{name}={path} would be read as {read_as(f'{path}/x')!r} by the commands that it is given to, as"
+                " YAML: choose a path without ' #' and ': '"
+            )
     if not args.temperature >= 0:
         raise ValueError(f"--temperature must be at least 0, got {args.temperature}")
     scale = SCALES[args.scale]
@@ -231,6 +239,14 @@ def make_options(args: argparse.Namespace, extra: list[str], bases: Iterable[Bas
         tuple(extra),
         recipes,
     )
+
+
+def read_as(value: str) -> Any:
+    """What the value of a flag is to LeRobot's commands; its beginning if it is none."""
+    try:
+        return yaml.safe_load(value)
+    except yaml.YAMLError:
+        return value.partition(": ")[0]
 
 
 def base_changes(args: argparse.Namespace) -> dict[str, int]:

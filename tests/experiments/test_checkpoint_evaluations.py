@@ -133,3 +133,52 @@ def test_results_of_version_0_are_named_and_left_out(options):
     assert "kitchen_2x2-v0; this is version 1" in text
     row = by_row(tables.main_rows(result))["t80"]
     assert (row["success_train_mean"], row["success_held_out_mean"]) == (0.75, None)
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"interaction_steps": 20_480}, "it was gone on with to 20,480 steps, of 10,240"),
+        ({"temperature": 0.0}, "its evaluations were not all made alike"),
+    ],
+)
+def test_a_run_that_was_gone_on_with_by_hand_is_named_and_left_out(options, changes, why):
+    metrics = make_run(options, "table1", "t80", 1, (2, 4, 6)).train_folder / "metrics.jsonl"
+    lines = [json.loads(line) for line in metrics.read_text().splitlines()]
+    metrics.write_text("".join(json.dumps(line) + "\n" for line in [*lines, lines[-1] | changes]))
+    result = results(options, "table1")
+    assert result.changed == [f"kitchen_2x2_state_small/t80_10k/seed1: {why}"]
+    assert by_row(tables.main_rows(result))["t80"]["seeds"] == 0
+
+
+def test_a_run_that_was_resumed_with_other_flags_is_named_and_left_out(options):
+    manifest = make_run(options, "table1", "t80", 1, (2, 4, 6)).train_folder / "manifest.json"
+    content = json.loads(manifest.read_text())
+    (start,) = content["starts"]
+    other = start | {"interaction_steps": 5_120}
+    other["config"] = start["config"] | {"protocol": start["config"]["protocol"] | {"scene_reset_interval": 40}}
+    manifest.write_text(json.dumps({"starts": [start, other]}))
+    (text,) = results(options, "table1").changed
+    assert "it was gone on with other flags: protocol.scene_reset_interval 80, then 40" in text
+
+
+@pytest.mark.parametrize(("files", "taken"), [("1f", True), ("2e", False), (None, True)])
+def test_an_evaluation_of_another_clone_is_not_the_start_of_a_curve(options, files, taken):
+    """An archive's runs began with another machine's clone than the one that was evaluated here."""
+    spec = make_run(options, "figure4", "t80", 1, (2, 4, 6))
+    manifest = spec.train_folder / "manifest.json"
+    content = json.loads(manifest.read_text())
+    content["starts"][0]["policy_fingerprint"] = "1f"
+    manifest.write_text(json.dumps(content))
+    folder = base_evaluation_folder(spec.base, "independent", "held_out", options)
+    write_results(folder, "independent", "held_out", evaluation(0.5))
+    told = json.loads((folder / "results.json").read_text()) | ({"policy_files": files} if files else {})
+    (folder / "results.json").write_text(json.dumps(told))
+    (job,) = base_evaluation_jobs(spec, EXPERIMENTS["figure4"].evaluations[0])
+    write_record(
+        job, {"command": list(job.command), "status": "done", "seconds": 1, "starts": 1, "made_by": made_by(job)}
+    )
+    result = results(options, "figure4")
+    (seed,) = next(row for row in result.rows if row.row.name == "t80").seeds
+    assert (0 in seed.evaluations.get(("independent", "held_out"), {})) == taken
+    assert any("another base policy than the one that" in text for text in result.changed) != taken

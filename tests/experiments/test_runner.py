@@ -3,6 +3,7 @@
 import fcntl
 import importlib
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -21,6 +22,7 @@ from cronos_lerobot.experiments.jobs import (
     changed_flags,
     changes,
     is_done,
+    lock,
     made_by,
     other_commits,
     read_record,
@@ -193,6 +195,50 @@ def test_job_of_another_process_is_waited_for(tmp_path):
     assert time.monotonic() - start > 0.3
     assert "another process" in tape.events[0][1]
     assert release.wait() == 0
+
+
+def test_a_folder_that_somebody_writes_to_by_hand_is_waited_for_and_left_alone(tmp_path):
+    """Without the job's claim: the command was copied from the log."""
+    job = python_job(tmp_path, "a", "raise SystemExit('once')")
+    run([job])
+    hold = "import sys, time; from cronos_lerobot.locks import FolderLock\n"
+    hold += "with FolderLock(sys.argv[1]): print('held', flush=True); time.sleep(1)"
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    with subprocess.Popen(
+        [sys.executable, "-c", hold, str(job.output)], stdout=subprocess.PIPE, text=True, env=environment
+    ) as by_hand:
+        assert by_hand.stdout.readline() == "held\n"
+        (job.output / "by_hand").touch()
+        _, tape = run([replace(job, resume=lambda: ["python", "-c", "pass"])])
+        assert by_hand.poll() == 0
+    assert [what for _, what in tape.events][1:] == ["resumed", "done"]
+    assert "another process" in tape.events[0][1]
+    assert (job.output / "by_hand").exists()
+
+
+def test_a_lock_is_for_all_who_may_write_to_the_folder(tmp_path):
+    before = os.umask(0o002)
+    try:
+        os.close(lock(count_job(tmp_path, "a")))
+    finally:
+        os.umask(before)
+    assert (tmp_path / ".a.job.lock").stat().st_mode & 0o777 == 0o664
+
+
+def test_another_user_s_lock_that_may_only_be_read_is_taken_all_the_same(tmp_path, monkeypatch):
+    job = count_job(tmp_path, "a")
+    (tmp_path / ".a.job.lock").touch()
+    open_ = os.open
+
+    def refuse_writing(path, flags, mode=0o777):
+        if flags & os.O_RDWR:
+            raise PermissionError(13, "Permission denied")
+        return open_(path, flags, mode)
+
+    monkeypatch.setattr("cronos_lerobot.experiments.jobs.os.open", refuse_writing)
+    held = lock(job)
+    assert lock(job) is None
+    os.close(held)
 
 
 def test_of_what_may_only_be_read_the_note_is_believed(tmp_path, monkeypatch):

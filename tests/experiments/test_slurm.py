@@ -4,6 +4,7 @@ import json
 import shutil
 import signal
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -114,6 +115,19 @@ def test_a_time_limit_that_leaves_nothing_to_go_on_with_ends_the_job(tmp_path, c
     # It was preempted before, or goes on from where it was.
     for again in (Task([anew], [], 1, 3600, 1), Task([resumable], [], 1, 0, 1)):
         assert [j.name for j in again.checkpoint().function.jobs] == ["anew"]
+
+
+def test_time_limits_are_counted_whatever_the_warning(tmp_path, capsys):
+    """Submitit takes a warning of a quarter of an hour before an hour is over for a preemption."""
+    again = job(tmp_path, "a")
+    task = Task([replace(again, resume=lambda: list(again.command))], [], 1, limit_s=0, grace_s=1, requeues=1)
+    following = task.checkpoint().function
+    assert following.requeues == 0
+    assert following.checkpoint() is None
+    assert "more often than --slurm.requeues allows" in capsys.readouterr().out
+    # A preemption is none.
+    preempted = Task(task.jobs, [], 1, limit_s=3600, grace_s=1, requeues=0)
+    assert preempted.checkpoint().function.requeues == 0
 
 
 @pytest.fixture
