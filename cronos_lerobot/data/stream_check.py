@@ -33,7 +33,7 @@ class StreamError(ValueError):
     """A recorded stream is not whole."""
 
 
-def check(frames: pd.DataFrame, total_frames: int, total_episodes: int) -> None:
+def check(frames: pd.DataFrame, total_frames: int, total_episodes: int, *, is_finished: bool = True) -> None:
     """Check every frame's place in its stream.
 
     - LeRobot's indices count frames and episodes without a gap, and an episode is one segment of one stream.
@@ -43,12 +43,14 @@ def check(frames: pd.DataFrame, total_frames: int, total_episodes: int) -> None:
     - An expert did all of a segment or nothing of it.
     - The last frame of a segment that another one follows is truncated, no other is, and none is done.
     - The position is 0 after a scene reset and rises by 1 at every other segment.
+    - All streams of a finished recording end at the same step: they step together.
 
     Args:
         frames: the columns `COLUMNS` and perhaps EXPERT of a whole recording, in LeRobot's order; a filtered one
             has gaps.
         total_frames: as `info.json` counts them.
         total_episodes: the same.
+        is_finished: whether the recording was not killed and does not go on.
 
     Raises:
         StreamError: names the stream, the step and what is wrong there.
@@ -64,6 +66,8 @@ def check(frames: pd.DataFrame, total_frames: int, total_episodes: int) -> None:
         raise StreamError(f"the streams {missing} are missing; recorded are the first ones up to {ids.max()}")
     for _, stream in frames.groupby(STREAM_ID, sort=True):
         _check_stream(stream.sort_values(STEP, kind="stable").reset_index(drop=True))
+    if is_finished:
+        _check_ends(frames)
 
 
 def _check_episodes(frames: pd.DataFrame, total: int) -> None:
@@ -112,6 +116,17 @@ def _check_stream(frames: pd.DataFrame) -> None:
         may_rise = first | (name == TOTAL_INTERVENTIONS)
         holds = (rise >= least) & (may_rise | (rise == 0))
         _expect(frames, holds, f"{name} is {{{name}}}, not what the interventions add up to")
+
+
+def _check_ends(frames: pd.DataFrame) -> None:
+    # A flush writes the segments that have ended by then, of some streams one more than of others.
+    steps = frames.groupby(STREAM_ID).size()
+    shortest, longest = steps.idxmin(), steps.idxmax()
+    if steps[shortest] < steps[longest]:
+        raise StreamError(
+            f"stream {shortest} ends after {steps[shortest]} steps, stream {longest} after {steps[longest]}: the"
+            " recording broke off, goes on or was filtered"
+        )
 
 
 def _expect(frames: pd.DataFrame, holds: pd.Series, message: str) -> None:

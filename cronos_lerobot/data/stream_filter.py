@@ -35,6 +35,7 @@ from cronos_lerobot.data.stats import Stats, episode_stats
 from cronos_lerobot.data.storage import INCOMPLETE, Shard, stats_of_row
 from cronos_lerobot.data.streams import Segment, StreamDataset, to_array
 from cronos_lerobot.data.video import MAX_FILE_DURATION_S, Clip, CopiedVideoFile, read_frames
+from cronos_lerobot.dataset_metadata import check_path
 from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.protocol.interventions import BEFORE_SEGMENTS
 
@@ -135,9 +136,11 @@ def filter_streams(
     Raises:
         FileExistsError: `root` exists.
         FolderInUseError: another process writes it.
-        ValueError: no segment is wanted, or a stream or task that is not there; or `source` is on the Hub.
+        ValueError: no segment is wanted, or a stream or task that is not there; `source` is on the Hub; or LeRobot
+            could not read what is in a folder of this path.
     """
     root = Path(root)
+    check_path(root)
     _check_free(root)
     if not source.is_local:
         raise ValueError(f"{source.repo_id} is streamed from the Hub; open it with streaming=False to filter it")

@@ -46,7 +46,7 @@ from cronos_lerobot.data.schema import (
 )
 from cronos_lerobot.data.stream_check import COLUMNS, check
 from cronos_lerobot.data.video import Clip, read_frames
-from cronos_lerobot.dataset_metadata import open_metadata
+from cronos_lerobot.dataset_metadata import check_files_are_there, missing_files, open_metadata
 from cronos_lerobot.protocol.interventions import Intervention
 
 _SUMMARY = (STREAM_ID, SEGMENT_INDEX, POSITION, STEP, INTERVENTION, POLICY_VERSION, SUCCESS, SUCCESS_FRAME)
@@ -122,7 +122,7 @@ class StreamDataset:
     Raises:
         ValueError: the dataset has no recorded streams, or no segment of them yet, or another version of the
             environment or of LeRobot made it, or a revision is asked of a folder.
-        DatasetFileError: a file of `meta/` in `root` is missing.
+        DatasetFileError: a file of the dataset in `root` is missing; of one that is streamed, of its `meta/`.
     """
 
     def __init__(
@@ -143,6 +143,8 @@ class StreamDataset:
                     f"revision={revision} is of the Hub, and {repo_id} is in {self.meta.root}: leave revision out,"
                     " or move that folder"
                 )
+            if root is not None and not streaming:
+                check_files_are_there(self.meta, Path(root))
             self._dataset = None if streaming else LeRobotDataset(repo_id, root=root, revision=revision)
         except (DatasetsError, pa.ArrowInvalid) as error:
             if root is not None:
@@ -168,11 +170,7 @@ class StreamDataset:
         if not self._is_snapshot:
             # A folder that was empty has the metadata alone.
             return (self.meta.root / "data").is_dir()
-        episodes = range(self.meta.total_episodes)
-        files = {self.meta.get_data_file_path(episode) for episode in episodes}
-        for camera in self.meta.video_keys:
-            files |= {self.meta.get_video_file_path(episode, camera) for episode in episodes}
-        return all((self.meta.root / file).is_file() for file in files)
+        return not missing_files(self.meta)
 
     @property
     def _is_snapshot(self) -> bool:
@@ -305,14 +303,19 @@ class StreamDataset:
         # A killed recording may have left rows behind that it had not counted yet.
         return pa.concat_tables(tables).slice(0, self.meta.total_frames).to_pandas()
 
-    def check(self) -> None:
+    def check(self, *, is_finished: bool = True) -> None:
         """Check that every stream is whole.
+
+        Args:
+            is_finished: also that all streams end at the same step, which those of a recording that was killed,
+                or goes on, need not.
 
         Raises:
             StreamError: a step is missing or there twice, or an annotation is wrong.
         """
         columns = [*COLUMNS, *({EXPERT} & self.meta.features.keys())]
-        check(self.annotations(columns), self.meta.total_frames, self.meta.total_episodes)
+        frames = self.annotations(columns)
+        check(frames, self.meta.total_frames, self.meta.total_episodes, is_finished=is_finished)
 
     def _episodes(self) -> pd.DataFrame:
         """One row per segment: LeRobot's columns and ours."""

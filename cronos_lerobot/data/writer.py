@@ -27,7 +27,7 @@ from cronos_lerobot.data.origin import Origin, check_same, marked, read_origin, 
 from cronos_lerobot.data.schema import Features, frame_format
 from cronos_lerobot.data.storage import INCOMPLETE, Shard, next_shard_index, truncate
 from cronos_lerobot.data.video import MAX_FILE_DURATION_S, VideoFile, fast_encoder
-from cronos_lerobot.dataset_metadata import open_metadata
+from cronos_lerobot.dataset_metadata import check_path, open_metadata
 from cronos_lerobot.locks import FolderLock
 
 FLUSH_INTERVAL_S = 20.0
@@ -97,7 +97,9 @@ class SegmentWriter:
         Raises:
             FileExistsError: `root` exists.
             OSError: it cannot be made, or another process writes to it.
+            ValueError: LeRobot could not read what is in a folder of this path.
         """
+        check_path(Path(root))
         has_video = any(feature["dtype"] == "video" for feature in features.values())
         with ExitStack() as on_failure:
             self._lock = on_failure.enter_context(FolderLock(root))

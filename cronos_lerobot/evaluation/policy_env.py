@@ -8,10 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from huggingface_hub import try_to_load_from_cache
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.datasets import CODEBASE_VERSION
 from lerobot.datasets.utils import INFO_PATH
-from lerobot.utils.constants import HF_LEROBOT_HOME, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from lerobot_env_cronos import CronosEnvConfig
 from lerobot_env_cronos.scene.model import CAMERAS
 from lerobot_env_cronos.scene.scenes import SCENES, get_scene
@@ -56,7 +58,7 @@ def trained_scene(path: Path | None) -> dict[str, str]:
             raise ValueError(f"the policy in {path} was trained in a scene that is not here: {error}") from error
     dataset = config.get("dataset") or {}
     if scene is None and isinstance(repo_id := dataset.get("repo_id"), str):
-        scene = scene_of_dataset(repo_id, dataset.get("root"))
+        scene = scene_of_dataset(repo_id, dataset.get("root"), dataset.get("revision"))
     return {"scene": scene} if scene in SCENES else {}
 
 
@@ -73,7 +75,7 @@ def trained_renderer(path: Path | None) -> dict[str, str]:
     renderer = env.get("renderer") if env.get("type", "cronos") == "cronos" else None
     if isinstance(repo_id := dataset.get("repo_id"), str):
         # The environment beside it is that of LeRobot's evaluations alone.
-        origin = _origin_of_dataset(repo_id, dataset.get("root"))
+        origin = _origin_of_dataset(repo_id, dataset.get("root"), dataset.get("revision"))
         renderer = (origin.flags if origin else {}).get("env.renderer", renderer)
     return {"renderer": renderer} if renderer else {}
 
@@ -90,20 +92,37 @@ def _train_config(path: Path | None) -> dict[str, Any]:
     return json.loads(file.read_text()) if file.is_file() else {}
 
 
-def scene_of_dataset(repo_id: str, root: Path | str | None) -> str | None:
-    """The scene of a dataset on this machine, in `root` or LeRobot's cache; None if there is none that says it."""
-    origin = _origin_of_dataset(repo_id, root)
+def scene_of_dataset(repo_id: str, root: Path | str | None, revision: str | None = None) -> str | None:
+    """The scene of a dataset on this machine; None if there is none that says it.
+
+    Args:
+        repo_id: its name, "owner/name".
+        root: its folder; None looks where LeRobot keeps its datasets, then among those that it has downloaded.
+        revision: of a downloaded one; None is that of LeRobot's format.
+    """
+    origin = _origin_of_dataset(repo_id, root, revision)
     return origin.scene if origin else None
 
 
-def _origin_of_dataset(repo_id: str, root: Path | str | None) -> Origin | None:
-    folder = Path(root or HF_LEROBOT_HOME / repo_id)
+def _origin_of_dataset(repo_id: str, root: Path | str | None, revision: str | None = None) -> Origin | None:
     try:
+        folder = Path(root) if root else _find_dataset(repo_id, revision)
         features = json.loads((folder / INFO_PATH).read_text())["features"]
         return read_origin(folder, features, f"dataset {repo_id}")
     except (OSError, ValueError, KeyError):
         # Not here, of another version, or not of these scenes at all.
         return None
+
+
+def _find_dataset(repo_id: str, revision: str | None) -> Path:
+    """The folder in which LeRobot finds a dataset without asking the Hub."""
+    folder = HF_LEROBOT_HOME / repo_id
+    if (folder / INFO_PATH).is_file():
+        return folder
+    info = try_to_load_from_cache(
+        repo_id, INFO_PATH, HF_LEROBOT_HUB_CACHE, revision or CODEBASE_VERSION, repo_type="dataset"
+    )
+    return Path(info).parents[1] if isinstance(info, str) else folder
 
 
 def check_observations(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:

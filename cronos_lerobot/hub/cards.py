@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import operator
 import os
+import re
 import shlex
 from collections.abc import Iterable
 from importlib import resources
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import jinja2
@@ -17,6 +18,8 @@ from cronos_lerobot.provenance import git_commit, package_versions
 
 PACKAGED = Path(__file__).parent / "cards"
 CHECKOUT = Path(__file__).parents[2] / "datasets_cards"
+PATHS = r"""(?<=['"])/[^'"]+|(?<=[\s=:,\[{(])/(?!/)[^\s'",\]})]+"""
+"""Absolute paths among other things, as in a list; in quotes they may have spaces. No addresses, `https://...`."""
 
 
 def render_card(kind: str, **values: Any) -> str:
@@ -65,11 +68,20 @@ def code(text: Any) -> str:
 def command_line(words: Iterable[str]) -> str:
     """A command, one flag a line, without the folders of whoever ran it."""
     words = list(words)
-    parts = [shlex.quote(_without_home(word)) for word in words[1:]]
+    parts = [shlex.quote(without_folders(word)) for word in words[1:]]
     return " \\\n    ".join([words[0], *parts]) if words else ""
 
 
-def _without_home(word: str) -> str:
-    """`~` in place of the home folder: a card is public."""
+def without_folders(word: str) -> str:
+    """A word of a command with `~` for the home folder, and `.../name` for absolute paths: a card is public."""
     home = os.path.expanduser("~")
-    return word.replace(home, "~") if len(home) > 1 else word
+    if len(home) > 1:
+        word = re.sub(rf"(?<![\w.-]){re.escape(home)}(?![^/\s'\",\]])", "~", word)
+    flag, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
+    if value.startswith("/"):
+        return f"{flag}{equals}{_last_part(value)}"
+    return re.sub(PATHS, lambda path: _last_part(path[0]), word)
+
+
+def _last_part(path: str) -> str:
+    return f".../{PurePosixPath(path).name}"

@@ -136,7 +136,8 @@ class PolicyConfig(PublishConfig):
     results: Path | None = None
     """results.json of cronos-eval, or its folder, for the card."""
     scene: str | None = None
-    """Scene of a policy that lerobot-train made, for the card; cronos-train's checkpoints know theirs."""
+    """Scene of a policy that lerobot-train made, for the card; by default that of its dataset, if it is on this
+    machine. cronos-train's checkpoints know theirs."""
     license: str | None = None
     """License of the policy, as the Hub calls it; by default that of its config (--policy.license of the
     training), or apache-2.0, or none where it was trained from another repository, whose license holds."""

@@ -7,14 +7,18 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import (
+    ACTION,
+    POLICY_POSTPROCESSOR_DEFAULT_NAME,
+    POLICY_PREPROCESSOR_DEFAULT_NAME,
+)
 from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 from matplotlib.figure import Figure
 from safetensors import SafetensorError, safe_open
 
 from cronos_lerobot.agents.steering.steered import STEERING
 from cronos_lerobot.evaluation.config import EXPERT
-from cronos_lerobot.evaluation.policy_env import trained_renderer
+from cronos_lerobot.evaluation.policy_env import trained_renderer, trained_scene
 from cronos_lerobot.evaluation.policy_source import files_fingerprint
 from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.hub.cards import render_card
@@ -37,8 +41,15 @@ from cronos_lerobot.report import figures
 from cronos_lerobot.report.png import to_png
 from cronos_lerobot.report.runs import TrainingRun, group_runs
 
-REPLACES = ["curves/*", "*.safetensors", "*.json", "tokenizer.model", "merges.txt", "vocab.txt"]
-"""Also what a policy of another kind has left: an actor that steers or adapters would be loaded with this one."""
+REPLACES = [
+    "curves/*", "config.json", "train_config.json", "model.safetensors", "model.safetensors.index.json",
+    "model-*-of-*.safetensors", f"{POLICY_PREPROCESSOR_DEFAULT_NAME}*", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}*",
+    "adapter_config.json", "adapter_model.safetensors", STEERING, "tokenizer.json", "tokenizer.model",
+    "tokenizer_config.json", "special_tokens_map.json", "added_tokens.json", "merges.txt", "vocab.json",
+    "vocab.txt",
+]  # fmt: skip
+"""Also what a policy of another kind has left: an actor that steers or adapters would be loaded with this one. No
+file that is not a policy's: others may lie beside it."""
 LICENSE = "apache-2.0"
 """As LeRobot says of a policy that names none."""
 FIGURES = {
@@ -149,9 +160,11 @@ def _card(
     base_model = config.base_policy or (str(base) if is_on_hub else None) or adapters_of
     env = trained.get("env") or {}
     renderer = trained_renderer(checkpoint.model).get("renderer")
-    if config.scene and env.get("scene") and config.scene != env["scene"]:
-        raise ValueError(f"--scene={config.scene}, but the policy was trained in {env['scene']}")
-    scene = env.get("scene") or config.scene or (results or {}).get("scene")
+    # A scene of one's own, which may not be registered here, is in the config; that of a clone in its dataset.
+    trained_in = env.get("scene") or trained_scene(checkpoint.model).get("scene")
+    if config.scene and trained_in and config.scene != trained_in:
+        raise ValueError(f"--scene={config.scene}, but the policy was trained in {trained_in}")
+    scene = trained_in or config.scene or (results or {}).get("scene")
     if results and results["scene"] != scene:
         raise ValueError(f"--results={config.results} is of {results['scene']}, the policy of {scene}")
     return render_card(

@@ -57,6 +57,7 @@ def push_folder(
     replaces: Sequence[str] = (),
     tag: str | None = None,
     creates: bool = True,
+    parent_commit: str | None = None,
 ) -> str:
     """Make the repository what `folder` is; files that are there already are not sent again.
 
@@ -68,12 +69,14 @@ def push_folder(
             of files at the root alone.
         tag: to put onto the result, moved if it is there.
         creates: make the repository if it is not there.
+        parent_commit: that the branch must still be at, where what is pushed was made from it.
 
     Returns:
         The URL of the repository.
 
     Raises:
-        PublishError: the Hub refused, or the connection was lost; pushing again goes on with what is missing.
+        PublishError: the Hub refused, the branch is at another commit than `parent_commit`, or the connection was
+            lost; pushing again goes on with what is missing.
     """
     if not sys.stderr.isatty():
         disable_progress_bars()
@@ -96,6 +99,7 @@ def push_folder(
             revision=target.branch,
             commit_message=message,
             delete_patterns=[escape(file) for file in replaced(there, replaces)] or None,
+            parent_commit=parent_commit,
         )
         if tag:
             _move_tag(api, target, tag)
@@ -164,6 +168,8 @@ def _explain(error: BaseException, target: Target) -> str | None:
         return f"there is no {where} on {hub}, or the token gives no access to it"
     if status == 403:
         return f"the token may not write to {where} on {hub}"
+    if status == 412:
+        return f"{where} on {hub} was changed meanwhile, nothing was pushed: run the same command again"
     if isinstance(error, HfHubHTTPError) and status is not None and status < 500:
         return f"{hub} refused: {error}"
     if isinstance(error, HfHubHTTPError | LocalEntryNotFoundError | httpx.TransportError):

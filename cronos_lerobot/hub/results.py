@@ -31,25 +31,50 @@ STANDARD = {"advance": "window", "end_effector_reset": False}
 """How the benchmark's chains are run; another way is another score."""
 
 
-def write_results(config: ResultsConfig, folder: Path) -> str:
-    """Write the repository's results with the new ones among them into `folder`; returns what they are, in words.
+def read_own_results(config: ResultsConfig) -> dict[str, Any]:
+    """Read results.json of the policy in the repository that the results go to.
 
     Raises:
-        ValueError: the results are not of this benchmark, or not of all of it.
-        PublishError: the policy's repository is missing, has other weights now than were evaluated, or its results
-            cannot be read.
+        ValueError: --results is missing, or they are of another policy.
+        FileNotFoundError: there is none.
     """
     if config.results is None:
         raise ValueError("--results=<results.json of cronos-eval, or its folder> is required")
     results = read_results(config.results)
     check_policy(results, config.repo_id)
+    return results
+
+
+def find_commit(config: ResultsConfig) -> str | None:
+    """The commit that the results are written onto: who pushes them names it, as others may push meanwhile.
+
+    Raises:
+        PublishError: the policy's repository or the revision is missing.
+    """
     with explained(config.target):
-        revision = _revision(config)
-        _check_commit(results, config.repo_id, revision)
+        return HfApi().model_info(config.repo_id, revision=_revision(config)).sha
+
+
+def write_results(config: ResultsConfig, folder: Path, *, results: dict[str, Any], commit: str | None) -> str:
+    """Write the repository's results with the new ones among them into `folder`; returns what they are, in words.
+
+    Args:
+        config: what to publish.
+        folder: to write into.
+        results: of `read_own_results`.
+        commit: of the repository, whose results and policy are read.
+
+    Raises:
+        ValueError: the results are not of this benchmark, or not of all of it.
+        PublishError: the policy's repository has other weights now than were evaluated, or its results cannot be
+            read.
+    """
+    with explained(config.target):
+        _check_commit(results, config.repo_id, commit)
         policy = _read_policy(config.repo_id, results["policy_revision"])
     benchmark = _load(config, results)
     entries = make_entries(results, benchmark, config, changes_of_policy(results, policy))
-    content = merge(_published(config, revision), eval_result_entries_to_yaml(entries))
+    content = merge(_published(config, commit), eval_result_entries_to_yaml(entries))
     path = folder / FILE
     path.parent.mkdir(parents=True)
     path.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=110))
@@ -77,10 +102,10 @@ def check_policy(results: dict[str, Any], repo_id: str) -> None:
         )
 
 
-def _check_commit(results: dict[str, Any], repo_id: str, revision: str | None) -> None:
-    """Check that the policy of the commit that was evaluated is the one that stands at `revision`."""
+def _check_commit(results: dict[str, Any], repo_id: str, commit: str | None) -> None:
+    """Check that the policy of the commit that was evaluated is the one that stands at `commit`."""
     evaluated = results["policy_revision"]
-    if _policy_files(repo_id, evaluated) != _policy_files(repo_id, revision):
+    if _policy_files(repo_id, evaluated) != _policy_files(repo_id, commit):
         raise PublishError(
             f"the results are of {repo_id} as it was at {evaluated}, which has another policy now: evaluate it"
             " again, in a new --output_dir"
@@ -210,14 +235,11 @@ def _notes(suite: str, scores: dict[str, Any], results: dict[str, Any]) -> list[
     return [f"n={scores['n']}", *what, how, f"seed {results['seed']}", results["obs_type"], ", ".join(packages)]
 
 
-def _published(config: ResultsConfig, revision: str | None) -> list[dict[str, Any]]:
-    """The entries that the repository has."""
-    api = HfApi()
+def _published(config: ResultsConfig, commit: str | None) -> list[dict[str, Any]]:
+    """The entries that the repository has at a commit; without a connection an older one of the cache is none."""
     with explained(config.target):
-        # By its commit: without a connection an older one of the cache is none.
-        commit = api.model_info(config.repo_id, revision=revision).sha
         try:
-            path = api.hf_hub_download(config.repo_id, FILE, revision=commit)
+            path = HfApi().hf_hub_download(config.repo_id, FILE, revision=commit)
         except RemoteEntryNotFoundError:
             return []
     try:

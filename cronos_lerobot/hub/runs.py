@@ -10,7 +10,7 @@ from huggingface_hub import constants
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 
-from cronos_lerobot.hub.cards import command_line
+from cronos_lerobot.hub.cards import command_line, without_folders
 from cronos_lerobot.protocol.config import COUNTED_INTERVENTIONS
 from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.report.protocol_names import describe_protocol
@@ -117,7 +117,7 @@ def run_facts(run: TrainingRun) -> dict[str, Any]:
         "commit_then": run.starts[-1]["git_commit"],
         "command": command_line(run.starts[0]["command"]),
         "num_starts": len(run.starts),
-        "changed": [f"{name}={values}" for name, values in run.changed.items()],
+        "changed": [without_folders(f"{name}={values}") for name, values in run.changed.items()],
     }
 
 

@@ -82,9 +82,12 @@ def publish_policy(config: PolicyConfig) -> None:
 def publish_results(config: ResultsConfig) -> None:
     """`cronos-publish results`."""
     config.validate()
-    from cronos_lerobot.hub.results import write_results
+    from cronos_lerobot.hub.results import find_commit, read_own_results, write_results
 
-    _publish(config, write_results, creates=False)
+    results = read_own_results(config)
+    commit = find_commit(config)
+    write = partial(write_results, results=results, commit=commit)
+    _publish(config, write, creates=False, parent_commit=commit)
 
 
 def _publish(

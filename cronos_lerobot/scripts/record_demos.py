@@ -31,6 +31,7 @@ from cronos_lerobot.data.demos import DemoCollector, DemoConfig, ExpertError, ta
 from cronos_lerobot.data.origin import DEMONSTRATIONS, flags_of, origin_of
 from cronos_lerobot.data.schema import demonstration_features, feature_names
 from cronos_lerobot.data.writer import RecordingError, SegmentWriter
+from cronos_lerobot.dataset_metadata import check_path
 from cronos_lerobot.evaluation.policy_source import files_fingerprint, find_policy
 from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.report.stream_video import PolicySpectator, load_spectator
@@ -186,10 +187,13 @@ def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv, source: Path | Non
         FileExistsError: the folder exists and neither flag is set.
         FileNotFoundError: there is nothing to resume.
         FolderInUseError: another process writes to it.
-        ValueError: the dataset to resume was recorded in another scene, with other flags or after another policy.
+        ValueError: the dataset to resume was recorded in another scene, with other flags or after another policy;
+            or LeRobot could not read what is in a folder of this path.
     """
     root = cfg.dataset.root
     assert root is not None
+    # Before anything is deleted.
+    check_path(root)
     policy = None if source is None else files_fingerprint(source)
     origin = origin_of(env, DEMONSTRATIONS, flags_of(cfg), policy)
     if cfg.resume:

@@ -12,6 +12,7 @@ from lerobot_env_cronos.scene.scenes import CONTROL_HZ
 
 from cronos_lerobot.data.video import MAX_FILE_DURATION_S, check_video_size
 from cronos_lerobot.data.writer import FLUSH_INTERVAL_S
+from cronos_lerobot.dataset_metadata import check_path
 
 
 @dataclass
@@ -77,7 +78,8 @@ class RecordConfig:
 
         Raises:
             ValueError: more streams are to be recorded than there are, or none; pictures that no video has, or
-                more in a segment than one has; or how is said, but not what.
+                more in a segment than one has; into a folder in which LeRobot cannot read them; or how is said,
+                but not what.
             OSError: a dataset cannot be made: it exists, or its folder cannot be written to.
         """
         if self.repo_id is None:
@@ -101,6 +103,8 @@ class RecordConfig:
             # Only the checkpoint knows whether there is one to go on with, or it had stopped.
             return
         root = self.root_in(output_dir)
+        # Filmed streams lie beside it, under its name with a size.
+        check_path(root)
         if env.obs_type == "pixels_agent_pos":
             size = (env.observation_height, env.observation_width)
             check_video_size("--env.observation_height and --env.observation_width", size)

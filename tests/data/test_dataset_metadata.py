@@ -1,6 +1,7 @@
 """A folder that holds a dataset is never filled up from the Hub; what another LeRobot wrote is said to be that."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.data.writer import SegmentWriter
 from cronos_lerobot.dataset_metadata import DatasetFileError, versions_explained
 
+FRONT = "observation.images.front"
 OPEN = {
     "streams": lambda root: StreamDataset("me/stream", root, streaming=True),
     "resume": lambda root: SegmentWriter.resume("me/stream", root),
@@ -30,10 +32,16 @@ def files(root: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in root.rglob("*") if path.is_file()}
 
 
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    root = tmp_path_factory.mktemp("recorded") / "d"
+    record(root, flush_at=())
+    return root
+
+
 @pytest.fixture
-def root(tmp_path):
-    record(tmp_path / "d", flush_at=())
-    return tmp_path / "d"
+def root(recorded, tmp_path):
+    return shutil.copytree(recorded, tmp_path / "d")
 
 
 @pytest.mark.parametrize("opens", OPEN)
@@ -44,6 +52,40 @@ def test_what_is_missing_of_a_folder_is_named_and_the_rest_stays(root, opens, lo
     with pytest.raises(DatasetFileError, match=rf"^{root}/{lost.split('/chunk')[0]} is missing$"):
         OPEN[opens](root)
     assert files(root) == before
+
+
+LOADED = OPEN | {"streams": lambda root: StreamDataset("me/stream", root)}
+
+
+@pytest.mark.parametrize("opens", ["streams", "demos"])
+@pytest.mark.parametrize("lost", ["data/chunk-000/file-000.parquet", f"videos/{FRONT}/chunk-000/file-000.mp4"])
+def test_a_missing_data_or_video_file_is_named_and_the_rest_stays(root, opens, lost):
+    """LeRobot would download the Hub's dataset over it."""
+    (root / lost).unlink()
+    before = files(root)
+    with pytest.raises(DatasetFileError, match=rf"^{root / lost} is missing$"):
+        LOADED[opens](root)
+    assert files(root) == before
+
+
+def test_what_lerobot_has_downloaded_into_a_folder_it_may_complete(root, monkeypatch):
+    (lost,) = root.glob("data/*/*.parquet")
+    content = lost.read_bytes()
+    lost.unlink()
+    (root / ".cache/huggingface/download").mkdir(parents=True)
+    monkeypatch.setattr("lerobot.datasets.lerobot_dataset.get_safe_version", lambda *_: "v3.0")
+    downloads = "lerobot.datasets.lerobot_dataset.snapshot_download"
+    monkeypatch.setattr(downloads, lambda *_, **__: lost.write_bytes(content))
+    assert len(LOADED["streams"](root).dataset) == 96
+
+
+@pytest.mark.parametrize("opens", ["streams", "demos"])
+def test_without_an_episode_nothing_is_downloaded(tmp_path, opens):
+    SegmentWriter("me/stream", tmp_path / "d", features(), FPS).finalize()
+    before = files(tmp_path / "d")
+    with pytest.raises(ValueError, match=r"has no episode yet$"):
+        LOADED[opens](tmp_path / "d")
+    assert files(tmp_path / "d") == before
 
 
 @pytest.mark.parametrize("opens", OPEN)

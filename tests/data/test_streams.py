@@ -149,6 +149,15 @@ def test_what_is_missing_is_named(tmp_path, skip, message):
         StreamDataset("me/stream", tmp_path / "d", streaming=True).check()
 
 
+def test_a_recording_that_broke_off_is_not_whole(tmp_path):
+    """Killed after a flush that had two segments of stream 2 and all eight of the others."""
+    record(tmp_path / "d", skip=[(2, k) for k in range(2, 8)])
+    streams = StreamDataset("me/stream", tmp_path / "d", streaming=True)
+    with pytest.raises(StreamError, match=r"^stream 2 ends after 8 steps, stream 0 after 32: the recording"):
+        streams.check()
+    streams.check(is_finished=False)
+
+
 @pytest.mark.parametrize(
     ("column", "row", "value", "message"),
     [

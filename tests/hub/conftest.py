@@ -94,6 +94,21 @@ def hub(served: Hub) -> Iterator[Hub]:
     served.faults = Faults()
 
 
+@pytest.fixture
+def here(hub: Hub, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Hub:
+    """The Hub, for what runs in this process, with a cache that is empty."""
+    # What huggingface_hub has read of the environment when it was imported.
+    constants = {
+        "ENDPOINT": hub.url,
+        "HUGGINGFACE_CO_URL_TEMPLATE": f"{hub.url}/{{repo_id}}/resolve/{{revision}}/{{filename}}",
+        "HF_HUB_CACHE": str(tmp_path / "cache"),
+    }
+    for name, value in constants.items():
+        monkeypatch.setattr(f"huggingface_hub.constants.{name}", value)
+    monkeypatch.setenv("HF_TOKEN", "any")
+    return hub
+
+
 @pytest.fixture(scope="session")
 def commands(served: Hub, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Commands]:
     """Commands against the Hub."""

@@ -6,6 +6,7 @@ import hashlib
 import threading
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 TIME_FORMAT = "%Y-%m-%dT%H:%M:%S.000Z"
 
@@ -76,6 +77,12 @@ class Repository:
         self.commits[commit.oid] = commit
         self.branches[branch] = commit.oid
         return commit
+
+    def commit_folder(self, folder: Path, branch: str = "main") -> Commit:
+        """Add a commit with the files of a folder, as if they had been pushed."""
+        paths = [path for path in folder.rglob("*") if path.is_file()]
+        added = {str(path.relative_to(folder)): File(path.read_bytes(), is_lfs=False) for path in paths}
+        return self.commit(branch, f"Add {folder.name}", added, [])
 
     def history(self, revision: str) -> list[Commit]:
         """Commits of a revision, the latest first."""

@@ -287,12 +287,12 @@ class Handler(BaseHTTPRequestHandler):
         self._commit_of(repository, revision)
         added: dict[str, File] = {}
         deleted: list[str] = []
-        message = ""
+        message, parent = "", None
         for line in self._read().splitlines():
             item = json.loads(line)
             value = item["value"]
             if item["key"] == "header":
-                message = value["summary"]
+                message, parent = value["summary"], value.get("parentCommit")
             elif item["key"] == "file":
                 added[value["path"]] = File(base64.b64decode(value["content"]), is_lfs=False)
             elif item["key"] == "lfsFile":
@@ -302,6 +302,8 @@ class Handler(BaseHTTPRequestHandler):
             else:
                 deleted.append(value["path"])
         with self.hub.lock:
+            if parent not in (None, self._commit_of(repository, revision).oid):
+                raise HubError(412, "", "A commit has happened since. Please refresh and try again.")
             commit = repository.commit(revision, message, added, deleted)
         url = f"{self.hub.url}/{'datasets/' if kind == 'datasets' else ''}{name}/commit/{commit.oid}"
         return self._json({"commitOid": commit.oid, "commitUrl": url, "success": True, "hookOutput": ""})

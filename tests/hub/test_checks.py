@@ -184,6 +184,10 @@ def test_results_of_a_folder_called_like_a_repository_are_refused():
 
 def test_a_policy_that_is_pushed_again_leaves_nothing_that_would_be_loaded_with_it():
     there = ["steering.safetensors", "adapter_model.safetensors", "adapter_config.json", "tokenizer.model",
-             "curves/old.png", ".eval_results/me_bench.yaml", "README.md", ".gitattributes", "requirements.txt",
-             "LICENSE.txt", "checkpoints/5000/model.safetensors", "onnx/config.json"]  # fmt: skip
-    assert replaced(there, REPLACES) == there[:5]
+             "curves/old.png", "config.json", "model-00001-of-00002.safetensors", "model.safetensors.index.json",
+             "policy_preprocessor_step_5_normalizer_processor.safetensors",
+             "policy_postprocessor.json"]  # fmt: skip
+    kept = [".eval_results/me_bench.yaml", "README.md", ".gitattributes", "requirements.txt", "LICENSE.txt",
+            "checkpoints/5000/model.safetensors", "onnx/config.json", "notes.json", "demo_actions.safetensors",
+            "model_of_mine.safetensors", "policy_notes.json", "dataset_statistics.json"]  # fmt: skip
+    assert replaced([*there, *kept], REPLACES) == there

@@ -1,11 +1,14 @@
 """Entries of `.eval_results/cronos.yaml`, from numbers that are known."""
 
 import json
+from dataclasses import replace
 
 import pytest
 from lerobot_env_cronos.benchmark.benchmark import draw_benchmark
 from lerobot_env_cronos.scene.scenes import Task
 from safetensors.numpy import save_file
+from synthetic_streams import ORIGIN
+from synthetic_streams import record as record_streams
 
 from cronos_lerobot.evaluation.results import independent_results, sequential_results
 from cronos_lerobot.hub.benchmark import choose_benchmark
@@ -191,13 +194,15 @@ def test_where_a_policy_may_be(tmp_path):
         find_checkpoint(tmp_path)
 
 
-def write_clone(model, env):
+def write_clone(model, env, **dataset):
     """A checkpoint of lerobot-train; without an `env` in its config, as after training on demonstrations alone."""
     model.mkdir(parents=True)
     actions = {"action": {"type": "ACTION", "shape": [7]}}
     (model / "config.json").write_text(json.dumps({"type": "cronos_mlp", "output_features": actions}))
     save_file({}, model / "model.safetensors")
-    (model / "train_config.json").write_text(json.dumps({"env": env, "dataset": {"repo_id": "me/demos"}}))
+    (model / "train_config.json").write_text(
+        json.dumps({"env": env, "dataset": {"repo_id": "me/demos"} | dataset})
+    )
     return model
 
 
@@ -224,6 +229,19 @@ def test_a_card_for_another_scene_is_refused(tmp_path):
     config = PolicyConfig(path=write_clone(tmp_path / "model", {"scene": "kitchen_3x3"}), scene="kitchen_2x2")
     with pytest.raises(ValueError, match="--scene=kitchen_2x2, but the policy was trained in kitchen_3x3"):
         write_policy_repository(config, tmp_path)
+
+
+def test_the_scene_of_a_clone_is_that_of_its_demonstrations(tmp_path):
+    record_streams(
+        tmp_path / "demos", steps=4, origin=replace(ORIGIN, environment="lerobot_env_cronos/playroom_2x2-v1")
+    )
+    model = write_clone(tmp_path / "model", None, root=str(tmp_path / "demos"))
+    (tmp_path / "repository").mkdir()
+    write_policy_repository(PolicyConfig(repo_id="me/clone", path=model), tmp_path / "repository")
+    card = (tmp_path / "repository/README.md").read_text()
+    assert "lerobot-eval --policy.path=me/clone --env.type=cronos --env.scene=playroom_2x2 --env.obs_type=" in card
+    with pytest.raises(ValueError, match="--scene=kitchen_2x2, but the policy was trained in playroom_2x2"):
+        write_policy_repository(PolicyConfig(path=model, scene="kitchen_2x2"), tmp_path / "repository")
 
 
 def test_what_can_be_a_repository(tmp_path, monkeypatch):

@@ -72,6 +72,14 @@ def test_filters_one_after_the_other_are_all_told(recorded, tmp_path):
     assert (FAILS in card, TABLE in card) == (False, False)
 
 
+def test_a_recording_that_broke_off_is_told(recorded, tmp_path):
+    record(tmp_path / "cut", skip=[(1, 7)])
+    assert "not whole here" not in card_of(recorded, tmp_path / "whole")
+    card = card_of(tmp_path / "cut", tmp_path / "out")
+    assert "The streams are not whole here (stream 1 ends after 28 steps, stream 0 after 32: the" in card
+    assert "whole and in order" not in card
+
+
 def test_a_filters_note_that_is_damaged_is_named(recorded, tmp_path):
     root = tmp_path / "filtered"
     filter_streams(StreamDataset("me/stream", recorded), SegmentFilter(streams=[0]), "me/filtered", root)

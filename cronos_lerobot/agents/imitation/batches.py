@@ -19,7 +19,7 @@ from cronos_lerobot.agents.base import Batch
 from cronos_lerobot.agents.imitation.config import DemosConfig
 from cronos_lerobot.agents.imitation.memory import Segment, SegmentMemory
 from cronos_lerobot.agents.processing import EMPTY_CAMERA
-from cronos_lerobot.dataset_metadata import open_metadata
+from cronos_lerobot.dataset_metadata import check_files_are_there, open_metadata
 
 
 def segment_batch(draws: Sequence[tuple[Segment, int]], config: PreTrainedConfig) -> Batch:
@@ -65,7 +65,8 @@ class Demonstrations:
         beside: shapes of what the run observes, if batches will have both.
 
     Raises:
-        ValueError: the dataset lacks a column that the policy reads, has it in another shape, or cannot be read.
+        ValueError: the dataset lacks a column that the policy reads, has it in another shape, cannot be read, or
+            lacks a file in the folder that it is in.
         FileNotFoundError: there is no such dataset.
     """
 
@@ -73,6 +74,8 @@ class Demonstrations:
         self, config: DemosConfig, policy: PreTrainedConfig, beside: Mapping[str, tuple[int, ...]] | None = None
     ) -> None:
         meta = _open_metadata(config)
+        if config.root is not None:
+            check_files_are_there(meta, config.root)
         wanted = _check_columns(config, policy, meta.features)
         _check_pictures(config, meta.features, wanted, beside or {})
         deltas = resolve_delta_timestamps(policy, meta)
