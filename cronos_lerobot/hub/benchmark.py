@@ -87,7 +87,8 @@ def _describe(table: pa.Table, pictures: list[bytes] | None) -> pa.Table:
     features = datasets.Features.from_arrow_schema(table.schema)
     if pictures is not None:
         features["picture"] = datasets.Image()
-    return table.cast(features.arrow_schema)
+    described = features.arrow_schema
+    return table.cast(described.with_metadata((table.schema.metadata or {}) | described.metadata))
 
 
 def _eval_yaml(benchmark: Benchmark, title: str) -> str:

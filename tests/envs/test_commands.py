@@ -78,6 +78,35 @@ def test_a_wrong_flag_ends_in_a_sentence(monkeypatch, capsys, command, flags, me
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("command", "flags", "advice"),
+    [
+        (freeze, ("orderings", "garage"), "lerobot_env_<name>, or give --discover_packages_path=<package>\n"),
+        (ceiling, ("--scene=garage",), "lerobot_env_<name>, or give --discover_packages_path=<package>\n"),
+        # It has no such flag.
+        (speed, ("--scene=garage",), "install it as lerobot_env_<name>\n"),
+    ],
+)
+def test_the_advice_for_an_unknown_scene_works(monkeypatch, capsys, command, flags, advice):
+    with pytest.raises(SystemExit, match="2"):
+        run(monkeypatch, command, *flags)
+    assert capsys.readouterr().err.endswith(advice)
+
+
+@pytest.mark.usefixtures("registries")
+def test_a_scene_of_an_installed_plugin_is_found(tmp_path, monkeypatch, capsys):
+    (tmp_path / "lerobot_env_attic.py").write_text(
+        "from lerobot_env_cronos import Scene, register_scene\n"
+        'register_scene(Scene("attic", ("ketchup bottle",), ("cloth",)))\n'
+    )
+    installed = tmp_path / "lerobot_env_attic-1.0.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: lerobot_env_attic\nVersion: 1.0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    run(monkeypatch, freeze, "orderings", "attic", "--output", tmp_path)
+    assert json.loads((tmp_path / "attic.json").read_text())["tasks"] == ["put the ketchup bottle on the cloth"]
+
+
 def test_the_ceiling_has_its_folder_before_it_measures(tmp_path, monkeypatch, capsys):
     class MeasuredError(Exception):
         pass

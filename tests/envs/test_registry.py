@@ -6,14 +6,14 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
-from lerobot_env_cronos import SCENES, Body, CronosEnvConfig, CronosVectorEnv, Scene, gymnasium_id, register_scene
+from lerobot_env_cronos import SCENES, Body, CronosEnvConfig, CronosVectorEnv, Scene, register_scene
 from lerobot_env_cronos.benchmark import configurations
 from lerobot_env_cronos.benchmark.configurations import (
-    _files,
     _load_splits,
     footprint_corners,
     footprint_gap,
     load_configurations,
+    write_configurations,
 )
 from lerobot_env_cronos.expert.ceiling import run_segment
 from lerobot_env_cronos.expert.expert import ScriptedExpert
@@ -26,25 +26,21 @@ BLOCK = Body("red block", (0.03, 0.03, 0.03), 600, "box", (0.8, 0.1, 0.1))
 COASTER = Body("blue coaster", (0.09, 0.09, 0.005), 900, "disc", (0.1, 0.3, 0.8))
 SCENE = Scene("study_2x1", ("red block", "ketchup bottle"), ("blue coaster",))
 STATE = "environment_state_agent_pos"
+pytestmark = pytest.mark.usefixtures("registries")
 
 
-@pytest.fixture(autouse=True)
-def registries():
-    """All registries are afterwards what they were before."""
-    registries = (SCENES, BODIES, _files)
-    before = [dict(registry) for registry in registries]
-    yield
-    for registry, content in zip(registries, before):
-        registry.clear()
-        registry.update(content)
-    gym.registry.pop(gymnasium_id(SCENE.name), None)
+def write_file(folder, bodies=SCENE.bodies, n=64, **changed):
+    """A file of configurations: the same one 64 times, but for the block's x and, by split, y.
 
-
-def write_file(folder, bodies=SCENE.bodies, n=64):
-    """A file of configurations: the same one 64 times, but for the block's x."""
-    block = [[0.25 + 0.001 * i, 0.0, 0.015, 1, 0, 0, 0] for i in range(n)]
+    The pose of the block that `changed` gives for a split takes the place of its fifth one.
+    """
     others = [[0.3, 0.1, 0.0104, 1, 0, 0, 0], [0.3, -0.1, 0.0025, 1, 0, 0, 0]]
-    splits = {split: [[pose, *others] for pose in block] for split in ("train", "held_out")}
+    splits = {}
+    for split, y in (("train", 0.0), ("held_out", 0.01)):
+        block = [[0.25 + 0.001 * i, y, 0.015, 1, 0, 0, 0] for i in range(n)]
+        if split in changed:
+            block[5] = changed[split]
+        splits[split] = [[pose, *others] for pose in block]
     path = folder / "mine.json"
     path.write_text(json.dumps({"version": 0, "bodies": bodies, "splits": splits}))
     return path
@@ -211,7 +207,6 @@ def test_a_scene_may_be_written_with_lists():
     scene = Scene("study_lists", ["toy bear"], ["newspaper"], spawn_low=[0.2, -0.15])
     assert scene == Scene("study_lists", ("toy bear",), ("newspaper",))
     register_scene(scene)
-    gym.registry.pop(gymnasium_id("study_lists"))
     assert load_configurations("study_lists", "train").shape == (64, 2, 7)
 
 
@@ -235,13 +230,70 @@ def test_a_file_of_something_else_is_refused(tmp_path, bodies, n, message):
     assert "red block" not in BODIES
 
 
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (
+            {"train": [0.9, 0, 0.015, 1, 0, 0, 0]},
+            r"split train of .*, row 5: the red block at \[0.9, 0.0\] m is out of",
+        ),
+        (
+            {"held_out": [0.25, 0, 0.015, 2, 0, 0, 0]},
+            "split held_out of .*, row 5: the red block has a quaternion of",
+        ),
+        (
+            {"train": [0.25, 0, None, 1, 0, 0, 0]},
+            "split train of .*, row 5: the red block has a pose that is not fin",
+        ),
+        # As deep as the coaster is thick, on whose place it is put.
+        (
+            {"train": [0.3, -0.1, 0.015, 1, 0, 0, 0]},
+            r"row 5: the blue coaster stands 5\.0 mm deep in the red block",
+        ),
+        # 2 and 3 mm from the training configuration 0.
+        (
+            {"held_out": [0.252, 0.003, 0.015, -1, 0, 0, 0]},
+            "held_out of .*, row 5: the same as training configuration 0",
+        ),
+    ],
+)
+def test_a_file_is_checked_row_by_row(tmp_path, changed, message):
+    with pytest.raises(ValueError, match=message):
+        register_scene(SCENE, bodies=[BLOCK, COASTER], configurations=write_file(tmp_path, **changed))
+    assert "study_2x1" not in SCENES
+    assert not {"red block", "blue coaster"} & BODIES.keys()
+
+
+def test_a_scene_keeps_its_configurations(tmp_path):
+    kitchen = load_configurations("kitchen_2x2", "held_out").copy()
+    easy = json.loads(write_configurations("kitchen_2x2", tmp_path, seed=1).read_text())
+    (tmp_path / "easy.json").write_text(json.dumps(easy))
+    with pytest.raises(
+        ValueError, match=r"of kitchen_2x2 come with the package, not from .*easy.json: write a bench"
+    ):
+        register_scene(SCENES["kitchen_2x2"], configurations=tmp_path / "easy.json")
+    np.testing.assert_array_equal(load_configurations("kitchen_2x2", "held_out"), kitchen)
+    path = write_file(tmp_path)
+    register_scene(SCENE, bodies=[BLOCK, COASTER], configurations=path)
+    mine = load_configurations("study_2x1", "train")
+    (tmp_path / "copy").mkdir()
+    others = write_file(tmp_path / "copy", train=[0.35, 0.0, 0.015, 1, 0, 0, 0])
+    with pytest.raises(
+        ValueError, match=r"study_2x1 is registered already, with other configurations than .*mine.js"
+    ):
+        register_scene(SCENE, bodies=[BLOCK, COASTER], configurations=others)
+    (tmp_path / "moved").mkdir()
+    for again in (path, None, write_file(tmp_path / "moved")):
+        register_scene(SCENE, bodies=[BLOCK, COASTER], configurations=again)
+        np.testing.assert_array_equal(load_configurations("study_2x1", "train"), mine)
+
+
 def test_bodies_that_do_not_fit_are_an_error(monkeypatch):
     monkeypatch.setattr("lerobot_env_cronos.benchmark.configurations.MAX_ATTEMPTS", 20)
     crowded = Scene(
         "crowded", ("ketchup bottle",), ("yellow plate", "cloth"), spawn_low=(0.3, 0.0), spawn_high=(0.32, 0.02)
     )
     register_scene(crowded)
-    gym.registry.pop(gymnasium_id("crowded"))
     with pytest.raises(ValueError, match="crowded: 3 bodies do not fit"):
         load_configurations("crowded", "train")
 
@@ -260,7 +312,6 @@ def test_bodies_that_hardly_ever_fit_are_told_from_the_first_tries(monkeypatch):
     monkeypatch.setattr(configurations, "_try_configuration", lambda *scene: tries.append(1) or place(*scene))
     objects = ("ketchup bottle", "kitchen shovel", "toy bear", "plastic bottle")
     register_scene(Scene("crowded", objects, ("yellow plate", "cloth", "carpet", "newspaper")))
-    gym.registry.pop(gymnasium_id("crowded"))
     with pytest.raises(ValueError, match=r"crowded: 8 bodies do not fit into the spawn area \(0\.2, -0\.15\) to"):
         load_configurations("crowded", "train")
     assert len(tries) <= 40

@@ -5,7 +5,8 @@ from typing import Any, TypeGuard
 
 from lerobot.envs.configs import EnvConfig, HubEnvConfig
 
-from lerobot_env_cronos.benchmark.files import fetch_benchmark
+from lerobot_env_cronos.benchmark.files import check_tag, fetch_benchmark
+from lerobot_env_cronos.benchmark.load import load_benchmark
 from lerobot_env_cronos.config import CronosEnvConfig
 
 
@@ -23,11 +24,13 @@ class CronosHubEnvConfig(CronosEnvConfig, HubEnvConfig):
     def _build(self) -> None:
         if not self.hub_path:
             raise ValueError("env.type=cronos_hub needs env.hub_path: <owner>/<repository>[@<revision>]")
-        folder, _ = fetch_benchmark(self.hub_path.partition(":")[0], repo_type="model")
+        name = self.hub_path.partition(":")[0]
+        folder, _ = fetch_benchmark(name, repo_type="model")
         if self.benchmark not in (None, str(folder)):
             raise ValueError(f"env.benchmark is that of env.hub_path={self.hub_path}; got {self.benchmark!r}")
         self.benchmark = str(folder)
         super()._build()
+        check_tag(load_benchmark(self.benchmark, self.scene), name)
 
 
 def is_of_this_package(env: Any) -> TypeGuard[CronosEnvConfig]:

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from math import perm
+from typing import Any
 
 import numpy as np
 
@@ -17,10 +18,12 @@ from lerobot_env_cronos.benchmark.configurations import (
     SPLITS,
     check_split,
     load_configurations,
+    redraw_shared,
     sample_configurations,
 )
 from lerobot_env_cronos.benchmark.orderings import draw_balanced, is_training_cycle, load_orderings
 from lerobot_env_cronos.benchmark.version import gymnasium_id
+from lerobot_env_cronos.scene.bodies import describe_collisions
 from lerobot_env_cronos.scene.scenes import BODIES, STEPS_PER_TASK, Scene, Task, get_scene
 
 SUITES = ("independent", "sequential")
@@ -78,9 +81,13 @@ class Benchmark:
     @property
     def fingerprint(self) -> str:
         """A hash of everything that decides a result: version, bodies, poses, tasks, chains; not `source`."""
+        return self.fingerprint_with(describe_bodies(self.scene))
+
+    def fingerprint_with(self, bodies: list[dict[str, Any]]) -> str:
+        """The fingerprint that it has where `describe_bodies` says so of its scene."""
         content = {
             "environment": gymnasium_id(self.scene.name),
-            "bodies": [asdict(BODIES[name]) for name in self.scene.bodies],
+            "bodies": bodies,
             "window_steps": STEPS_PER_TASK,
             "episodes": {
                 f"{suite}/{split}": [
@@ -94,6 +101,12 @@ class Benchmark:
         for split in SPLITS:
             digest.update(np.ascontiguousarray(self.configurations[split], dtype="<f8").tobytes())
         return digest.hexdigest()[:16]
+
+
+def describe_bodies(scene: Scene) -> list[dict[str, Any]]:
+    """Everything about the registered bodies of a scene that decides a result, as JSON holds it."""
+    bodies = [BODIES[name] for name in scene.bodies]
+    return json.loads(json.dumps([asdict(body) | describe_collisions(body) for body in bodies]))
 
 
 def packaged_benchmark(scene_name: str) -> Benchmark:
@@ -139,6 +152,7 @@ def draw_benchmark(
         split: sample_configurations(scene, num_configurations, rng)
         for split, rng in zip(SPLITS, of_splits, strict=True)
     }
+    poses["held_out"] = redraw_shared(scene, poses["held_out"], poses["train"], of_splits[1])
     drawn = draw_balanced(len(scene.tasks), length, num_orderings, of_orderings)
     orderings = [tuple(scene.tasks[i] for i in ordering) for ordering in drawn]
     return _cross(scene, poses, orderings, f"drawn with seed {seed}")

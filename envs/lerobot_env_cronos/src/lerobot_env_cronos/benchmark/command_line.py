@@ -3,16 +3,28 @@
 import argparse
 from importlib import import_module
 
-from lerobot_env_cronos.scene.scenes import Scene, get_scene
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_env_cronos.scene.scenes import SCENES, Scene, describe_unknown_scene
+
+FLAG = "--discover_packages_path"
+"""Names the package to import first, in commands that have it."""
 
 
 def find_scene(parser: argparse.ArgumentParser, name: str, package: str | None = None) -> Scene:
-    """The scene `name`, which `package` registers if one is given; without it the command ends in a sentence."""
+    """The scene `name`, of this package or an installed plugin, or registered by `package` if one is given.
+
+    Without such a scene the command ends in a sentence.
+    """
     try:
         if package is not None:
             import_module(package)
-        return get_scene(name)
     except ModuleNotFoundError as error:
-        parser.error(f"--discover_packages_path={package}: {error}")
+        parser.error(f"{FLAG}={package}: {error}")
     except ValueError as error:
         parser.error(str(error))
+    if name not in SCENES and package is None:
+        register_third_party_plugins()
+    if name not in SCENES:
+        parser.error(describe_unknown_scene(name, FLAG if FLAG in parser.format_usage() else None))
+    return SCENES[name]

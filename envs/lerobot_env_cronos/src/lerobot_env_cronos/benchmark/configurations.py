@@ -10,11 +10,13 @@ import json
 from collections.abc import Callable
 from functools import cache
 from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 
 import numpy as np
 
-from lerobot_env_cronos.scene.scenes import BODIES, Scene, get_scene
+from lerobot_env_cronos.benchmark.poses import find_bad_row, find_shared_row, make_overlap_finder
+from lerobot_env_cronos.scene.scenes import BODIES, SCENES, Scene, get_scene
 
 SPLITS = ("train", "held_out")
 NUM_CONFIGURATIONS = 64
@@ -50,24 +52,41 @@ def load_configurations(scene_name: str, split: str) -> np.ndarray:
 
 
 def set_configurations_file(scene: Scene, path: Path) -> None:
-    """Read the configurations of `scene` from `path` from now on.
+    """Read the configurations of `scene`, whose bodies are registered, from `path` from now on.
 
     Raises:
-        ValueError: the file is of other bodies, or a split has not 64 configurations.
+        ValueError: the scene is the package's or registered, with other configurations; the file is of other
+            bodies, a split has not 64 configurations, or one of these cannot be used.
     """
-    _load_splits(scene, path)
-    _files[scene.name] = path
+    advice = (
+        "write a benchmark of others (lerobot_env_cronos.benchmark.files.write_benchmark) and give --env.benchmark"
+    )
+    if _packaged_file(scene).is_file():
+        raise ValueError(f"the configurations of {scene.name} come with the package, not from {path}: {advice}")
+    splits = _load_splits(scene, path)
+    if scene.name not in SCENES:
+        _files[scene.name] = path
+    elif any((splits[split] != load_configurations(scene.name, split)).any() for split in SPLITS):
+        raise ValueError(
+            f"{scene.name} is registered already, with other configurations than {path} has: {advice}"
+        )
+
+
+def _packaged_file(scene: Scene) -> Traversable:
+    return resources.files("lerobot_env_cronos").joinpath(f"data/{scene.name}.json")
 
 
 @cache
 def _load_splits(scene: Scene, path: Path | None) -> dict[str, np.ndarray]:
-    packaged = resources.files("lerobot_env_cronos").joinpath(f"data/{scene.name}.json")
+    packaged = _packaged_file(scene)
     if path is not None or packaged.is_file():
         content = json.loads((path or packaged).read_text())
         _check_content(scene, content, path or packaged)
     else:
         content = _generate(scene, SEED)
-    splits = {split: np.array(content["splits"][split]) for split in SPLITS}
+    splits = {split: np.array(content["splits"][split], dtype=float) for split in SPLITS}
+    if path is not None:
+        _check_poses(scene, splits, path)
     for poses in splits.values():
         poses.flags.writeable = False
     return splits
@@ -84,6 +103,15 @@ def _check_content(scene: Scene, content: dict, source: object) -> None:
     for split in SPLITS:
         if np.shape((splits or {}).get(split, ())) != shape:
             raise ValueError(f"split {split} of {source} must be of shape {shape}")
+
+
+def _check_poses(scene: Scene, splits: dict[str, np.ndarray], source: Path) -> None:
+    """What is checked of benchmarks in folders and on the Hub, of a file."""
+    for split in SPLITS:
+        if bad := find_bad_row(scene, splits[split]):
+            raise ValueError(f"split {split} of {source}, row {bad[0]}: {bad[1]}")
+    if shared := find_shared_row(splits["held_out"], splits["train"]):
+        raise ValueError(f"split held_out of {source}, row {shared[0]}: {shared[1]}")
 
 
 def footprint_corners(name: str, xy: np.ndarray, yaw: float) -> np.ndarray:
@@ -161,29 +189,51 @@ def sample_configuration(scene: Scene, rng: np.random.Generator, draw: DrawPlace
         draw: see `sample_place`.
 
     Raises:
-        ValueError: the bodies do not fit into the spawn area, or into where `draw` puts them.
+        ValueError: the bodies do not fit into the spawn area, or into where `draw` puts them, clear of the arm at
+            home.
     """
+    find_overlap, overlap = make_overlap_finder(scene), None
     for _ in range(MAX_RESTARTS):
-        if (poses := _try_configuration(scene, rng, draw)) is not None:
+        poses = _try_configuration(scene, rng, draw)
+        if poses is not None and (overlap := find_overlap(poses)) is None:
             return poses
-    raise _no_fit(scene, draw)
+    raise _no_fit(scene, overlap, draw)
 
 
 def sample_configurations(scene: Scene, number: int, rng: np.random.Generator) -> np.ndarray:
     """Draw poses (number, bodies, 7) as `sample_configuration` does, rounded as they are in files.
 
     Raises:
-        ValueError: the bodies do not fit into the spawn area, or hardly ever.
+        ValueError: the bodies do not fit into the spawn area, clear of the arm at home, or hardly ever.
     """
+    find_overlap, overlap = make_overlap_finder(scene), None
     drawn, restarts = [], 0
     while len(drawn) < number:
         if (poses := _try_configuration(scene, rng)) is not None:
-            drawn.append(poses.round(6))
-            continue
+            poses = poses.round(6)
+            if (overlap := find_overlap(poses)) is None:
+                drawn.append(poses)
+                continue
         restarts += 1
         if restarts >= max(MAX_RESTARTS, MAX_RESTARTS_EACH * (len(drawn) + 1)):
-            raise _no_fit(scene)
+            raise _no_fit(scene, overlap)
     return np.stack(drawn)
+
+
+def redraw_shared(scene: Scene, held_out: np.ndarray, train: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The held-out configurations (n, bodies, 7), others in place of those that are training configurations.
+
+    Raises:
+        ValueError: there are hardly any others.
+    """
+    held_out = held_out.copy()
+    for _ in range(MAX_RESTARTS_EACH * len(held_out)):
+        if (shared := find_shared_row(held_out, train)) is None:
+            return held_out
+        held_out[shared[0]] = sample_configurations(scene, 1, rng)[0]
+    raise ValueError(
+        f"{scene.name}: hardly any configuration is none of the {len(train)} training ones: widen the spawn area"
+    )
 
 
 def _try_configuration(scene: Scene, rng: np.random.Generator, draw: DrawPlace | None = None) -> np.ndarray | None:
@@ -199,19 +249,19 @@ def _try_configuration(scene: Scene, rng: np.random.Generator, draw: DrawPlace |
     return np.stack([poses[body] for body in scene.bodies])
 
 
-def _no_fit(scene: Scene, draw: DrawPlace | None = None) -> ValueError:
+def _no_fit(scene: Scene, overlap: str | None, draw: DrawPlace | None = None) -> ValueError:
     area = "the places that are drawn" if draw else f"the spawn area {scene.spawn_low} to {scene.spawn_high}"
     return ValueError(
         f"{scene.name}: {len(scene.bodies)} bodies do not fit into {area} with {CLEARANCE_M} m between them"
+        f"{f' and clear of the arm at home ({overlap})' if overlap else ''}"
     )
 
 
 def _generate(scene: Scene, seed: int) -> dict:
-    drawn = sample_configurations(scene, len(SPLITS) * NUM_CONFIGURATIONS, np.random.default_rng(seed))
-    splits = {
-        split: [pose.tolist() for pose in drawn[i * NUM_CONFIGURATIONS : (i + 1) * NUM_CONFIGURATIONS]]
-        for i, split in enumerate(SPLITS)
-    }
+    rng = np.random.default_rng(seed)
+    drawn = sample_configurations(scene, len(SPLITS) * NUM_CONFIGURATIONS, rng)
+    train, held_out = np.split(drawn, len(SPLITS))
+    splits = {"train": train.tolist(), "held_out": redraw_shared(scene, held_out, train, rng).tolist()}
     return {"scene": scene.name, "version": POSES_VERSION, "seed": seed, "bodies": scene.bodies, "splits": splits}
 
 

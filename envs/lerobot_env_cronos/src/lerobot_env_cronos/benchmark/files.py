@@ -7,6 +7,8 @@ sequential/{train,held_out}.parquet       one row for each chain
 Files of several parts (`train-00000-of-00002.parquet`), further columns and further files are fine.
 """
 
+import json
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,10 +17,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lerobot_env_cronos.benchmark.benchmark import SUITES, Benchmark, EpisodeGroup
+from lerobot_env_cronos.benchmark.benchmark import SUITES, Benchmark, EpisodeGroup, describe_bodies
 from lerobot_env_cronos.benchmark.configurations import SPLITS
 from lerobot_env_cronos.benchmark.orderings import is_training_cycle
-from lerobot_env_cronos.benchmark.poses import are_same, find_fault, find_overlaps
+from lerobot_env_cronos.benchmark.poses import find_bad_row, find_shared_row
 from lerobot_env_cronos.benchmark.version import check_environment_id, gymnasium_id
 from lerobot_env_cronos.scene.scenes import STEPS_PER_TASK, Scene, Task, get_scene
 
@@ -27,6 +29,10 @@ CONFIGS = (CONFIGURATIONS, *SUITES)
 """The dataset's configs, in the Hub's sense of the word."""
 POSE = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 """Suffixes of the columns of a body: position [m] and quaternion."""
+BODIES_KEY = b"lerobot_env_cronos.bodies"
+"""Of the metadata of the schema of `configurations`: what bodies the poses are of, `describe_bodies` as JSON."""
+TAG = re.compile("benchmark-([0-9a-f]{16})")
+"""Revisions that say which fingerprint they have."""
 
 _INTEGERS = ("configuration", "window_steps", "episode", "task", "chain", "ordering")
 _STRINGS = ("environment", "instruction", "object", "receptacle")
@@ -65,7 +71,8 @@ def make_tables(benchmark: Benchmark) -> dict[tuple[str, str], pa.Table]:
         for body, of_body in zip(benchmark.scene.bodies, poses.transpose(1, 2, 0), strict=True):
             columns |= dict(zip(pose_columns(body), of_body.tolist(), strict=True))
         types |= {name: pa.float64() for name in columns if name not in types}
-        tables[CONFIGURATIONS, split] = pa.table(columns, schema=pa.schema(types))
+        metadata = {BODIES_KEY: json.dumps(describe_bodies(benchmark.scene), sort_keys=True)}
+        tables[CONFIGURATIONS, split] = pa.table(columns, schema=pa.schema(types, metadata))
         for suite in SUITES:
             rows = list(_episode_rows(benchmark, suite, split))
             schema = pa.schema([(name, _TYPES[name]) for name in COLUMNS[suite]])
@@ -158,18 +165,38 @@ def read_benchmark(folder: Path, source: str) -> Benchmark:
 
     Raises:
         BenchmarkError: a file is missing, or a row of one is malformed, of another version, or names what the
-            scene does not have; the message says which row and why.
+            scene does not have; the message says which row and why. Or the scene has other bodies here.
     """
     tables = {(config, split): _read(folder, config, split, source) for config in CONFIGS for split in SPLITS}
     scene = _find_scene(tables)
-    poses = {split: _read_poses(tables[CONFIGURATIONS, split], scene) for split in SPLITS}
-    _check_disjoint(poses, tables[CONFIGURATIONS, "held_out"])
+    placed = {split: tables[CONFIGURATIONS, split] for split in SPLITS}
+    poses = {split: _read_poses(table, scene) for split, table in placed.items()}
     groups = {
         suite: {split: _read_groups(tables[suite, split], scene, suite, len(poses[split])) for split in SPLITS}
         for suite in SUITES
     }
     _check_alike(groups, {suite: tables[suite, "held_out"] for suite in SUITES})
-    return Benchmark(scene, poses, groups["independent"], groups["sequential"], source)
+    benchmark = Benchmark(scene, poses, groups["independent"], groups["sequential"], source)
+    # Before the poses: those of other bodies stand in the table or in the air.
+    for table in placed.values():
+        _check_same_bodies(table, benchmark)
+    _check_poses(placed, benchmark)
+    return benchmark
+
+
+def check_tag(benchmark: Benchmark, name: str) -> Benchmark:
+    """The benchmark, whose fingerprint is that of the revision in `name` (see `fetch_benchmark`) if it has one.
+
+    Raises:
+        BenchmarkError: it has another fingerprint.
+    """
+    tag = TAG.fullmatch(name.partition("@")[2])
+    if tag and tag[1] != benchmark.fingerprint:
+        raise BenchmarkError(
+            f"benchmark {name} has the fingerprint {benchmark.fingerprint} here, not {tag[1]}: its scene "
+            f"{benchmark.scene.name} has other bodies than where it was published, or the tag was moved"
+        )
+    return benchmark
 
 
 class _Table:
@@ -244,21 +271,44 @@ def _read_poses(table: _Table, scene: Scene) -> np.ndarray:
             raise table.fail(i, f"configuration must be {i}, the number of the row, got {number}")
     values = np.array([table.column(name, float) for name in known]).T
     poses = values.reshape(-1, len(scene.bodies), len(POSE))
-    for i, of_row in enumerate(poses):
-        for body, pose in zip(scene.bodies, of_row, strict=True):
-            if why := find_fault(pose):
-                raise table.fail(i, f"the {body} {why}")
-    for i, why in enumerate(find_overlaps(scene, poses)):
-        if why is not None:
-            raise table.fail(i, why)
     poses.flags.writeable = False
     return poses
 
 
-def _check_disjoint(poses: dict[str, np.ndarray], held_out: _Table) -> None:
-    for i, same in enumerate(are_same(poses["held_out"], poses["train"])):
-        if same.any():
-            raise held_out.fail(i, f"the same as training configuration {np.argmax(same)}: it is not held out")
+def _check_poses(tables: dict[str, _Table], benchmark: Benchmark) -> None:
+    """Every configuration can be used, and none is in both splits."""
+    poses = benchmark.configurations
+    for split, table in tables.items():
+        if bad := find_bad_row(benchmark.scene, poses[split]):
+            raise table.fail(*bad)
+    if shared := find_shared_row(poses["held_out"], poses["train"]):
+        raise tables["held_out"].fail(*shared)
+
+
+def _check_same_bodies(table: _Table, benchmark: Benchmark) -> None:
+    """The scene's bodies are those that the benchmark was made with, where the file says which."""
+    text = (table.table.schema.metadata or {}).get(BODIES_KEY)
+    if text is None:
+        return
+    try:
+        there = {body["name"]: body for body in json.loads(text)}
+    except (ValueError, TypeError, KeyError):
+        raise table.fail(None, f"{BODIES_KEY.decode()} must be a JSON list of bodies, got {text!r}") from None
+    here = {body["name"]: body for body in describe_bodies(benchmark.scene)}
+    if list(there.items()) == list(here.items()):
+        return
+    differing = [
+        f"{key} of the {name} is {body.get(key)} here and {there.get(name, {}).get(key)} there"
+        for name, body in here.items()
+        for key in sorted(body.keys() | there.get(name, {}).keys())
+        if body.get(key) != there.get(name, {}).get(key)
+    ] or [f"they are {list(here)} here and {list(there)} there"]
+    published = benchmark.fingerprint_with(list(there.values()))
+    raise table.fail(
+        None,
+        f"its fingerprint is {published} with the bodies that it was made with, and {benchmark.fingerprint} with "
+        f"those of {benchmark.scene.name} here: {'; '.join(differing)}",
+    )
 
 
 def _read_groups(table: _Table, scene: Scene, suite: str, num_configurations: int) -> tuple[EpisodeGroup, ...]:

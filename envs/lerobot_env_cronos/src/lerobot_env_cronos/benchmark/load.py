@@ -4,7 +4,7 @@ from functools import cache
 from pathlib import Path
 
 from lerobot_env_cronos.benchmark.benchmark import Benchmark, packaged_benchmark
-from lerobot_env_cronos.benchmark.files import fetch_benchmark, read_benchmark
+from lerobot_env_cronos.benchmark.files import check_tag, fetch_benchmark, read_benchmark
 from lerobot_env_cronos.scene.scenes import get_scene
 
 
@@ -38,4 +38,4 @@ def benchmark_scene(name: str) -> str:
 def _load(name: str) -> Benchmark:
     if Path(name).is_dir():
         return read_benchmark(Path(name), source=name)
-    return read_benchmark(*fetch_benchmark(name))
+    return check_tag(read_benchmark(*fetch_benchmark(name)), name)

@@ -1,6 +1,6 @@
 """What can be wrong with the poses of somebody else's configurations."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import mujoco
 import numpy as np
@@ -44,25 +44,49 @@ def are_same(poses: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def find_overlaps(scene: Scene, poses: np.ndarray) -> Iterator[str | None]:
-    """For each configuration of `poses` (n, bodies, 7), what stands deepest in what, if anything does.
+    """For each configuration of `poses` (n, bodies, 7), what stands deepest in what, if anything does."""
+    return map(make_overlap_finder(scene), poses)
+
+
+def make_overlap_finder(scene: Scene) -> Callable[[np.ndarray], str | None]:
+    """A function of a configuration (bodies, 7) that says what stands deepest in what, if anything does.
 
     The shapes are those that collide in the simulation, with the arm at home: bodies may lie on one another.
     """
-    model = build_model(scene)
+    model = build_model(scene, looks=False)
     data = mujoco.MjData(model)
-    for configuration in poses:
+
+    def find_overlap(configuration: np.ndarray) -> str | None:
         data.qpos[:] = [*HOME_QPOS, FINGER_OPEN, -FINGER_OPEN, *configuration.ravel()]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
         touching = [c for c in data.contact if set(scene.bodies) & {_name(model, geom) for geom in c.geom}]
         deepest = min(touching, key=lambda contact: contact.dist, default=None)
         if deepest is None or deepest.dist > -MAX_OVERLAP_M:
-            yield None
-            continue
+            return None
         first, second = sorted(
             (_name(model, geom) for geom in deepest.geom), key=lambda name: name not in scene.bodies
         )
-        yield f"the {first} stands {-1000 * deepest.dist:.1f} mm deep in the {second}"
+        return f"the {first} stands {-1000 * deepest.dist:.1f} mm deep in the {second}"
+
+    return find_overlap
+
+
+def find_bad_row(scene: Scene, poses: np.ndarray) -> tuple[int, str] | None:
+    """The first of the configurations (n, bodies, 7) that cannot be used, and why."""
+    for i, configuration in enumerate(poses):
+        for body, pose in zip(scene.bodies, configuration, strict=True):
+            if why := find_fault(pose):
+                return i, f"the {body} {why}"
+    return next(((i, why) for i, why in enumerate(find_overlaps(scene, poses)) if why is not None), None)
+
+
+def find_shared_row(held_out: np.ndarray, train: np.ndarray) -> tuple[int, str] | None:
+    """The first of the held-out configurations (n, bodies, 7) that is a training configuration, and which."""
+    for i, same in enumerate(are_same(held_out, train)):
+        if same.any():
+            return i, f"the same as training configuration {np.argmax(same)}: it is not held out"
+    return None
 
 
 def _name(model: mujoco.MjModel, geom: int) -> str:

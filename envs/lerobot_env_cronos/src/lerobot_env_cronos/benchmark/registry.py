@@ -35,18 +35,27 @@ def register_scene(scene: Scene, bodies: Sequence[Body] = (), configurations: Pa
         bodies: new bodies; `Body.shape` names an entry of `bodies.SHAPES` and `visuals.objects.LOOKS`.
         configurations: JSON file written by `python -m lerobot_env_cronos.benchmark.freeze configurations`;
             without one, 64 training and 64 held-out configurations are drawn from a fixed seed in every process.
+            A scene that is there keeps those it has: others are a benchmark, `files.write_benchmark`.
 
     Raises:
         ValueError: a name is taken by something else or malformed, a shape or a body is unknown, a size, density
             or colour is none, the gripper cannot take an object, the spawn area is not within the workspace and
-            the front camera's view, or the file is of another scene. Nothing is registered then.
+            the front camera's view, the file is of another scene or has a configuration that cannot be used, or
+            the scene is there with other configurations. Nothing is registered then.
     """
     new_bodies = {body.name: body for body in bodies}
     _check(scene, new_bodies)
     known = scene.name in SCENES
-    if configurations is not None:
-        set_configurations_file(scene, Path(configurations))
+    added = new_bodies.keys() - BODIES.keys()
+    # First: configurations are checked with the bodies that they are of.
     BODIES.update(new_bodies)
+    try:
+        if configurations is not None:
+            set_configurations_file(scene, Path(configurations))
+    except Exception:
+        for name in added:
+            del BODIES[name]
+        raise
     SCENES[scene.name] = scene
     if not known:
         _register_gymnasium(scene.name)

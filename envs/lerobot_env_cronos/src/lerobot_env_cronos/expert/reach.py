@@ -96,6 +96,13 @@ def sample_reach_configuration(scene: Scene, rng: np.random.Generator) -> np.nda
     """Draw poses (bodies, 7) of all bodies at rest on the table within reach, no two touching.
 
     Raises:
-        ValueError: the bodies do not fit there.
+        ValueError: the bodies do not fit there, or there is no place within reach.
     """
-    return sample_configuration(scene, rng, find_reach(scene).draw)
+    reach = find_reach(scene)
+    if not reach.within.any():
+        tallest = max(scene.objects, key=lambda name: BODIES[name].size[2])
+        raise ValueError(
+            f"nothing is within reach in {scene.name}: there is no place on the table over which the arm can "
+            f"carry the {tallest}, {BODIES[tallest].size[2]} m tall"
+        )
+    return sample_configuration(scene, rng, reach.draw)

@@ -5,6 +5,7 @@ Looks are added by `lerobot_env_cronos.scene.visuals`; only the geometry here ha
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -84,6 +85,8 @@ SHAPES: dict[str, Callable[[mujoco.MjsBody, Body], None]] = {
     "disc": _add_plate,
 }
 """How to build a body, by `Body.shape`; another shape is another entry here and in `visuals.objects.LOOKS`."""
+_PACKAGED = dict(SHAPES)
+"""Those of this package, whatever is entered later: a name and its function."""
 
 
 def narrowest_width(body: Body) -> float:
@@ -91,9 +94,7 @@ def narrowest_width(body: Body) -> float:
 
     That is where a hand that points down can hold it, as a shovel by its handle.
     """
-    spec = mujoco.MjSpec()
-    add_body(spec, body)
-    model = spec.compile()
+    model = _compile(body)
     widths = []
     for g in np.flatnonzero(model.geom_contype):
         rotation = np.empty(9)
@@ -102,6 +103,35 @@ def narrowest_width(body: Body) -> float:
         is_level = np.abs(rotation.reshape(3, 3)[2]) <= MAX_CLOSING_TILT
         widths += (2 * model.geom_aabb[g, 3:][is_level]).tolist()
     return min(widths)
+
+
+def describe_collisions(body: Body) -> dict[str, Any]:
+    """What is known of a body only by compiling it: nothing, unless its shape is none of this package's.
+
+    Returns:
+        Mass [kg], principal moments of inertia [kg m^2], and type, size [m], position [m], quaternion and friction
+        of every geom that collides; rounded, for the last bits differ between processors.
+    """
+    if SHAPES[body.shape] is _PACKAGED.get(body.shape):
+        return {}
+    model = _compile(body)
+    part = model.body(body.name)
+    geoms = [_describe_geom(model, g) for g in np.flatnonzero(model.geom_contype | model.geom_conaffinity)]
+    mass, *inertia = (float(f"{value:.6g}") for value in (*part.mass, *part.inertia))
+    return {"mass": mass, "inertia": inertia, "geoms": geoms}
+
+
+def _describe_geom(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
+    names = ("size", "pos", "quat", "friction")
+    # Zero has a sign, which JSON would show.
+    numbers = {name: (getattr(model, f"geom_{name}")[geom].round(6) + 0.0).tolist() for name in names}
+    return {"type": mujoco.mjtGeom(model.geom_type[geom]).name} | numbers
+
+
+def _compile(body: Body) -> mujoco.MjModel:
+    spec = mujoco.MjSpec()
+    add_body(spec, body)
+    return spec.compile()
 
 
 def add_body(spec: mujoco.MjSpec, body: Body) -> mujoco.MjsBody:
