@@ -268,8 +268,9 @@ class LearningAgent(Agent):
     def state_dict(self) -> dict[str, Any]:
         """What the agent needs to go on bit for bit, beside policy, optimizer and the context's generators.
 
-        All processes call it, and the first one's answer, which covers all streams, is kept: nested dicts and
-        lists of tensors, numbers and strings.
+        All processes call it, once before the run as well, and the first one's answer, which covers all streams,
+        is kept: nested dicts, lists and tuples of tensors, NumPy arrays, numbers, strings and None. They come back
+        as they were, tensors on the CPU; anything else is refused.
         """
         return {}
 

@@ -18,6 +18,11 @@ from torch import Tensor
 
 from cronos_lerobot.agents.base import Batch
 
+PLANS_FROM_PLANS = ("tdmpc", "lingbot_va")
+"""Types of policies whose plans depend on the plans before them."""
+Rows = Callable[[list[int]], Batch]
+"""Makes the preprocessed batch of some observations by their numbers, ascending; see `PolicyProcessors.rows`."""
+
 
 class Player(Protocol):
     """Chooses one action for each stream at a time; streams are numbered by whoever asks."""
@@ -29,8 +34,16 @@ class Player(Protocol):
         """What streams `ids` see from now on has nothing to do with what they saw before."""
         ...
 
-    def act(self, batch: Batch, ids: Sequence[int]) -> Tensor:
-        """Return normalised actions (k, A) of streams `ids` (k,) for their preprocessed observations."""
+    def act(self, batch: Batch | Rows, ids: Sequence[int]) -> Tensor:
+        """Return normalised actions (k, A) of streams `ids` (k,) for their preprocessed observations.
+
+        Args:
+            batch: k of them, or what makes them: it is not asked where nobody looks.
+            ids: the streams.
+
+        Raises:
+            ValueError: some of the streams plan, and which of the batch is theirs cannot be said.
+        """
         ...
 
 
@@ -61,14 +74,15 @@ class ChunkPlayer:
             self._queues.pop(i, None)
             self._frames.pop(i, None)
 
-    def act(self, batch: Batch, ids: Sequence[int]) -> Tensor:
+    def act(self, batch: Batch | Rows, ids: Sequence[int]) -> Tensor:
         """See `Player`."""
         ids = [int(i) for i in ids]
         idle = [row for row, i in enumerate(ids) if not self._queues[i]]
         if self._history > 1:
-            self._look(batch, ids)
+            self._look(_whole(batch, len(ids)), ids)
         if idle:
-            chunks = self._plan(self._past(batch, ids, idle))[:, : self._num_steps]
+            frames = [_some(batch, idle, len(ids))] if self._history == 1 else self._past(ids, idle)
+            chunks = self._plan(frames)[:, : self._num_steps]
             for row, chunk in zip(idle, chunks, strict=True):
                 self._queues[ids[row]].extend(chunk)
         return torch.stack([self._queues[i].popleft() for i in ids])
@@ -76,12 +90,10 @@ class ChunkPlayer:
     def _look(self, batch: Batch, ids: list[int]) -> None:
         for row, i in enumerate(ids):
             frames = self._frames[i]
-            frames.extend([take_rows(batch, [row])] * (1 if frames else self._history))
+            frames.extend([_some(batch, [row], len(ids))] * (1 if frames else self._history))
 
-    def _past(self, batch: Batch, ids: list[int], rows: list[int]) -> list[Batch]:
+    def _past(self, ids: list[int], rows: list[int]) -> list[Batch]:
         """The observations of some rows, oldest first."""
-        if self._history == 1:
-            return [batch if len(rows) == len(ids) else take_rows(batch, rows)]
         frames = zip(*(self._frames[ids[row]] for row in rows), strict=True)
         return [join_rows(frame) for frame in frames]
 
@@ -99,22 +111,23 @@ class SharedPlayer:
         """Forget everything: LeRobot can only clear the memory for all streams at once."""
         self._is_new |= len(ids) > 0
 
-    def act(self, batch: Batch, ids: Sequence[int]) -> Tensor:
+    def act(self, batch: Batch | Rows, ids: Sequence[int]) -> Tensor:
         """See `Player`."""
         # Only now: an evaluation in between has left its own plans in the policy.
         if self._is_new:
             self._policy.reset()
             self._is_new = False
-        return self._policy.select_action(batch)
+        return self._policy.select_action(_whole(batch, len(ids)))
 
 
 def make_player(policy: Any) -> ChunkPlayer | SharedPlayer:
     """Return what plays a LeRobot policy as its own `select_action` does, each stream by itself where that can be.
 
-    It cannot where a plan depends on the plans before it: ACT's temporal ensemble, TD-MPC's warm start.
+    It cannot where a plan depends on the plans before it: ACT's temporal ensemble, TD-MPC's warm start, the cache
+    of LingBot-VA.
     """
     config = policy.config
-    if getattr(config, "temporal_ensemble_coeff", None) is not None or config.type == "tdmpc":
+    if getattr(config, "temporal_ensemble_coeff", None) is not None or config.type in PLANS_FROM_PLANS:
         return SharedPlayer(policy)
     policy.reset()
     observed = {key: queue.maxlen or 1 for key, queue in _queues(policy).items() if key != ACTION}
@@ -134,7 +147,30 @@ def make_player(policy: Any) -> ChunkPlayer | SharedPlayer:
         except NotImplementedError:
             return policy.select_action(frames[-1]).unsqueeze(1)
 
-    return ChunkPlayer(plan, max(observed.values(), default=1), getattr(config, "n_action_steps", None))
+    # GR00T plays fewer than its config says, where the model that it began with was made to.
+    num_steps = getattr(policy, "_action_queue_steps", getattr(config, "n_action_steps", None))
+    return ChunkPlayer(plan, max(observed.values(), default=1), num_steps)
+
+
+def _whole(batch: Batch | Rows, count: int) -> Batch:
+    return batch if isinstance(batch, dict) else batch(list(range(count)))
+
+
+def _some(batch: Batch | Rows, rows: list[int], count: int) -> Batch:
+    """Some rows of a batch of `count`. A text is padded to the longest of all, whoever plans."""
+    whole = _whole(batch, count)
+    if len(rows) == count:
+        return whole
+    packed = [key for key, value in whole.items() if isinstance(value, Tensor) and value.shape[:1] != (count,)]
+    if not packed:
+        return take_rows(whole, rows)
+    if not isinstance(batch, dict):
+        return batch(rows)
+    # Such as all patches of all pictures, one after the other.
+    raise ValueError(
+        f"{packed[0]!r} has the shape {tuple(whole[packed[0]].shape)} for {count} observations, and does not say "
+        "whose is what: give `PolicyProcessors.rows` in place of a batch, if the policy does not look back."
+    )
 
 
 def take_rows(batch: Batch, rows: list[int]) -> Batch:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.configs import FeatureType, NormalizationMode
-from lerobot.processor import TokenizerProcessorStep
+from lerobot.processor import RelativeActionsProcessorStep, TokenizerProcessorStep
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_LANGUAGE, OBS_STATE, OBS_STR
 
 from cronos_lerobot.agents.base import Batch, Columns
@@ -79,6 +79,20 @@ class PolicyProcessors:
                 batch[name] = tensor.float()
         return self.preprocessor(batch)
 
+    def rows(self, columns: Columns, instructions: list[str]) -> Callable[[list[int]], Batch]:
+        """Return what makes the policy's batch of some of these observations, by their numbers in ascending order.
+
+        For a `Player`, which asks for those that it plans for, when it does.
+        """
+
+        def make(rows: list[int]) -> Batch:
+            if len(rows) == len(instructions):
+                return self.batch(columns, instructions)
+            some = {name: column[rows] for name, column in columns.items()}
+            return self.batch(some, [instructions[row] for row in rows])
+
+        return make
+
     def encode(self, columns: Columns, instructions: list[str]) -> Columns:
         """Return the columns that a rollout keeps: the policy's encodings, or the raw observations."""
         if self._encoder is None:
@@ -132,7 +146,12 @@ class OncePerText:
 
 
 def make_processors(policy: Any, preprocessor: Any, postprocessor: Any) -> PolicyProcessors:
-    """Return the processors of a LeRobot policy that is on its device."""
+    """Return the processors of a LeRobot policy that is on its device.
+
+    Raises:
+        ValueError: its actions are relative to the state that a chunk was planned on.
+    """
+    _check_absolute(policy, preprocessor)
     for step in getattr(preprocessor, "steps", ()):
         if isinstance(step, TokenizerProcessorStep) and not isinstance(step.input_tokenizer, OncePerText):
             step.input_tokenizer = OncePerText(step.input_tokenizer)
@@ -142,6 +161,18 @@ def make_processors(policy: Any, preprocessor: Any, postprocessor: Any) -> Polic
     uint8_images = getattr(policy, "takes_uint8_images", False) and mode == NormalizationMode.IDENTITY
     encoder = getattr(policy, "encode_observation", None)
     return PolicyProcessors(preprocessor, postprocessor, device, uint8_images=uint8_images, encoder=encoder)
+
+
+def _check_absolute(policy: Any, preprocessor: Any) -> None:
+    """LeRobot adds the newest state to relative actions, also to those of a chunk that was planned before it."""
+    steps = getattr(preprocessor, "steps", ())
+    is_enabled = any(isinstance(step, RelativeActionsProcessorStep) and step.enabled for step in steps)
+    if is_enabled or getattr(policy.config, "use_relative_actions", False):
+        raise ValueError(
+            f"--policy.type={policy.config.type} with --policy.use_relative_actions=true plays a chunk of actions "
+            "that are each added to the newest state, not to the one that the chunk was planned on: clone the "
+            "policy with --policy.use_relative_actions=false."
+        )
 
 
 def to_array(name: str, tensor: torch.Tensor) -> np.ndarray:

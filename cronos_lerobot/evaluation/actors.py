@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.factory import make_env_pre_post_processors
-from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
@@ -23,6 +23,7 @@ from cronos_lerobot.agents.history import ObservationHistory, observation_steps
 from cronos_lerobot.agents.processing import PolicyProcessors, make_processors, observation_columns
 from cronos_lerobot.agents.steering.steered import with_steering
 from cronos_lerobot.agents.weights import train_in_float32
+from cronos_lerobot.evaluation.policy_loading import load_policy
 from cronos_lerobot.evaluation.policy_source import damage_named
 
 
@@ -71,7 +72,10 @@ class SamplingPolicy:
     is_per_environment = True
 
     def __init__(self, policy: Any, processors: PolicyProcessors, temperature: float) -> None:
-        self._policy, self._processors, self.temperature = policy.eval(), processors, temperature
+        self._policy, self._processors, self.temperature = policy, processors, temperature
+        # What acts in a policy's place may have no modes, nor a config.
+        if callable(getattr(policy, "eval", None)):
+            policy.eval()
         self._takes_uniform = "uniform" in inspect.signature(policy.sample_actions).parameters
         self._generator = torch.Generator(device=processors.device)
         self._left: dict[int, list[np.ndarray]] = {}
@@ -149,9 +153,9 @@ class SelectingPolicy:
         self, observation: dict[str, Any], instructions: list[str], uniform: np.ndarray, ids: np.ndarray
     ) -> np.ndarray:
         """See `Actor`."""
-        batch = self._processors.batch(observation_columns(observation), instructions)
+        rows = self._processors.rows(observation_columns(observation), instructions)
         with self._autocast():
-            action = self._processors.postprocessor(self._player.act(batch, ids.tolist()))
+            action = self._processors.postprocessor(self._player.act(rows, ids.tolist()))
         return self._after_policy({ACTION: action})[ACTION].to("cpu", torch.float32).numpy()
 
 
@@ -205,11 +209,11 @@ def load_actor(
         rename_map: observations to rename for the policy.
 
     Raises:
-        ValueError: a file of the checkpoint is damaged.
+        ValueError: a file of the checkpoint is damaged, or what its adapters go onto is not found.
     """
     renamed = rename_map or {}
     with damage_named(config.pretrained_path):
-        policy: Any = make_policy(config, env_cfg=env, rename_map=renamed)
+        policy: Any = load_policy(config, env, renamed)
         # As it was trained.
         train_in_float32(policy, config.pretrained_path, config.pretrained_revision)
         processors = make_pre_post_processors(
@@ -233,7 +237,7 @@ def _autocast(policy: Any, processors: PolicyProcessors) -> Any:
     """What `lerobot-eval` does for `--policy.use_amp`: makes a context for each inference."""
 
     def make() -> AbstractContextManager:
-        uses_amp = getattr(policy.config, "use_amp", False)
+        uses_amp = getattr(getattr(policy, "config", None), "use_amp", False)
         return torch.autocast(processors.device.type) if uses_amp else nullcontext()
 
     return make

@@ -41,7 +41,7 @@ def run_independent(
 
     Args:
         env: environments of the evaluation's own, never those of a training stream.
-        policy: a LeRobot policy on its device.
+        policy: a LeRobot policy on its device, or what acts in its place by `sample_actions`.
         processors: between `env` and `policy`.
         n_episodes: configurations of every task, the first ones.
         split: `train` or `held_out`.
@@ -56,14 +56,16 @@ def run_independent(
     processes = processes or Processes()
     (part,) = make_parts(env.benchmark, ["independent"], [split], n_episodes, 0)
     env.split = split
-    was_training, rng_state = policy.training, get_rng_state()
+    # What acts in a policy's place may have no modes.
+    was_training, rng_state = getattr(policy, "training", None), get_rng_state()
     try:
         actor = make_actor(policy, processors, temperature)
         actor.seed(seed + processes.rank)
         own = part.chains[processes.rank :: processes.count]
         results = ChainRunner(env, actor, keeps_states=keeps_states).run(own, part.noise(seed))
     finally:
-        policy.train(was_training)
+        if was_training is not None:
+            policy.train(was_training)
         set_rng_state(rng_state)
     by_chain = {result.chain: result for some in processes.gather(results) for result in some}
     return [by_chain[chain] for chain in part.chains]

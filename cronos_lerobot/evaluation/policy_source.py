@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+from httpx import HTTPError
 from huggingface_hub import HfApi, snapshot_download
 from huggingface_hub.constants import CONFIG_NAME, SAFETENSORS_SINGLE_FILE
 from huggingface_hub.errors import HFValidationError
@@ -99,7 +100,7 @@ def pin_policy(name: str, given: str | None) -> tuple[str, str | None]:
     wanted = revision or given or None
     try:
         return repository, HfApi().model_info(repository, revision=wanted).sha or wanted
-    except (OSError, HFValidationError):
+    except (OSError, HTTPError, HFValidationError):
         # It may be in the cache; who loads it says what is wrong.
         return repository, wanted
 
@@ -167,8 +168,11 @@ def fingerprint(policy: PreTrainedConfig) -> str:
         digest.update(content)
     for field in ("checkpoint", "adapter"):
         if name := getattr(policy, field, None):
-            files = sorted(Path(name).glob("*.safetensors")) if Path(name).is_dir() else []
-            for content in [_hash(file) for file in files] or [_commit(name).encode()]:
+            # As OpenVLA finds it: from here, or from where the training ran.
+            places = (Path(name), *(parent / name for parent in folder.absolute().parents))
+            files = next((sorted(place.glob("*.safetensors")) for place in places if place.is_dir()), [])
+            revision = getattr(policy, f"{field}_revision", None)
+            for content in [_hash(file) for file in files] or [_commit(name, revision).encode()]:
                 digest.update(content)
     return digest.hexdigest()[:16]
 
@@ -197,18 +201,25 @@ def _weights_and_processors(folder: Path) -> Iterator[bytes]:
         yield json.dumps(settings, sort_keys=True).encode()
 
 
+def find_base(folder: Path) -> tuple[str | None, Path | None]:
+    """Of PEFT's adapters in `folder` the policy that they go onto: as they name it, and its folder if it has one.
+
+    The folder may have been named from where the training ran, such as outputs/clone. None, None without adapters.
+    """
+    name = _adapter_config(folder).get(BASE)
+    if not name:
+        return None, None
+    places = (*(parent / name for parent in folder.absolute().parents), Path(name))
+    return name, next((place for place in places if any(place.glob("*.safetensors"))), None)
+
+
 def _base_of_adapters(folder: Path) -> Iterator[bytes]:
     """Of PEFT's adapters the policy that they go onto: its weights in a folder, its name on the Hub."""
-    name, revision = (_adapter_config(folder).get(field) for field in (BASE, REVISION))
-    if not name:
-        return
-    # The folder may have been named from where the training ran, such as outputs/clone.
-    places = (*(parent / name for parent in folder.absolute().parents), Path(name))
-    files = next((files for place in places if (files := sorted(place.glob("*.safetensors")))), None)
-    if files is None:
-        yield f"{name} {revision}".encode()
-    else:
-        yield from (file.name.encode() + _hash(file) for file in files)
+    name, base = find_base(folder)
+    if base is not None:
+        yield from (file.name.encode() + _hash(file) for file in sorted(base.glob("*.safetensors")))
+    elif name is not None:
+        yield f"{name} {_adapter_config(folder).get(REVISION)}".encode()
 
 
 def _adapter_config(folder: Path) -> dict[str, Any]:
@@ -221,9 +232,12 @@ def _hash(file: Path) -> bytes:
         return hashlib.file_digest(content, "sha256").digest()
 
 
-def _commit(repository: str) -> str:
+def _commit(repository: str, revision: str | None) -> str:
     """The commit of a repository on the Hub, or of its copy in the cache where the Hub cannot be reached."""
     try:
-        return HfApi().model_info(repository).sha or repository
-    except OSError:
-        return Path(snapshot_download(repository, local_files_only=True, allow_patterns=["config.json"])).name
+        return HfApi().model_info(repository, revision=revision).sha or repository
+    except (OSError, HTTPError):
+        copied = snapshot_download(
+            repository, revision=revision, local_files_only=True, allow_patterns=["config.json"]
+        )
+        return Path(copied).name

@@ -49,7 +49,7 @@ from safetensors.torch import load_file, save_file
 from torch.optim import Optimizer
 
 from cronos_lerobot.agents.base import LearningAgent
-from cronos_lerobot.agents.state import to_arrays, to_tensors
+from cronos_lerobot.agents.state import agent_state, as_it_was, to_arrays, to_tensors
 from cronos_lerobot.agents.weights import load_weights, weights_file
 from cronos_lerobot.processes import Processes
 from cronos_lerobot.protocol.loop_state import LoopState
@@ -105,7 +105,7 @@ def save_checkpoint(
     folder = Path(config.output_dir) / CHECKPOINTS_DIR
     final = folder / get_step_identifier(run.loop.n, config.total_steps)
     generators = _merge(run.processes.gather_to_main(run.generators.state_dict()))
-    agent = run.agent.state_dict()
+    agent = agent_state(run.agent)
     other_rngs = run.processes.gather_to_main(serialize_rng_state())[1:]
     if not run.processes.is_main:
         return final
@@ -230,7 +230,7 @@ def _load_agent(path: Path) -> dict[str, Any]:
             "--policy.path."
         )
     with _reading(path):
-        return torch.load(path, map_location="cpu")
+        return as_it_was(torch.load(path, map_location="cpu"))
 
 
 def _load_strategies(run: RunState, path: Path) -> None:

@@ -13,7 +13,7 @@ from httpx import HTTPError
 from huggingface_hub import file_exists, hf_hub_download
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
-from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import ACTION
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, SequentialVectorEnv, get_scene
 from lerobot_env_cronos.hub_config import is_of_this_package
@@ -28,6 +28,7 @@ from cronos_lerobot.evaluation.policy_env import (
     scene_of_dataset,
     trained_scene,
 )
+from cronos_lerobot.evaluation.policy_loading import load_policy
 from cronos_lerobot.evaluation.policy_source import UNDECISIVE, damage_named, load_policy_config
 from cronos_lerobot.training.config import CronosTrainConfig
 
@@ -102,7 +103,7 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
         logging.warning("Training a policy from scratch: its states are not normalised, its success starts at 0.")
     with damage_named(path):
         with _pretrained(policy_config, path):
-            loaded = make_policy(policy_config, env_cfg=env_config)
+            loaded = load_policy(policy_config, env_config)
         assert config.policy is not None
         config.policy.input_features = policy_config.input_features
         config.policy.output_features = policy_config.output_features

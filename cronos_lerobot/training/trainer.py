@@ -13,7 +13,7 @@ from lerobot.envs import EnvConfig
 from cronos_lerobot.agents.base import Agent, LearningAgent
 from cronos_lerobot.agents.processing import make_processors
 from cronos_lerobot.agents.registry import AgentContext, make_agent
-from cronos_lerobot.agents.state import to_comparable
+from cronos_lerobot.agents.state import agent_state, to_comparable
 from cronos_lerobot.evaluation.independent import evaluate_independent
 from cronos_lerobot.processes import Processes, bit_sum
 from cronos_lerobot.protocol.loop_state import Event, SegmentEnd, Step, Update
@@ -114,6 +114,7 @@ class Trainer:
         )  # fmt: skip
         # What no checkpoint can hold is told now, and not hours later.
         own_states(self.run_state.strategies)
+        agent_state(self.agent)
         self.statistics = RolloutStatistics([t.instruction for t in self.task_set.all], len(self.task_set.tasks))
         self.critic_log = CriticLog(config.protocol)
         self._smoothed = SmoothedSuccess(config.protocol, len(self.task_set.tasks))

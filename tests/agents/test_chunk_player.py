@@ -2,12 +2,14 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.factory import get_policy_class, make_policy_config
 
 from cronos_lerobot.agents.chunk_player import ChunkPlayer, SharedPlayer, make_player, take_rows
+from cronos_lerobot.agents.processing import PolicyProcessors
 
 
 def play(player, seen, ids=None):
@@ -131,6 +133,80 @@ def test_a_late_stream_does_what_it_does_alone():
             torch.testing.assert_close(found[step][stream], policy.select_action(own)[0], rtol=0, atol=1e-5)
 
 
+def packing(columns, instructions):
+    """As Qwen's processors do it: the patches of all pictures one after the other, `count` of each."""
+    counts = columns["seen"].astype(int)
+    return {
+        "count": torch.from_numpy(counts),
+        "patches": torch.from_numpy(np.repeat(columns["seen"], counts)),
+        "task": instructions,
+    }
+
+
+def test_a_late_stream_gets_its_own_patches():
+    """Stream i sees i + 1 patches of the value i + 1, and is planned for alone from step 2 on."""
+    planned = []
+
+    def plan(frames):
+        (batch,) = frames
+        assert len(batch["patches"]) == batch["count"].sum()
+        planned.append(batch["patches"].tolist())
+        return torch.stack([part.sum() for part in batch["patches"].split(batch["count"].tolist())])[:, None, None]
+
+    processors = PolicyProcessors(lambda batch: packing({"seen": batch["seen"].numpy()}, batch["task"]), None)
+    asked = []
+
+    def rows(wanted):
+        asked.append(wanted)
+        return processors.rows({"seen": np.array([1.0, 2.0, 3.0])}, ["a", "b", "c"])(wanted)
+
+    player = ChunkPlayer(lambda frames: plan(frames).repeat(1, 2, 1))
+    assert player.act(rows, [0, 1, 2])[:, 0].tolist() == [1, 4, 9]
+    player.begin([1])
+    assert player.act(rows, [0, 1, 2])[:, 0].tolist() == [1, 4, 9]
+    assert planned == [[1, 2, 2, 3, 3, 3], [2, 2]]
+    asked.clear()
+    assert player.act(rows, [1])[:, 0].tolist() == [4]
+    assert asked == [], "who has actions left is not looked at"
+    whole = rows([0, 1, 2])
+    assert player.act(whole, [0, 1, 2])[:, 0].tolist() == [1, 4, 9]
+    player.begin([2])
+    with pytest.raises(ValueError, match=r"'patches' has the shape \(6,\) for 3 observations"):
+        player.act(whole, [0, 1, 2])
+
+
+def test_rows_are_those_of_the_whole_batch():
+    """A text is padded to the longest of all streams, whoever plans: a plan is what it was, bit for bit."""
+
+    def preprocess(batch):
+        width = max(map(len, batch["task"]))
+        return batch | {"tokens": torch.tensor([list(map(ord, text.ljust(width))) for text in batch["task"]])}
+
+    planned = []
+
+    def plan(frames):
+        planned.append(frames[0])
+        return torch.zeros(len(frames[0]["task"]), 2, 1)
+
+    state = np.arange(6, dtype=np.float32).reshape(3, 2)
+    rows = PolicyProcessors(preprocess, None).rows({"observation.state": state}, ["a", "bcd", "ef"])
+    player = ChunkPlayer(plan)
+    player.act(rows, [0, 1, 2])
+    player.begin([0, 2])
+    player.act(rows, [0, 1, 2])
+    assert planned[1]["tokens"].tolist() == [[97, 32, 32], [101, 102, 32]]
+    assert planned[1]["observation.state"].tolist() == [[0, 1], [4, 5]]
+
+
+def test_groot_plays_as_many_actions_as_it_queues():
+    """Its `select_action` queues `_action_queue_steps`, which may be fewer than `n_action_steps`."""
+    config = SimpleNamespace(type="groot", n_action_steps=4)
+    policy = SimpleNamespace(config=config, _action_queue_steps=2, reset=lambda: None)
+    policy.predict_action_chunk = lambda batch: batch["observation.state"][:, None] + torch.arange(4.0)[:, None]
+    player = make_player(policy)
+    assert [play(player, [seen]) for seen in (0, 10, 20, 30)] == [[0], [1], [20], [21]]
+
+
 def test_plans_that_depend_on_plans_are_left_to_the_policy():
     config = SimpleNamespace(type="act", temporal_ensemble_coeff=0.01)
     policy = SimpleNamespace(config=config, select_action=lambda batch: batch["x"], resets=[])
@@ -143,5 +219,8 @@ def test_plans_that_depend_on_plans_are_left_to_the_policy():
     assert player.act({"x": 4}, [0]) == 4
     assert len(policy.resets) == 1
     player.begin([1])
-    assert player.act({"x": 5}, [0]) == 5
+    assert player.act(lambda rows: {"x": 5 + len(rows)}, [0]) == 6
     assert len(policy.resets) == 2
+    # Its cache of what was seen and done reaches back to the first chunk.
+    config.type, config.temporal_ensemble_coeff = "lingbot_va", None
+    assert isinstance(make_player(policy), SharedPlayer)

@@ -4,7 +4,7 @@ import torch
 from dummies import DummyPolicy, DummyPolicyConfig, identity_processors
 from lerobot.configs import NormalizationMode
 from lerobot.envs.utils import preprocess_observation
-from lerobot.processor import PolicyProcessorPipeline, TokenizerProcessorStep
+from lerobot.processor import PolicyProcessorPipeline, RelativeActionsProcessorStep, TokenizerProcessorStep
 
 from cronos_lerobot.agents.processing import PolicyProcessors, make_processors, observation_columns
 
@@ -105,3 +105,23 @@ def test_bfloat16_is_refused_by_the_name_of_what_it_is():
     )
     with pytest.raises(TypeError, match=r"the policy's 'features' is bfloat16.*view\(torch.int16\)"):
         processors.encode({"observation.state": np.zeros((1, 2), np.float32)}, ["a"])
+
+
+def test_relative_actions_are_refused():
+    """By the flag, and by what a checkpoint's preprocessor does."""
+    config = DummyPolicyConfig()
+    policy, (preprocessor, postprocessor) = DummyPolicy(config), identity_processors()
+    message = (
+        r"--policy\.type=dummy_linear with --policy\.use_relative_actions=true plays .*: clone the policy with"
+    )
+    for is_enabled in (False, True):
+        steps = [RelativeActionsProcessorStep(enabled=is_enabled)]
+        relative = PolicyProcessorPipeline(steps=steps)
+        if is_enabled:
+            with pytest.raises(ValueError, match=message):
+                make_processors(policy, relative, postprocessor)
+        else:
+            make_processors(policy, relative, postprocessor)
+    config.use_relative_actions = True
+    with pytest.raises(ValueError, match=message):
+        make_processors(policy, preprocessor, postprocessor)

@@ -90,6 +90,15 @@ def test_it_leaves_the_global_generators_and_the_policys_mode_alone():
     assert evaluate(DummyEnv(8), policy, seed=4)["steps"] != first["steps"]
 
 
+def test_what_has_sample_actions_alone_is_evaluated():
+    """An agent's `acting` may be no module: it has no modes and no config."""
+
+    class Acting:
+        rows, sample_actions = 0, ScriptedPolicy.sample_actions
+
+    assert evaluate(DummyEnv(5), Acting()) == evaluate(DummyEnv(5), ScriptedPolicy())
+
+
 def test_a_broken_simulation_ends_its_episode_and_is_no_success():
     whole, broken = (
         evaluate(DummyEnv(8, diverge_at=diverge_at), ScriptedPolicy(), n_episodes=2)
@@ -103,11 +112,6 @@ def test_a_broken_simulation_ends_its_episode_and_is_no_success():
 def test_decisions_of_several_actions_are_played_by_each_environment_for_itself():
     class Counting:
         """Decides on the next three whole numbers after what it sees."""
-
-        config = None
-
-        def eval(self):
-            return self
 
         def sample_actions(self, batch, *, temperature=1.0, generator=None):
             first = batch["observation.state"][:, :1]

@@ -60,8 +60,14 @@ class Adapter(nn.Module):
         return text
 
     def own_parameters(self) -> dict[str, Tensor]:
-        """What is not the policy's, without gradient: noise scales, the critic. A run's checkpoint holds it."""
-        return {name: p.detach() for name, p in self.named_parameters() if not name.startswith("policy.")}
+        """What is not the policy's, without gradient: noise scales, the critic, with the buffers that are saved.
+
+        A run's checkpoint holds it.
+        """
+        saved = self.state_dict(keep_vars=True).keys()
+        buffers = {name: buffer for name, buffer in self.named_buffers() if name in saved}
+        tensors = dict(self.named_parameters()) | buffers
+        return {name: tensor.detach() for name, tensor in tensors.items() if not name.startswith("policy.")}
 
     @torch.no_grad()
     def load_own_parameters(self, parameters: dict[str, Tensor]) -> None:

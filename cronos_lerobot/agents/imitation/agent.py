@@ -81,9 +81,9 @@ class ImitationAgent(LearningAgent):
     def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
         """Choose an action for each of its streams; what it does not know of them is 0."""
         with self._stopwatch("infer"):
-            batch = self._processors.batch(observation_columns(o_t), tau[self._streams])
+            rows = self._processors.rows(observation_columns(o_t), tau[self._streams])
             ids = range(self._streams.stop - self._streams.start)
-            action = self._processors.physical_actions(self._player.act(batch, ids))
+            action = self._processors.physical_actions(self._player.act(rows, ids))
         return plain_sample(action)
 
     def store(

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from httpx import HTTPError
 from huggingface_hub import snapshot_download
+from huggingface_hub.errors import HFValidationError
 from safetensors import safe_open
 
 from lerobot_policy_openvla.architecture import Architecture
@@ -34,10 +37,36 @@ class Checkpoint:
 
 
 def fetch(name: str, revision: str | None = None) -> Path:
-    """Return the folder `name`, or that of the Hub repository of that name, downloaded if need be."""
+    """Return the folder `name`, or that of the Hub repository of that name, downloaded if need be.
+
+    Raises:
+        FileNotFoundError: there is no such folder, and no such repository that can be reached.
+    """
     if Path(name).is_dir():
         return Path(name)
-    return Path(snapshot_download(name, revision=revision, allow_patterns=FILES))
+    try:
+        return Path(snapshot_download(name, revision=revision, allow_patterns=FILES))
+    except (OSError, HTTPError, HFValidationError) as error:
+        # Of a commit the Hub is asked for the list of its files, also offline, unless the cache has that.
+        with suppress(OSError, HTTPError, HFValidationError):
+            return Path(snapshot_download(name, revision=revision, allow_patterns=FILES, local_files_only=True))
+        raise FileNotFoundError(
+            f"{name} is no folder, seen from here or from above the policy that names it, and the Hub did not "
+            f"give it: {error}"
+        ) from error
+
+
+def commit_of(name: str, folder: Path) -> str | None:
+    """The commit of the Hub that `fetch(name)` returned as `folder`; None where `name` is a folder itself."""
+    return None if Path(name).is_dir() else folder.name
+
+
+def seen_from(folder: Path, name: str) -> str:
+    """`name`, or the folder of that name above `folder`: it may have been named from where a training ran."""
+    if Path(name).is_dir():
+        return name
+    above = (parent / name for parent in folder.absolute().parents)
+    return str(next((place for place in above if place.is_dir()), name))
 
 
 def read_checkpoint(name: str, revision: str | None = None) -> Checkpoint:

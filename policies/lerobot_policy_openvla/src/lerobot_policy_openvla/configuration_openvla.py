@@ -10,7 +10,7 @@ from lerobot.optim import AdamWConfig
 
 from lerobot_policy_openvla.action_statistics import choose_statistics
 from lerobot_policy_openvla.architecture import ATTENTION
-from lerobot_policy_openvla.checkpoint import fetch, read_checkpoint, tuned_statistics
+from lerobot_policy_openvla.checkpoint import commit_of, fetch, read_checkpoint, tuned_statistics
 
 Dtype = Literal["auto", "bfloat16", "float32"]
 Quantization = Literal["none", "int8", "nf4"]
@@ -26,7 +26,7 @@ class OpenVLAConfig(PreTrainedConfig):
     """Weights to build on: a Hub repository or folder in the published format (openvla/openvla-7b), or a whole
     OpenVLA in LeRobot's format."""
     checkpoint_revision: str | None = None
-    """Revision of the Hub repository."""
+    """Revision of the Hub repository; null is what it is at when the policy is first built, which is then kept."""
     adapter: str | None = None
     """Trained LoRA adapter in PEFT's format, a Hub repository or folder, that goes onto the checkpoint."""
     merge_adapter: bool = False
@@ -118,7 +118,7 @@ class OpenVLAConfig(PreTrainedConfig):
             )
 
     def resolve(self, dataset_stats: dict[str, dict[str, Any]] | None = None) -> None:
-        """Read sizes and action statistics from the checkpoint, unless they are known.
+        """Read sizes and action statistics from the checkpoint, unless they are known, and note its commit.
 
         Args:
             dataset_stats: LeRobot's statistics, for `unnorm_key=dataset`.
@@ -137,6 +137,7 @@ class OpenVLAConfig(PreTrainedConfig):
         if self.checkpoint is None:
             raise ValueError("choose the weights to build on: --policy.checkpoint=openvla/openvla-7b")
         checkpoint = read_checkpoint(self.checkpoint, self.checkpoint_revision)
+        self.checkpoint_revision = commit_of(self.checkpoint, checkpoint.folder) or self.checkpoint_revision
         self.architecture = checkpoint.architecture.to_dict()
         published = (
             tuned_statistics(fetch(self.adapter)) if self.adapter else None

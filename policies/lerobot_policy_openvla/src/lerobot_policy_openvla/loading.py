@@ -13,7 +13,15 @@ from safetensors.torch import load_model
 from torch import nn
 
 from lerobot_policy_openvla.adapters import ADAPTER_CONFIG, ADAPTER_WEIGHTS
-from lerobot_policy_openvla.checkpoint import CONFIG, NETWORK_PREFIX, WEIGHTS, fetch, holds_network
+from lerobot_policy_openvla.checkpoint import (
+    CONFIG,
+    NETWORK_PREFIX,
+    WEIGHTS,
+    commit_of,
+    fetch,
+    holds_network,
+    seen_from,
+)
 from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
 
 
@@ -34,6 +42,7 @@ def config_for(
         TypeError: the saved config is of another policy.
     """
     folder = fetch(name, revision)
+    revision = commit_of(name, folder) or revision
     published = "type" not in json.loads((folder / CONFIG).read_text()) if (folder / CONFIG).is_file() else False
     if config is None:
         config = OpenVLAConfig() if published else PreTrainedConfig.from_pretrained(folder)
@@ -47,13 +56,27 @@ def config_for(
             # The caller's stays as it is: a run that is resumed compares it with what it began with.
             config = copy(config)
             config.checkpoint, config.checkpoint_revision = name, revision
-        return config, folder / WEIGHTS
+            return config, folder / WEIGHTS
+        return _with_folders(config, folder), folder / WEIGHTS
     if (folder / ADAPTER_WEIGHTS).is_file():
         below: dict[str, Any] = json.loads((folder / ADAPTER_CONFIG).read_text())
         config.checkpoint = config.checkpoint or below["base_model_name_or_path"]
+        config.checkpoint = seen_from(folder, config.checkpoint)
         config.adapter, config.use_peft = str(folder), False
         return config, None
     raise FileNotFoundError(f"{name} has neither {WEIGHTS} nor {ADAPTER_WEIGHTS}.")
+
+
+def _with_folders(config: OpenVLAConfig, folder: Path) -> OpenVLAConfig:
+    """The config with what the policy in `folder` is built on as it is called from here; the caller's stays."""
+    named = {field: name for field in ("checkpoint", "adapter") if (name := getattr(config, field))}
+    found = {field: seen_from(folder, name) for field, name in named.items()}
+    if found == named:
+        return config
+    config = copy(config)
+    for field, name in found.items():
+        setattr(config, field, name)
+    return config
 
 
 def load_saved_tensors(policy: Any, path: Path) -> None:
