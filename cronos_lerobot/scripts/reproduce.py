@@ -206,8 +206,8 @@ def make_options(args: argparse.Namespace, extra: list[str], bases: Iterable[Bas
     for name, path in (("root", args.root), ("policy.path", args.policy_path)):
         if path is not None and read_as(f"{path}/x") != f"{path}/x":
             raise ValueError(
-                f"--{name}={path} would be read as {read_as(f'{path}/x')!r} by the commands that it is given to, as"
-                " YAML: choose a path without ' #' and ': '"
+                f"--{name}={path} would be read as {read_as(f'{path}/x')!r} by the commands that it is given to,"
+                " as YAML: choose a path without ' #' and ': '"
             )
     if not args.temperature >= 0:
         raise ValueError(f"--temperature must be at least 0, got {args.temperature}")
