@@ -59,7 +59,7 @@ class Side:
         evaluated, own = self._by_source(suite, split)
         words = []
         if early := [str(_checkpoint(one)[1]) for one in self._outdated(suite, split)]:
-            end = max(int(_checkpoint(one)[1]) for one in self.runs)
+            end = max(step for _, step in map(_checkpoint, self.runs) if isinstance(step, int))
             words.append(f"cronos-eval of checkpoint {', '.join(early)}, the runs' own evaluations go to {end}")
         if 0 < len(evaluated) < len(self.runs):
             counts = f"cronos-eval has been run of {len(evaluated)} of {len(self.runs)} policies"
@@ -77,7 +77,7 @@ class Side:
 
         A run is known by its folder; where that has moved, an end before those of all is an early one.
         """
-        ends = {run: int(step) for run, step in map(_checkpoint, self.runs)}
+        ends = {run: step for run, step in map(_checkpoint, self.runs) if isinstance(step, int)}
         if not all(one.of(suite, split) for one in self.runs) or not ends:
             return []
         found = []
