@@ -39,8 +39,8 @@ def test_imports_point_one_way(package):
 
 FLOORS = {
     "cronos_lerobot": (
-        "stopwatch", "processes", "provenance", "locks", "dataset_metadata", "agents", "protocol", "data", "film",
-        "evaluation", "training", "report", "experiments", "hub", "scripts", "studies",
+        "stopwatch", "processes", "provenance", "locks", "whole_files", "dataset_metadata", "agents", "protocol",
+        "data", "film", "evaluation", "training", "report", "experiments", "hub", "scripts", "studies",
     ),
     "lerobot_env_cronos": (
         "statistics", "lerobot_log", "scene", "benchmark", "simulation", "vector_env", "episodic", "autoreset",

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -14,6 +13,7 @@ from lerobot_env_cronos import check_environment_id
 
 from cronos_lerobot.evaluation.chains import ChainResult, Trajectory
 from cronos_lerobot.locks import INSIDE
+from cronos_lerobot.whole_files import partial_name, written_whole
 
 IDENTITY = "evaluation.json"
 RESULTS = "results.json"
@@ -22,7 +22,7 @@ COMPARISON = "comparison.json"
 FORMAT = 2
 """Version of results.json; 1 was of version 0 of the environments."""
 
-OURS = (INSIDE, f".{IDENTITY}")
+OURS = (INSIDE, partial_name(IDENTITY))
 """What may lie in a folder that is no evaluation's yet: its lock, and a first file that was cut off."""
 ANEW = "evaluate anew with another --output_dir"
 
@@ -73,13 +73,8 @@ class ResultStore:
         arrays = {}
         for key, t in trajectories.items():
             arrays |= {f"{key}.qpos": t.qpos, f"{key}.position": t.position, f"{key}.is_complete": t.is_complete}
-        path = self._path(name).with_suffix(".npz")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}")
-        with partial.open("wb") as file:
+        with written_whole(self._path(name).with_suffix(".npz"), "wb") as file:
             np.savez_compressed(file, **arrays)
-            _to_disk(file)
-        partial.replace(path)
         # Written last: a part is finished when it is there.
         write_json(self._path(name), content)
 
@@ -154,15 +149,5 @@ def chain_records(results: Sequence[ChainResult]) -> list[dict[str, Any]]:
 
 def write_json(path: Path, content: Any) -> None:
     """Write a file at once or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}")
-    with partial.open("w") as file:
+    with written_whole(path) as file:
         file.write(json.dumps(content, indent=2) + "\n")
-        _to_disk(file)
-    partial.replace(path)
-
-
-def _to_disk(file: IO[Any]) -> None:
-    """Have the disk take what was written before its name: a crash leaves the old file or the new one."""
-    file.flush()
-    os.fsync(file.fileno())

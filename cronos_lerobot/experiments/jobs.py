@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from cronos_lerobot.provenance import git_commit, package_versions
+from cronos_lerobot.whole_files import written_whole
 
 RUNNING, STOPPED = "running", "stopped"
 BASE, RUN, EVALUATION = "base", "run", "evaluation"
@@ -109,13 +110,8 @@ def _damage(job: Job) -> str | None:
 
 def write_record(job: Job, record: dict[str, Any]) -> None:
     """Replace the note in one step, on disk once this returns: a kill or a power cut leaves the old or the new."""
-    job.record.parent.mkdir(parents=True, exist_ok=True)
-    partial = job.record.with_name(f".{job.record.name}")
-    with partial.open("w") as file:
+    with written_whole(job.record) as file:
         file.write(json.dumps(record, indent=2))
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(job.record)
 
 
 @cache
@@ -322,6 +318,8 @@ def lock(job: Job) -> int | None:
         # The umask says whether a group may, as of the other files.
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     except PermissionError:
+        if not path.exists():
+            raise
         # Of another user: to lock it, on a disk of this machine, takes no more than to read it.
         descriptor = os.open(path, os.O_RDONLY)
     try:

@@ -330,10 +330,10 @@ def _read_evaluation(
     try:
         if found := known_changes(job):
             raise ValueError("; ".join(found))
-        found = read_results(job.output)
-        if checkpoint == 0 and is_of_another(found, seed.run):
+        results = read_results(job.output)
+        if checkpoint == 0 and is_of_another(results, seed.run):
             raise ValueError(f"it is of another base policy than the one that {seed.spec.name} began with")
-        splits = found[evaluation.suite]
+        splits = results[evaluation.suite]
     except ValueError as error:
         text = f"{job.name}: {error}"
         result.changed += [text] if text not in result.changed else []

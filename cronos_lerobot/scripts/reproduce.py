@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import yaml
 
@@ -204,10 +204,10 @@ def make_options(args: argparse.Namespace, extra: list[str], bases: Iterable[Bas
         if name == "--eval.n_episodes" and value.isdigit() and int(value) > 64 and int(value) % 64:
             raise ValueError(f"{name}={value} must be at most 64, the configurations, or so many times 64")
     for name, path in (("root", args.root), ("policy.path", args.policy_path)):
-        if path is not None and read_as(f"{path}/x") != f"{path}/x":
+        if path is not None and not is_plain(f"{path}/x"):
             raise ValueError(
-                f"--{name}={path} would be read as {read_as(f'{path}/x')!r} by the commands that it is given to,"
-                " as YAML: choose a path without ' #' and ': '"
+                f"--{name}={path} is YAML to the commands that it is given to, and another text there: choose a"
+                " path without ' #', ': ' and the like"
             )
     if not args.temperature >= 0:
         raise ValueError(f"--temperature must be at least 0, got {args.temperature}")
@@ -241,12 +241,12 @@ def make_options(args: argparse.Namespace, extra: list[str], bases: Iterable[Bas
     )
 
 
-def read_as(value: str) -> Any:
-    """What the value of a flag is to LeRobot's commands; its beginning if it is none."""
+def is_plain(value: str) -> bool:
+    """Whether the value of a flag is to LeRobot's commands, which read YAML, the text that it is."""
     try:
-        return yaml.safe_load(value)
+        return yaml.safe_load(value) == value
     except yaml.YAMLError:
-        return value.partition(": ")[0]
+        return False
 
 
 def base_changes(args: argparse.Namespace) -> dict[str, int]:

@@ -57,6 +57,7 @@ from cronos_lerobot.protocol.own_state import load_own_states, own_states
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.resume import RUN, check_resumed, describe_run
 from cronos_lerobot.training.seeding import NamedGenerators
+from cronos_lerobot.whole_files import written_whole
 
 DAMAGE = (ValueError, RuntimeError, KeyError, EOFError, BadZipFile, UnpicklingError, SafetensorError)
 """What the readers of the files raise for a truncated one."""
@@ -142,12 +143,8 @@ def save_checkpoint(
 
 def save_observers(checkpoint: Path, observers: dict[str, Any]) -> None:
     """Replace what a checkpoint keeps of the loggers and recorders, at once or not at all."""
-    path = checkpoint / TRAINING_STATE_DIR / OBSERVERS
-    partial = path.with_name(f".{OBSERVERS}")
-    torch.save(to_tensors(observers), partial)
-    with partial.open("rb") as file:
-        os.fsync(file.fileno())
-    partial.replace(path)
+    with written_whole(checkpoint / TRAINING_STATE_DIR / OBSERVERS, "wb") as file:
+        torch.save(to_tensors(observers), file)
 
 
 def go_on_from(checkpoint: Path) -> None:

@@ -22,6 +22,7 @@ from cronos_lerobot.provenance import git_commit, package_versions
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.resume import MANIFEST, describe_environment, read_starts
 from cronos_lerobot.training.rollout import Count
+from cronos_lerobot.whole_files import written_whole
 
 METRICS = "metrics.jsonl"
 
@@ -213,23 +214,14 @@ def write_manifest(config: CronosTrainConfig, num_processes: int = 1, interactio
         "policy_fingerprint": _policy_fingerprint(config),
         "config": config.to_dict(),
     } | describe_environment(config.env)
-    write_whole(path, json.dumps({"starts": [*starts, start]}, indent=2))
+    with written_whole(path) as file:
+        file.write(json.dumps({"starts": [*starts, start]}, indent=2))
 
 
 def _policy_fingerprint(config: CronosTrainConfig) -> str | None:
     """Of the policy in a folder that this start begins with: two machines may have made other clones of it."""
     path = config.weights_path
     return files_fingerprint(Path(path)) if path is not None and Path(path).is_dir() else None
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file so that a kill leaves the old one or the new one, on disk once this returns."""
-    partial = path.with_name(f".{path.name}.partial")
-    with partial.open("w") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
 
 
 def _jsonable(value: Any) -> Any:

@@ -224,22 +224,22 @@ class Trainer:
             self._check_processes()
             self._log_update()
             ends = self._is_stopped(stop)
+            is_evaluated = not ends and self._is_evaluation_due()
+            if not (ends or is_evaluated):
+                self._last_interventions = self.loop.b
+            saves = self.config.save_checkpoint
             # Before the evaluation, which may take long: a kill in it loses the evaluation alone.
-            if saves := self.config.save_checkpoint and (
-                ends or _due(self.loop.n, last_save, self.config.save_freq)
-            ):
+            if saves and (ends or _due(self.loop.n, last_save, self.config.save_freq)):
                 self._save(env_state)
                 last_save, has_checkpoint = self.loop.n, True
-            if not ends:
-                if is_due := self._is_evaluation_due():
-                    self._evaluate()
+            if is_evaluated:
+                self._evaluate()
                 self._last_interventions = self.loop.b
-                if saves:
+                ends = self._is_stopped(stop)
+                if saves and last_save == self.loop.n:
                     self._note_evaluation()
-                if is_due and self._is_stopped(stop):
-                    ends = True
-                    if self.config.save_checkpoint and not saves:
-                        self._save(env_state)
+                elif saves and ends:
+                    self._save(env_state)
             if ends:
                 return False
         self._say_end()

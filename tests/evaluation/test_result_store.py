@@ -101,7 +101,7 @@ def test_states_that_cannot_be_read_are_none(tmp_path, left):
 
 
 def test_what_a_full_disk_has_left_of_the_first_file_takes_no_folder(tmp_path):
-    (tmp_path / ".evaluation.json").touch()
+    (tmp_path / ".evaluation.json.partial").touch()
     (tmp_path / ".lock").touch()
     assert ResultStore(tmp_path, ENVIRONMENT).names() == []
     (tmp_path / "evaluation.json").unlink()

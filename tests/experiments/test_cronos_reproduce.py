@@ -124,7 +124,7 @@ def test_list_names_every_row(monkeypatch, capsys):
         (["table1", "--base.demos=0"], "--base.demos must be at least 1, got 0"),
         (["table1", "--base.demos=9", "--policy.path=me/policy"], "--base.demos is of a base policy that is made"),
         (["table1", "--base.clean", "--policy.path=me/policy"], "--base.clean is of a base policy that is made"),
-        (["table1", "--root=exp #2"], "--root=exp #2 would be read as 'exp' by the commands"),
+        (["table1", "--root=exp #2"], "--root=exp #2 is YAML to the commands that it is given to"),
         (["table1", "--temperature=-1"], "--temperature must be at least 0, got -1.0"),
         (["table1", "--import=no_module"], "--import=no_module cannot be imported (No module named 'no_module')"),
         (["table1", "--base.checkpoint=400"], "base.checkpoint must be one of [80, 160, 240, 320], got 400"),
