@@ -47,7 +47,7 @@ class End:
     """Mean over the seeds."""
     steps: float
     success: Summary
-    """Over the seeds, with the 95 % interval of the mean; of one seed that of its evaluation."""
+    """Over the seeds, with the 95 % interval of the mean, of two seeds without; of one that of its evaluation."""
 
     def x(self, axis: str) -> float:
         """Its place on `axis`, interaction_steps or interventions."""
@@ -168,6 +168,9 @@ def find_end(row: RowResult) -> End | None:
     success = summarise_points(points)
     if success is None:
         return None
+    if len(points) == 2:
+        # Student's interval of two reaches over the whole axis, and would hide the others' behind it.
+        success = replace(success, ci95=None)
     mean = [float(np.mean([point.x(axis) for point in points])) for axis in (INTERVENTIONS, INTERACTION_STEPS)]
     return End(*mean, success)
 

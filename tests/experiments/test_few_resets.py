@@ -1,8 +1,10 @@
 """The experiments of few resets: what their rows do, and the figure of success against interventions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from experiment_runs import TINY, make_run
+from experiment_runs import TINY, make_run, results
 from flags import parse_flags
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Base
@@ -136,13 +138,18 @@ def test_ends_of_the_rows(drawn):
     t80 = rows["t80"]
     # 8 streams in 1280 steps: 16 resets of each; .75 and 1.0 of two seeds.
     assert (t80.interventions, t80.steps, t80.success.mean) == (128, 10_240, 0.875)
-    # Student's of two seeds, 12.706 / 8 to each side, is wider than a rate can be.
-    assert t80.success.ci95 == (0.0, 1.0)
+    # Student's of two seeds, 12.706 / 8 to each side, is wider than a rate can be: none.
+    assert t80.success.ci95 is None
     wide_end = rows["t1280_eer_staggered_wide"]
     # One seed: Wilson's interval of 24 of 32.
     assert (wide_end.interventions, wide_end.success.mean) == (8, 0.75)
     assert wide_end.success.ci95 == pytest.approx((0.579, 0.867), abs=1e-3)
     assert rows["t1280_eer_cl"] is None
+    options = replace(drawn[0], seeds=(1, 2, 3))
+    make_run(options, "few_resets", "t80", 3, (2, 4, 7))
+    (t80,) = (row for row in results(options, "few_resets").rows if row.row.name == "t80")
+    # Of three, .75, .875 and 1: 4.303 times their .125 / sqrt(3) to each side.
+    assert find_end(t80).success.ci95 == pytest.approx((0.875 - 4.303 * 0.125 / 3**0.5, 1.0), abs=1e-4)
 
 
 def test_figure_has_a_line_of_panels_for_each_base_and_marks_at_the_ends(drawn):
