@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import platform
 import sys
@@ -195,6 +196,7 @@ def write_manifest(config: CronosTrainConfig, num_processes: int = 1, interactio
     path = Path(config.output_dir) / MANIFEST
     path.parent.mkdir(parents=True, exist_ok=True)
     starts = read_starts(path) if path.exists() else []
+    instructions = torch.backends.cpu.get_cpu_capability()
     start = {
         "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "interaction_steps": interaction_steps,
@@ -206,7 +208,7 @@ def write_manifest(config: CronosTrainConfig, num_processes: int = 1, interactio
             "platform": platform.platform(),
             "cpu_count": os.cpu_count(),
             # What its floating-point sums are made with, and so their last bits.
-            "cpu_capability": torch.backends.cpu.get_cpu_capability(),
+            "cpu_capability": instructions,
         },
         "num_processes": num_processes,
         "renderer": os.environ.get("MUJOCO_GL"),
@@ -214,8 +216,19 @@ def write_manifest(config: CronosTrainConfig, num_processes: int = 1, interactio
         "policy_fingerprint": _policy_fingerprint(config),
         "config": config.to_dict(),
     } | describe_environment(config.env)
+    if starts:
+        _warn_of_other_instructions(starts[-1]["machine"].get("cpu_capability"), instructions)
     with written_whole(path) as file:
         file.write(json.dumps({"starts": [*starts, start]}, indent=2))
+
+
+def _warn_of_other_instructions(was: str | None, now: str) -> None:
+    if was and was != now:
+        logging.warning(
+            f"This run computed with {was} and goes on with {now}, which have other last bits: it becomes another "
+            "run than it would have been, as with another seed. docs/experiments.md has the variables that hold a "
+            "command to AVX2, as cronos-reproduce does."
+        )
 
 
 def _policy_fingerprint(config: CronosTrainConfig) -> str | None:

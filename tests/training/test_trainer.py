@@ -17,6 +17,7 @@ from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.training.checkpoint import list_checkpoints
 from cronos_lerobot.training.config import CronosTrainConfig, PeriodicEvaluationConfig
+from cronos_lerobot.training.logging import write_manifest
 from cronos_lerobot.training.record_config import RecordConfig
 from cronos_lerobot.training.stopping import StopRequest
 from cronos_lerobot.training.trainer import Trainer
@@ -285,6 +286,18 @@ def test_manifest_tells_the_run(tmp_path):
     assert start["seed"] == 5
     assert start["versions"]["torch"] == version("torch")
     assert start["config"]["protocol"]["task_switch_interval"] == 4
+
+
+@pytest.mark.parametrize(("was", "is_told"), [("AVX2", True), ("AVX512", False), (None, False)])
+def test_going_on_with_other_vector_instructions_is_told(was, is_told, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
+    manifest = tmp_path / "manifest.json"
+    # Runs of before have no such note.
+    machine = {"cpu_count": 2} if was is None else {"cpu_count": 2, "cpu_capability": was}
+    manifest.write_text(json.dumps({"starts": [{"machine": machine, "command": ["cronos-train"]}]}))
+    write_manifest(config(tmp_path))
+    assert ("This run computed with AVX2 and goes on with AVX512" in caplog.text) == is_told
+    assert len(json.loads(manifest.read_text())["starts"]) == 2
 
 
 def test_old_checkpoints_are_dropped(tmp_path):
