@@ -1,6 +1,6 @@
 """docs/training.md has a table for each group of cronos-train's flags, with every flag and the default it has.
 
-Those of `--record.*` are in docs/streams.md. PPO's own have no table.
+Those of `--record.*` are in docs/streams.md. PPO's has a column of defaults for each of its two names.
 """
 
 import re
@@ -11,42 +11,45 @@ import pytest
 import yaml
 
 from cronos_lerobot.agents.imitation.config import ImitationConfig
-from cronos_lerobot.agents.ppo.config import SelfImitationConfig
+from cronos_lerobot.agents.ppo.config import PaperPPOConfig, PPOConfig, SelfImitationConfig
 from cronos_lerobot.agents.steering.config import SteeringConfig
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.training.config import CronosTrainConfig, PeriodicEvaluationConfig
 from cronos_lerobot.training.record_config import RecordConfig
 
 DOCS = Path(__file__).parents[2] / "docs"
-HEAD = "| flag | default | meaning |"
+HEAD = re.compile(r"\| flag \|(?P<defaults>.+)\| meaning \|")
 TABLES = {
-    ("training", "The protocol", 0): (ProtocolConfig(), ""),
-    ("training", "The run", 0): (CronosTrainConfig(), "--"),
-    ("training", "The run", 1): (PeriodicEvaluationConfig(), "--eval."),
-    ("training", "Successes that are kept", 0): (SelfImitationConfig(), "--algorithm.self_imitation."),
-    ("training", "Imitation", 0): (ImitationConfig(), "--algorithm."),
-    ("training", "Steering", 0): (SteeringConfig(), "--algorithm."),
-    ("streams", "Record", 0): (RecordConfig(), "--record."),
+    ("training", "The protocol", 0): ("", ProtocolConfig()),
+    ("training", "The run", 0): ("--", CronosTrainConfig()),
+    ("training", "The run", 1): ("--eval.", PeriodicEvaluationConfig()),
+    ("training", "PPO", 0): ("--algorithm.", PPOConfig(), PaperPPOConfig()),
+    ("training", "Successes that are kept", 0): ("--algorithm.self_imitation.", SelfImitationConfig()),
+    ("training", "Imitation", 0): ("--algorithm.", ImitationConfig()),
+    ("training", "Steering", 0): ("--algorithm.", SteeringConfig()),
+    ("streams", "Record", 0): ("--record.", RecordConfig()),
 }
-"""By file, heading and number: the settings, and what is before their names in the table."""
+"""By file, heading and number: what is before the names in the table, and the settings of each column."""
 ELSEWHERE = {"protocol", "eval", "policy", "checkpoint_path"}
 """Of the run: tables of their own, what is given by its path or type, and what is no flag."""
 
 
 def tables(page):
-    """The rows (flags, defaults) of a page's tables of flags, by heading and number under it."""
-    found, heading, rows = {}, "", None
+    """The rows (flags, then defaults by column) of the tables of flags, by heading and number under it."""
+    found, heading, rows, columns = {}, "", None, 0
     for line in (DOCS / f"{page}.md").read_text().splitlines():
         if line.startswith("#"):
             heading = line.strip("# ")
-        elif line == HEAD:
+        elif head := HEAD.fullmatch(line):
+            columns = len(head["defaults"].split("|"))
             number = sum(place[0] == heading for place in found)
             rows = found[heading, number] = []
         elif not line.startswith("|"):
             rows = None
         elif rows is not None and not line.startswith("|---"):
-            flags, defaults, *_ = line.strip("|").split("|")
-            rows.append((re.findall(r"`([^`]+)`", flags), [one.strip(" `") for one in defaults.split(", ")]))
+            flags, *cells = line.strip("|").split("|")
+            defaults = [[one.strip(" `") for one in cell.split(", ")] for cell in cells[:columns]]
+            rows.append((re.findall(r"`([^`]+)`", flags), *defaults))
     return found
 
 
@@ -71,9 +74,16 @@ def says(text, value):
 
 @pytest.mark.parametrize("place", TABLES, ids=lambda place: f"{place[1]}, {place[2]}")
 def test_every_flag_is_there_with_its_default(place):
-    settings, prefix = TABLES[place]
+    prefix, *columns = TABLES[place]
+    for number, settings in enumerate(columns, 1):
+        rows = [(row[0], row[number]) for row in tables(place[0])[place[1:]]]
+        check_column(rows, settings, prefix)
+
+
+def check_column(rows, settings, prefix):
+    """Every setting has a row, with the default that it has."""
     values, told = dict(leaves(settings)), []
-    for flags, defaults in tables(place[0])[place[1:]]:
+    for flags, defaults in rows:
         assert all(flag.startswith(prefix) for flag in flags), flags
         names = [flag.removeprefix(prefix) for flag in flags]
         told += names

@@ -286,8 +286,8 @@ class PaperPPOConfig(PPOConfig):
     """PPO with the settings of the paper (Table 2) for a 7B policy with LoRA.
 
     What the paper leaves open follows RL4VLA, which it builds on: minibatches of 8, gradient norm 10, a clipped
-    Huber value loss with delta 10, normalised advantages. Two things do not: policy and value head have a gradient
-    norm each, where RL4VLA clips both together, and AdamW's weight decay is 0, where RL4VLA leaves PyTorch's 0.01.
+    Huber value loss with delta 10, normalised advantages, PyTorch's weight decay. One thing does not: policy and
+    value head have a gradient norm each, where RL4VLA clips both together.
     """
 
     epochs: int = 1
@@ -303,3 +303,4 @@ class PaperPPOConfig(PPOConfig):
     target_kl: float | None = None
     max_grad_norm: float = 10.0
     value_max_grad_norm: float = 10.0
+    weight_decay: float = 0.01
