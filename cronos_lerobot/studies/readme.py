@@ -44,7 +44,7 @@ def make_table(folder: Path) -> str:
     differences = {one["row"]: one for one in found["differences"] if one["reference"] in firsts.values()}
     lines = [
         "| training | interventions | before | success | held out | seeds "
-        "| minus the first row from that base, on the same seeds [95 %] |",
+        "| minus the first row from that kind of base, on the seeds of both [95 %] |",
         "|---|---|---|---|---|---|---|",
     ]
     for name in shown:
