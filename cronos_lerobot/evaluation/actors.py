@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import pickle
+import random
 from contextlib import AbstractContextManager, nullcontext
 from copy import copy
 from typing import Any, Protocol
@@ -26,6 +28,11 @@ from cronos_lerobot.agents.weights import train_in_float32
 from cronos_lerobot.evaluation.policy_loading import load_policy
 from cronos_lerobot.evaluation.policy_source import damage_named
 
+NOT_REPEATED = (
+    "eval.repetitions=%d: the policy draws nothing, and would do the same again; every episode is run once."
+)
+"""Said where repetitions of a policy without randomness would count as episodes that there are not."""
+
 
 class Actor(Protocol):
     """Chooses actions for some of the environments."""
@@ -40,6 +47,11 @@ class Actor(Protocol):
 
     def seed(self, seed: int) -> None:
         """Start all randomness that is not handed to `act` anew."""
+        ...
+
+    @property
+    def drew(self) -> bool:
+        """Whether it has drawn or been handed randomness since `seed`: if not, it would do the same once more."""
         ...
 
     def begin(self, ids: np.ndarray) -> None:
@@ -85,6 +97,11 @@ class SamplingPolicy:
     def seed(self, seed: int) -> None:
         """See `Actor`."""
         self._generator.manual_seed(seed)
+
+    @property
+    def drew(self) -> bool:
+        """See `Actor`: at temperature 0 it takes the likeliest action."""
+        return self.temperature > 0
 
     def begin(self, ids: np.ndarray) -> None:
         """What was decided for another task is not played, what was seen in it forgotten."""
@@ -139,10 +156,23 @@ class SelectingPolicy:
         self._processors.preprocessor = lambda batch: processors.preprocessor(before(batch))
         self._autocast = _autocast(policy, processors)
         self.is_per_environment = self._player.is_per_stream
+        self._seeded = self._generator_states()
 
     def seed(self, seed: int) -> None:
         """Seed the global generators, from which LeRobot's policies draw."""
         set_seed(seed)
+        self._seeded = self._generator_states()
+
+    @property
+    def drew(self) -> bool:
+        """See `Actor`: whether the global generators have moved. ACT draws nothing, Diffusion its noise."""
+        return self._generator_states() != self._seeded
+
+    def _generator_states(self) -> list[bytes]:
+        states = [torch.get_rng_state()]
+        if (device := self._processors.device).type != "cpu":
+            states.append(torch.get_device_module(device).get_rng_state())
+        return [pickle.dumps([random.getstate(), np.random.get_state()]), *(s.numpy().tobytes() for s in states)]
 
     def begin(self, ids: np.ndarray) -> None:
         """Forget chunks and history; a memory for the whole batch is forgotten for all."""
@@ -166,6 +196,8 @@ class ExpertActor:
 
     def __init__(self, env: CronosVectorEnv) -> None:
         self._expert = ScriptedExpert(env)
+
+    drew = False
 
     def seed(self, seed: int) -> None:
         """It is deterministic."""

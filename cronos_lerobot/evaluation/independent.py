@@ -5,6 +5,7 @@ The same chains, random numbers and actors as `cronos-eval`'s.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,7 +14,7 @@ from lerobot_env_cronos import SequentialVectorEnv
 
 from cronos_lerobot.agents.base import samples
 from cronos_lerobot.agents.processing import PolicyProcessors
-from cronos_lerobot.evaluation.actors import make_actor
+from cronos_lerobot.evaluation.actors import NOT_REPEATED, make_actor
 from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
 from cronos_lerobot.evaluation.plan import make_parts
 from cronos_lerobot.evaluation.results import Record, independent_results
@@ -53,6 +54,21 @@ def run_independent(
     Returns:
         The episodes, task by task.
     """
+    return _run(env, policy, processors, n_episodes, split, temperature, seed, processes, keeps_states)[0]
+
+
+def _run(
+    env: SequentialVectorEnv,
+    policy: Any,
+    processors: PolicyProcessors,
+    n_episodes: int,
+    split: str,
+    temperature: float,
+    seed: int,
+    processes: Processes | None = None,
+    keeps_states: bool = False,
+) -> tuple[list[ChainResult], bool]:
+    """What `run_independent` returns, and whether other random numbers might have given something else."""
     processes = processes or Processes()
     (part,) = make_parts(env.benchmark, ["independent"], [split], n_episodes, 0)
     env.split = split
@@ -63,12 +79,15 @@ def run_independent(
         actor.seed(seed + processes.rank)
         own = part.chains[processes.rank :: processes.count]
         results = ChainRunner(env, actor, keeps_states=keeps_states).run(own, part.noise(seed))
+        # Before the global generators are set back.
+        drew = actor.drew
     finally:
         if was_training is not None:
             policy.train(was_training)
         set_rng_state(rng_state)
-    by_chain = {result.chain: result for some in processes.gather(results) for result in some}
-    return [by_chain[chain] for chain in part.chains]
+    gathered = processes.gather((results, drew))
+    by_chain = {result.chain: result for some, _ in gathered for result in some}
+    return [by_chain[chain] for chain in part.chains], any(has_drawn for _, has_drawn in gathered)
 
 
 def episode_lists(by_seed: Mapping[int, Sequence[Record]]) -> list[list[int]]:
@@ -85,6 +104,8 @@ def evaluate_independent(
 ) -> dict[str, Any]:
     """`run_independent` in numbers.
 
+    Of a policy that draws nothing, as ACT, an episode is not repeated: it would be the same one.
+
     Args:
         env: as there, and so are the others.
         policy: as there.
@@ -97,10 +118,13 @@ def evaluate_independent(
         `split`, `temperature` (None of a policy that has none), `steps` (control steps of all episodes),
         `episodes` (see `episode_lists`) and `independent_results`.
     """
-    by_seed = {
-        s: chain_records(run_independent(env, policy, *args, seed=s, **options))
-        for s in range(seed, seed + repetitions)
-    }
+    by_seed = {}
+    for s in range(seed, seed + repetitions):
+        results, drew = _run(env, policy, *args, seed=s, **options)
+        by_seed[s] = chain_records(results)
+        if not drew and repetitions > 1:
+            logging.warning(NOT_REPEATED, repetitions)
+            break
     records = [record for some in by_seed.values() for record in some]
     groups = env.benchmark.groups("independent", options["split"])
     temperature = options["temperature"] if samples(policy) else None

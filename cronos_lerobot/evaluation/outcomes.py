@@ -18,16 +18,27 @@ AGREE = {
 """What two evaluations must have alike to be of the same episodes."""
 AGREE_IN_CHAINS = {"advance": "advance", "end_effector_reset": "end_effector_reset"}
 """What the chains must have alike, too."""
-PICTURES = ("camera_name", "observation_height", "observation_width", "rename_map")
+BESIDE_PIXELS = ("camera_name", "observation_height", "observation_width", "rename_map", "privileged_state")
 """What a policy from pixels is shown, beside the renderer; fields of an evaluation's identity."""
-WORTH_SAYING = ("temperature", "obs_type", "renderer", *PICTURES, "versions")
+OBSERVED = (*BESIDE_PIXELS, "task_observation")
+"""What a policy is shown."""
+WORTH_SAYING = ("temperature", "obs_type", "renderer", *OBSERVED, "versions")
 """What may differ, as it is of the policy or should not matter, but is said."""
 
 
-def pictures(obs_type: str | None, env: Mapping[str, Any], rename_map: Mapping[str, str] | None) -> dict[str, Any]:
-    """The fields of PICTURES, None where there is nothing to say; of a policy from the state there is not."""
+def observed(obs_type: str | None, env: Mapping[str, Any], rename_map: Mapping[str, str] | None) -> dict[str, Any]:
+    """The fields of OBSERVED, None where there is nothing to say; of a policy from the state most are not."""
     shown = {**env, "rename_map": rename_map} if obs_type == "pixels_agent_pos" else {}
-    return {name: shown.get(name) or None for name in PICTURES}
+    told = {name: shown.get(name) or None for name in BESIDE_PIXELS}
+    task = env.get("task_observation", "none")
+    return told | {"task_observation": None if task == "none" else task}
+
+
+def observed_in(results: Mapping[str, Any]) -> dict[str, Any]:
+    """The same of a results.json, whose identity has the task apart, and only where it is shown."""
+    identity = results.get("identity") or {}
+    env = {**(identity.get("env") or {}), "task_observation": identity.get("task_observation", "none")}
+    return observed(results.get("obs_type"), env, identity.get("rename_map"))
 
 
 class Episode(NamedTuple):
@@ -105,8 +116,7 @@ def _outcomes(folder: Path, results: Mapping[str, Any]) -> Outcomes:
     setting = {name: results.get(name) for name in (*AGREE, *AGREE_IN_CHAINS, *WORTH_SAYING)}
     benchmark = results["benchmark"]
     setting |= {"environment": benchmark["environment"], "benchmark": benchmark["fingerprint"]}
-    identity = results.get("identity") or {}
-    setting |= pictures(results.get("obs_type"), identity.get("env") or {}, identity.get("rename_map"))
+    setting |= observed_in(results)
     return Outcomes(
         results["policy"],
         results["policy_fingerprint"],

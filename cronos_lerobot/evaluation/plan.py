@@ -66,7 +66,8 @@ def make_parts(
             groups = benchmark.groups(suite, split)
             if suite == "independent":
                 chains = _chains(groups, num_configurations)
-                names = [f"independent_{split}", *(f"independent_{split}_again{i}" for i in range(1, repetitions))]
+                first = first_name(split)
+                names = [first, *(f"{first}_again{i}" for i in range(1, repetitions))]
                 parts += [Part(name, suite, split, chains, i) for i, name in enumerate(names)]
                 continue
             groups = groups[:num_orderings]
@@ -74,6 +75,11 @@ def make_parts(
                 chains = _chains(groups[start : start + ORDERINGS_PER_PART], num_configurations)
                 parts.append(Part(f"sequential_{split}_{start}", suite, split, chains))
     return parts
+
+
+def first_name(split: str) -> str:
+    """Name of the part that has a split's independent episodes for the first time."""
+    return f"independent_{split}"
 
 
 def _chains(groups: Sequence[EpisodeGroup], num_configurations: int) -> tuple[Chain, ...]:

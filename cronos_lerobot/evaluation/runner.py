@@ -16,11 +16,11 @@ import numpy as np
 from lerobot_env_cronos import CronosEnvConfig, SequentialVectorEnv, check_environment_id, get_scene, gymnasium_id
 from tqdm import tqdm
 
-from cronos_lerobot.evaluation.actors import Actor, ExpertActor, load_actor
+from cronos_lerobot.evaluation.actors import NOT_REPEATED, Actor, ExpertActor, load_actor
 from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
 from cronos_lerobot.evaluation.config import CronosEvalConfig
 from cronos_lerobot.evaluation.film import film_best_and_worst, note_drawings
-from cronos_lerobot.evaluation.plan import Part
+from cronos_lerobot.evaluation.plan import Part, first_name
 from cronos_lerobot.evaluation.results import independent_results, sequential_results
 from cronos_lerobot.evaluation.store import (
     ANEW,
@@ -71,6 +71,7 @@ class Evaluation:
             self._lock = on_failure.enter_context(FolderLock(config.output_dir))
             self.store = ResultStore(config.output_dir, self._identity())
             self._missing = [part for part in self.parts if not self._is_kept(part)]
+            self._leave_out_repeats()
             on_failure.pop_all()
 
     def _make_parts(self) -> list[Part]:
@@ -120,6 +121,7 @@ class Evaluation:
             self._run(self._missing)
         finally:
             self._close_env()
+        self._leave_out_repeats()
         results = self.results()
         note_drawings(self.store.folder, self.env_config)
         write_json(self.store.folder / self.file, results)
@@ -143,6 +145,9 @@ class Evaluation:
         done = total - sum(len(part.chains) for part in missing)
         with tqdm(total=total, initial=done, unit="chain", disable=None, smoothing=0.1) as bar:
             for part in missing:
+                if self._is_repeat(part):
+                    bar.total -= len(part.chains)
+                    continue
                 if part.repetition == 0:
                     for outdated in self.store.folder.glob(f"videos/{part.suite}_{part.split}_*.mp4"):
                         outdated.unlink()
@@ -178,6 +183,7 @@ class Evaluation:
             "seconds": time.perf_counter() - start,
             "made_by": self._maker,
             "temperature": actor.temperature,
+            "drew": actor.drew,
             "chains": records,
         }
         kept = {
@@ -234,6 +240,17 @@ class Evaluation:
             return False
         return True
 
+    def _is_repeat(self, part: Part) -> bool:
+        """Whether a part would be the one of repetition 0 once more, whose policy drew nothing."""
+        # Parts of earlier commits do not say it.
+        return part.repetition > 0 and not (self.store.read(first_name(part.split)) or {}).get("drew", True)
+
+    def _leave_out_repeats(self) -> None:
+        kept = [part for part in self.parts if not self._is_repeat(part)]
+        if len(kept) < len(self.parts):
+            logging.warning(NOT_REPEATED, self.config.eval.repetitions)
+        self.parts, self._missing = kept, [part for part in self._missing if part in kept]
+
     # Who acts where ---------------------------------------------------------------------------------------
 
     @cached_property
@@ -284,7 +301,7 @@ class Evaluation:
             # Parts of earlier commits do not say it.
             "temperature": finished[0].get("temperature", config.eval.temperature),
             "seed": config.seed,
-            "repetitions": config.eval.repetitions,
+            "repetitions": 1 + max(part.repetition for part in self.parts),
             "advance": config.advance,
             "end_effector_reset": config.end_effector_reset,
             "renderer": self.env_config.renderer,

@@ -12,13 +12,14 @@ from draccus import cfgparsing
 from draccus.utils import DecodingError, ParsingError, deflatten
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot_env_cronos import CronosEnvConfig
+from lerobot_env_cronos import CronosEnvConfig, load_benchmark
 
-from cronos_lerobot.agents.registry import check_agent, check_settings
+from cronos_lerobot.agents.registry import check_agent, check_reward, check_settings
 from cronos_lerobot.experiments.flags import read_flags
 from cronos_lerobot.experiments.jobs import Job
 from cronos_lerobot.experiments.scales import PIXELS
 from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.configurations import check_configurations
 from cronos_lerobot.training.resume import allow_single_file
 
 BASE_POLICY = "pocketvla"
@@ -65,7 +66,7 @@ def _check(given: dict[str, str], policy_type: str | None) -> None:
             allow_single_file(module)
             parser.load_plugin(module)
     # A plan is made without the Hub: a benchmark of it is looked for when the run begins.
-    given.pop("env.benchmark", None)
+    benchmark = given.pop("env.benchmark", None)
     # So is the policy's own config, for which the flags are.
     policy = {name.split(".")[1] for name in given if name.startswith("policy.")} - {"path"}
     if policy_type is not None:
@@ -78,8 +79,12 @@ def _check(given: dict[str, str], policy_type: str | None) -> None:
         name: cfgparsing.parse_string(value) for name, value in given.items() if not name.startswith("policy.")
     }
     config = draccus.decode(CronosTrainConfig, deflatten(values, sep="."))
+    config.check_start()
+    check_reward(config.algorithm, config.protocol.reward)
     if config.env is not None:
         config.check_env(config.env)
+        if benchmark is None:
+            check_configurations(config, load_benchmark(None, config.env.scene), str(config.env.scene))
         if policy_type is not None:
             _check_base(config.env)
         # A recording's folder is looked at when its run begins, or goes on.

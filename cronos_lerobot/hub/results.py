@@ -17,6 +17,7 @@ from lerobot_env_cronos import Benchmark, gymnasium_id, load_benchmark
 from lerobot_env_cronos.benchmark.benchmark import SUITES
 
 from cronos_lerobot.evaluation.config import EXPERT
+from cronos_lerobot.evaluation.outcomes import observed_in
 from cronos_lerobot.evaluation.store import read_results
 from cronos_lerobot.hub.benchmark import task_id
 from cronos_lerobot.hub.cards import describe_sampling
@@ -232,7 +233,10 @@ def _notes(suite: str, scores: dict[str, Any], results: dict[str, Any]) -> list[
     packages = [
         f"{name} {versions[name]}" for name in ("cronos-lerobot", "lerobot_env_cronos") if name in versions
     ]
-    return [f"n={scores['n']}", *what, how, f"seed {results['seed']}", results["obs_type"], ", ".join(packages)]
+    shown = observed_in(results)
+    seen = results["obs_type"] + " with the privileged state" * bool(shown["privileged_state"])
+    seen += " and the task" * bool(shown["task_observation"])
+    return [f"n={scores['n']}", *what, how, f"seed {results['seed']}", seen, ", ".join(packages)]
 
 
 def _published(config: ResultsConfig, commit: str | None) -> list[dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field
 
 from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
@@ -41,12 +42,11 @@ class CriticConfig:
     """Tasks in a row that a stream has failed, all since its last scene reset, before it may get one."""
 
     def __post_init__(self) -> None:
-        if self.certain_value <= 0:
-            raise ValueError(f"protocol.critic.certain_value must be > 0, got {self.certain_value}.")
-        if self.floor <= 0:
-            raise ValueError(f"protocol.critic.floor must be > 0, got {self.floor}.")
-        if self.sharpness < 0:
-            raise ValueError(f"protocol.critic.sharpness must be >= 0, got {self.sharpness}.")
+        for name in ("certain_value", "floor"):
+            if not 0 < (value := getattr(self, name)) < math.inf:
+                raise ValueError(f"protocol.critic.{name} must be > 0 and finite, got {value}.")
+        if not 0 <= self.sharpness < math.inf:
+            raise ValueError(f"protocol.critic.sharpness must be >= 0 and finite, got {self.sharpness}.")
         if not 1 <= self.failures <= MAX_FAILURES:
             raise ValueError(f"protocol.critic.failures must be 1 to {MAX_FAILURES}, got {self.failures}.")
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
 
-from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.protocol.config import COUNTED_INTERVENTIONS, ProtocolConfig
 from cronos_lerobot.protocol.interventions import BEFORE_SEGMENTS, Intervention
 from cronos_lerobot.protocol.learnable_starts import LearnableStarts
 from cronos_lerobot.protocol.loop_state import LoopState
@@ -230,6 +230,8 @@ ResetFactory = Callable[[np.random.Generator, ProtocolConfig], ResetStrategy]
 
 EXTRA_RESETS: dict[str, ResetFactory] = {}
 """Strategies of users by name."""
+EXTRA_KINDS = tuple(kind for kind in BEFORE_SEGMENTS if kind is not Intervention.INITIAL)
+"""What they may be counted as: a first placement, which is free, is the run's own."""
 
 
 def register_reset(name: str) -> Callable[[ResetFactory], ResetFactory]:
@@ -275,10 +277,12 @@ def make_resets(protocol: ProtocolConfig, rng: Callable[[str], np.random.Generat
     check_extra_resets(protocol.extra_resets)
     extra = tuple(EXTRA_RESETS[name](rng(f"resets/extra/{name}"), protocol) for name in protocol.extra_resets)
     for name, strategy in zip(protocol.extra_resets, extra, strict=True):
-        if getattr(strategy, "kind", None) not in BEFORE_SEGMENTS:
+        # A scene reset that is counted as something free would be a way around the budget.
+        valid = COUNTED_INTERVENTIONS if isinstance(strategy, SceneReset) else EXTRA_KINDS
+        if getattr(strategy, "kind", None) not in valid:
             raise ValueError(
                 f"{type(strategy).__name__}.kind, of --protocol.extra_resets={name}, must be an Intervention"
-                f" before a segment, one of {[kind.name for kind in BEFORE_SEGMENTS]}, got "
+                f" before a segment, one of {[kind.name for kind in valid]}, got "
                 f"{getattr(strategy, 'kind', None)!r}"
             )
     scene: ResetStrategy = (CriticSceneReset if protocol.scene_reset == "critic" else PeriodicSceneReset)(

@@ -12,7 +12,7 @@ from cronos_lerobot.evaluation.outcomes import (
     WORTH_SAYING,
     Episode,
     Outcomes,
-    pictures,
+    observed,
     read_outcomes,
     shared_episodes,
 )
@@ -254,7 +254,7 @@ def periodic_evaluation(run: TrainingRun, number: int) -> Outcomes:
         )
     start = run.starts[-1] if run.starts else {}
     env = run.config.get("env") or {}
-    setting = pictures(env.get("obs_type"), env, run.config.get("rename_map")) | {
+    setting = observed(env.get("obs_type"), env, run.config.get("rename_map")) | {
         "scene": env.get("scene"),
         "environment": start.get("environment"),
         "benchmark": (start.get("benchmark") or {}).get("fingerprint"),

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from math import hypot
-from operator import add
+from math import hypot, sqrt
+from operator import add, attrgetter
 
 import numpy as np
 from lerobot_env_cronos.statistics import wilson_interval
+from scipy.stats import t as student_t
 
 from cronos_lerobot.evaluation.rates import cluster_interval
 from cronos_lerobot.protocol.metrics import summarise, summarise_rates
@@ -85,9 +86,12 @@ class SeedRate(Rate):
     def interval(self) -> tuple[float, float]:
         """95 % t-interval of the mean over the seeds, within 0 and 1; of one, or of some all alike, that of one.
 
-        Seeds are evaluated on the same episodes: together they are no more of them.
+        Seeds are evaluated on the same episodes: together they are no more of them. Where they have other numbers
+        of episodes, it is the one of a ratio (Cochran 1977, section 6.3), which is the same for equal numbers.
         """
         seeds = [rate for rate in self.seeds if rate.n]
+        if len({rate.n for rate in seeds}) > 1:
+            return _ratio_interval(seeds)
         summary = summarise_rates([rate.value for rate in seeds])
         over_seeds = summary.ci95 if summary else None
         return over_seeds or seeds[0].interval
@@ -100,6 +104,17 @@ class SeedRate(Rate):
 
     def __str__(self) -> str:
         return super().__str__() + (f" ({len(self.seeds)} seeds)" if len(self.seeds) > 1 else "")
+
+
+def _ratio_interval(seeds: Sequence[Rate]) -> tuple[float, float]:
+    """Of all successes over all episodes of two seeds or more; of some all alike that of the one with most."""
+    k, n = len(seeds), sum(rate.n for rate in seeds)
+    value = sum(rate.successes for rate in seeds) / n
+    residuals = np.array([rate.successes - value * rate.n for rate in seeds])
+    if np.allclose(residuals, 0):
+        return max(seeds, key=attrgetter("n")).interval
+    half = float(student_t.ppf(0.975, k - 1)) * sqrt(k / (k - 1) * float(residuals @ residuals)) / n
+    return max(value - half, 0.0), min(value + half, 1.0)
 
 
 def sum_rates(rates: Iterable[Rate]) -> Rate:

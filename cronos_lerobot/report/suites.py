@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from cronos_lerobot.evaluation.outcomes import pictures
+from cronos_lerobot.evaluation.outcomes import observed_in
 from cronos_lerobot.evaluation.store import IDENTITY as IDENTITY_FILE
 from cronos_lerobot.evaluation.store import read_results
 
@@ -81,7 +81,7 @@ def _settings(results: dict[str, Any]) -> dict[str, Any]:
     identity = results.get("identity", {})
     own = {name: identity.get(name, default) for name, default in IDENTITY.items()}
     own["repetitions"] = results.get("repetitions", 1)
-    own |= pictures(results.get("obs_type"), identity.get("env") or {}, identity.get("rename_map"))
+    own |= observed_in(results)
     return {name: results.get(name) for name in DECISIVE} | own
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import math
 import sys
 import tempfile
 from collections.abc import Generator
@@ -18,8 +19,9 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.envs import EnvConfig
+from lerobot.envs.utils import env_to_policy_features
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
-from lerobot.utils.constants import CHECKPOINTS_DIR, OBS_ENV_STATE, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import ACTION, CHECKPOINTS_DIR, OBS_ENV_STATE, PRETRAINED_MODEL_DIR
 from lerobot_env_cronos import CronosEnvConfig, load_benchmark
 from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
 from lerobot_env_cronos.hub_config import is_of_this_package
@@ -76,8 +78,8 @@ class PeriodicEvaluationConfig:
             raise ValueError(f"eval.repetitions={self.repetitions} would all be alike at eval.temperature=0.")
         if self.split not in ("train", "held_out"):
             raise ValueError(f"eval.split must be 'train' or 'held_out', got {self.split!r}.")
-        if self.temperature < 0:
-            raise ValueError(f"eval.temperature must be >= 0, got {self.temperature}.")
+        if not 0 <= self.temperature < math.inf:
+            raise ValueError(f"eval.temperature must be >= 0 and finite, got {self.temperature}.")
         if self.batch_size < 1:
             raise ValueError(f"eval.batch_size must be >= 1, got {self.batch_size}.")
         if self.seed < 0:
@@ -186,8 +188,7 @@ class CronosTrainConfig:
             raise ValueError(f"--env.type must be cronos to train in, got {self.env.type!r}.")
         if not self.resume:
             self.check_env(self.env)
-            self.protocol.check_start()
-            self._check_unread()
+            self.check_start()
             self._check_base()
         check_agent(self.algorithm.type)
         check_reward(self.algorithm, self.protocol.reward)
@@ -223,8 +224,9 @@ class CronosTrainConfig:
             if (value := getattr(env, name)) != getattr(CronosEnvConfig, name):
                 raise ValueError(f"--env.{name}={value} is of lerobot-eval: {why}.")
 
-    def _check_unread(self) -> None:
-        """Refuse what has no effect beside the others."""
+    def check_start(self) -> None:
+        """Refuse what a run should not begin with, or has no effect beside the others."""
+        self.protocol.check_start()
         if not (self.eval_freq or self.eval_at_interventions):
             default = PeriodicEvaluationConfig()
             for name, value in vars(self.eval).items():
@@ -284,7 +286,12 @@ class CronosTrainConfig:
     def _show_what_is_read(self, env: CronosEnvConfig, policy: PreTrainedConfig) -> None:
         """A policy or a critic that reads the privileged state is shown it."""
         reads = OBS_ENV_STATE in (policy.input_features or {})
-        reads |= getattr(self.algorithm, "critic_observation", "policy") == "environment_state"
+        if getattr(self.algorithm, "critic_observation", "policy") == "environment_state":
+            reads = True
+            if env.obs_type == "pixels_agent_pos" and not policy.input_features:
+                # From scratch LeRobot lets the policy read all that is shown, and this is for the critic alone.
+                shown = env_to_policy_features(env)
+                policy.input_features = {key: shown[key] for key in shown.keys() - {ACTION, OBS_ENV_STATE}}
         if reads and OBS_ENV_STATE not in env.features_map.values():
             env.privileged_state = True
             env.__post_init__()

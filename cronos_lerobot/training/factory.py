@@ -31,6 +31,7 @@ from cronos_lerobot.evaluation.policy_env import (
 from cronos_lerobot.evaluation.policy_loading import load_policy
 from cronos_lerobot.evaluation.policy_source import UNDECISIVE, damage_named, load_policy_config
 from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.configurations import check_configurations
 
 
 def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1) -> CronosVectorEnv:
@@ -44,17 +45,11 @@ def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1)
     env_config = _cronos(config)
     options = _env_options(env_config, local_processes)
     env = CronosVectorEnv(num_envs, scene=env_config.scene, reward=config.protocol.reward, **options)
-    wanted = {"protocol.num_configurations": ("train", config.protocol.num_configurations)}
-    if config.eval_freq or config.eval_at_interventions:
-        wanted["eval.n_episodes"] = (config.eval.split, config.eval.n_episodes)
-    for flag, (split, count) in wanted.items():
-        available = len(env.benchmark.configurations[split])
-        if count > available:
-            env.close()
-            raise ValueError(
-                f"--{flag}={count}, but {env_config.benchmark or env_config.scene} has {available} {split}"
-                f" configurations: give --{flag}={available} or fewer."
-            )
+    try:
+        check_configurations(config, env.benchmark, str(env_config.benchmark or env_config.scene))
+    except ValueError:
+        env.close()
+        raise
     return env
 
 

@@ -6,11 +6,13 @@ import pytest
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
 from cronos_lerobot.agents import builtin, registry
-from cronos_lerobot.agents.imitation.config import ImitationConfig
+from cronos_lerobot.agents.imitation.config import DemosConfig, ImitationConfig
 from cronos_lerobot.agents.ppo.config import PaperPPOConfig, PPOConfig, SelfImitationConfig
 from cronos_lerobot.agents.steering.config import SteeringConfig
 
 assert builtin
+
+DEMOS = DemosConfig("me/demos")
 
 
 def test_a_name_is_taken_once_and_needs_a_config_to_be_offered(monkeypatch):
@@ -43,6 +45,10 @@ def test_every_agent_of_this_package_has_a_config():
         (PPOConfig(lr_schedule="fixed", kl_stop_factor=None, target_kl=0.1), {"target_kl": "kl_stop_factor"}),
         (PaperPPOConfig(kl_stop_factor=3.0), {"kl_stop_factor": "target_kl"}),
         (PPOConfig(self_imitation=SelfImitationConfig(max_age=3)), {"self_imitation.max_age": "imitation.coef"}),
+        (PPOConfig(self_imitation=SelfImitationConfig(0.1, max_age=3), demos_share=1.0, demos=DEMOS), {
+            "self_imitation.max_age": "demos_share below 1",
+        }),
+        (ImitationConfig(warmup_segments=3, demos_share=0.5, demos=DEMOS), {"warmup_segments": "demos_share=0"}),
         (ImitationConfig(gamma=0.5, max_weight=2.0), {"gamma": "weighting of return", "max_weight": "=advantage"}),
         (ImitationConfig(weighting="return", weighting_beta=1.0, max_weight=2.0), {"max_weight": "=advantage"}),
     ],
@@ -76,6 +82,7 @@ def test_settings_that_are_read_may_be_given_and_defaults_everywhere(config, giv
 
 def test_every_setting_that_may_be_unread_is_one():
     for config in (PPOConfig(value_loss="mse", lr_schedule="fixed", kl_stop_factor=None, target_kl=None),
-                   ImitationConfig()):  # fmt: skip
+                   PPOConfig(demos_share=1.0, demos=DEMOS, self_imitation=SelfImitationConfig(0.1)),
+                   ImitationConfig(demos_share=0.5, demos=DEMOS), ImitationConfig()):  # fmt: skip
         assert config.unread
         registry.check_settings(config, config.unread, resume=False)

@@ -179,6 +179,12 @@ def test_a_lerobot_policy_with_action_chunks(tmp_path, monkeypatch):
     assert results["temperature"] is None
     assert results["sequential"]["held_out"]["n"] == 6
     assert results["obs_type"] == STATE["obs_type"]
+    # It draws nothing, and would do the same again: before the first time is there, and after.
+    flags = (*flags[:2], *SMALL[::2], "--eval.suites=independent", f"--output_dir={folder / 'again'}")
+    for repetitions in (3, 2):
+        cronos_eval(monkeypatch, *flags, "--eval.batch_size=4", f"--eval.repetitions={repetitions}")
+        results = json.loads((folder / "again" / RESULTS).read_text())
+        assert (results["repetitions"], results["independent"]["held_out"]["n"]) == (1, 8)
 
 
 def test_a_lerobot_policy_does_what_it_does_in_lerobot_eval(tmp_path):

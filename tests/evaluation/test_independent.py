@@ -76,6 +76,34 @@ def test_repetitions_are_as_many_episodes_with_random_numbers_of_their_own():
     assert len({tuple(draws[i : i + 80]) for i in (0, 80, 160)}) == 3
 
 
+class Selecting(DummyPolicy):
+    """A LeRobot policy without `sample_actions`, deterministic as ACT or with noise as Diffusion."""
+
+    sample_actions = None
+    noise = 0.0
+
+    def predict_action_chunk(self, batch, **kwargs):
+        actions = torch.zeros(len(batch["observation.state"]), 1, 7)
+        return actions + self.noise * torch.randn(actions.shape) if self.noise else actions
+
+
+class Noisy(Selecting):
+    noise = 1.0
+
+
+def test_what_draws_nothing_is_not_repeated(caplog):
+    """Its repetitions would be the same episodes, and more of them no more of a sample."""
+    result = evaluate(DummyEnv(4), Selecting(), n_episodes=1, repetitions=3)
+    assert (result["n"], result["temperature"]) == (4, None)
+    assert [episode[0] for episode in result["episodes"]] == [1000] * 4
+    assert "eval.repetitions=3: the policy draws nothing" in caplog.text
+    caplog.clear()
+    result = evaluate(DummyEnv(4), Noisy(), n_episodes=1, repetitions=3)
+    assert (result["n"], caplog.text) == (12, "")
+    assert evaluate(DummyEnv(4), Selecting(), n_episodes=1)["n"] == 4
+    assert not caplog.text
+
+
 def test_it_leaves_the_global_generators_and_the_policys_mode_alone():
     policy = DummyPolicy(seed=1).train()
     torch.manual_seed(0)

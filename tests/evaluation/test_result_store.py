@@ -19,7 +19,7 @@ ENVIRONMENT = {"environment": "lerobot_env_cronos/kitchen_2x2-v1"}
 class Idle:
     """An actor that stands still, the gripper open."""
 
-    is_per_environment, temperature = True, None
+    is_per_environment, temperature, drew = True, None, False
 
     def seed(self, seed):
         """Draws nothing."""

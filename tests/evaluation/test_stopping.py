@@ -80,7 +80,7 @@ def test_it_goes_on_after_a_kill_and_says_if_it_cannot_tell(tmp_path, monkeypatc
 class Recorder:
     """Does nothing, and tells what it is seeded with."""
 
-    is_per_environment, temperature = True, None
+    is_per_environment, temperature, drew = True, None, False
 
     def __init__(self):
         self.seeds = []

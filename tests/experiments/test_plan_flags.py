@@ -42,6 +42,30 @@ def test_settings_of_a_policy_of_ones_own_hold_where_its_curves_begin():
 
 
 @pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (["--protocol.num_configurations=65"], "num_configurations=65, but kitchen_2x2 has 64 train config"),
+        (["--save_checkpoint=false", "--keep_checkpoints=3"], "keep_checkpoints=3 is of checkpoints"),
+        (
+            ["--protocol.takeover_after=2", "--protocol.takeover_price=3", "--protocol.reset_budget=1"],
+            "reset_budget=1 pays for no takeover",
+        ),
+        (
+            ["--algorithm.type=imitation", "--algorithm.weighting=return", "--protocol.reward=level"],
+            "weighting=return with --protocol.reward=level",
+        ),
+    ],
+)
+def test_what_a_run_would_be_refused_for_at_its_start_is_refused_before_the_base_is_made(extra, message):
+    jobs = jobs_of("table1", ["t80"], scale="small", extra=tuple(extra))
+    with pytest.raises(ValueError, match=rf"t80_307k/seed1 would not begin: .*{message}"):
+        check_commands(jobs.values())
+    if "num_configurations" in extra[0]:
+        # A benchmark of the Hub may have as many.
+        check_commands(jobs_of("table1", ["t80"], extra=(*extra, "--env.benchmark=me/large")).values())
+
+
+@pytest.mark.parametrize(
     ("flag", "obs_type", "is_refused"),
     [
         ("camera_name=bridge", PIXELS, True),

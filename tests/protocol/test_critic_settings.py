@@ -1,5 +1,7 @@
 """Which settings of values that choose are taken, and which are refused and how."""
 
+import math
+
 import pytest
 from test_rf_mtrl import protocol
 
@@ -59,8 +61,12 @@ def test_critics_settings_are_taken_where_something_may_read_them(name, value, o
 
 
 @pytest.mark.parametrize(
-    "options", [{"certain_value": 0}, {"floor": 0}, {"sharpness": -1}, {"failures": 0}, {"failures": 17}]
-)
+    "options",
+    [
+        {"certain_value": 0}, {"floor": 0}, {"sharpness": -1}, {"failures": 0}, {"failures": 17},
+        {"certain_value": math.nan}, {"certain_value": math.inf}, {"floor": math.nan}, {"sharpness": math.nan},
+    ],
+)  # fmt: skip
 def test_critics_settings_out_of_range_are_named(options):
     with pytest.raises(ValueError, match=f"protocol.critic.{next(iter(options))} must be"):
         CriticConfig(**options)

@@ -11,6 +11,7 @@ from cronos_lerobot.protocol.loop_state import SegmentEnd, Step
 from cronos_lerobot.protocol.resets import (
     EXTRA_RESETS,
     EndEffectorReset,
+    PeriodicSceneReset,
     ResetStrategy,
     check_extra_resets,
     register_reset,
@@ -210,7 +211,21 @@ def test_a_scene_reset_of_an_extra_strategy_takes_the_place_of_the_periodic_one_
         del EXTRA_RESETS["second"]
 
 
-@pytest.mark.parametrize("kind", [None, Intervention.NONE, Intervention.TAKEOVER])
+def test_a_scene_reset_is_counted_whatever_a_strategy_calls_it():
+    """Called an end-effector reset it would be free, and a way around the budget."""
+
+    @register_reset("free")
+    class Free(PeriodicSceneReset):
+        kind = Intervention.END_EFFECTOR_RESET
+
+    try:
+        with pytest.raises(ValueError, match=r"Free\.kind, .*one of \['SCENE_RESET', 'HEURISTIC_RESET', 'DIVERG"):
+            run(protocol(extra_resets=["free"]), 8)
+    finally:
+        del EXTRA_RESETS["free"]
+
+
+@pytest.mark.parametrize("kind", [None, Intervention.NONE, Intervention.INITIAL, Intervention.TAKEOVER])
 def test_a_strategy_that_does_not_say_what_it_counts_as_is_refused_before_the_run(kind):
     @register_reset("unnamed")
     class Unnamed(EndEffectorReset):

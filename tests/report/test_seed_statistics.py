@@ -33,6 +33,20 @@ def test_seeds_that_are_all_alike_do_not_say_that_every_training_is():
     assert SeedRate.of([Rate(9, 10), Rate(0, 0)]).interval == Rate(9, 10).interval
 
 
+def test_a_rate_of_seeds_with_other_numbers_of_episodes_lies_in_its_interval():
+    # 15 of 30; 1 - .5 * 10 = -4 and 14 - .5 * 20 = 4: 12.706 * sqrt(2 * 32) / 30 is more than a half to each side.
+    assert SeedRate.of([Rate(1, 10), Rate(14, 20)]).interval == (0.0, 1.0)
+    # 30 of 60; -1, 2, -1: 4.3027 * sqrt(1.5 * 6) / 60.
+    rate = SeedRate.of([Rate(4, 10), Rate(12, 20), Rate(14, 30)])
+    assert rate.value == 0.5
+    assert rate.interval == pytest.approx((0.2849, 0.7151), abs=1e-4)
+    # 915 of 1030: the mean of .9, .5, .5 and .5 lies far below.
+    low, high = SeedRate.of([Rate(900, 1000), *[Rate(5, 10)] * 3]).interval
+    assert low < 915 / 1030 < high
+    # Some that are all alike: the largest one's.
+    assert SeedRate.of([Rate(1, 2), Rate(50, 100)]).interval == Rate(50, 100).interval
+
+
 def test_chains_from_one_configuration_go_together():
     one = ChainRate.of([True, True, False, False], range(4))
     # One from each configuration: Wilson's of 2 of 4, .5 -+ z sqrt(.25 / 4 + z^2 / 64) / (1 + z^2 / 4).

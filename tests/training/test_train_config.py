@@ -8,6 +8,7 @@ import yaml
 from draccus.utils import DecodingError
 from dummies import DummyPolicyConfig
 from flags import parse_flags
+from lerobot.policies import make_policy
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot_env_cronos import CronosEnvConfig
 
@@ -244,6 +245,28 @@ def test_what_has_an_effect_or_is_given_by_every_command_of_a_study_is_taken(opt
     """They end at the policy, which is missing."""
     with pytest.raises(ValueError, match="Choose a policy"):
         CronosTrainConfig(env=CronosEnvConfig(), **options).validate()
+
+
+def test_the_privileged_state_is_the_critics_alone_beside_a_policy_from_scratch(tmp_path):
+    """LeRobot lets a policy without features of its own read all that the environment shows."""
+    algorithm = PPOConfig(critic_observation="environment_state")
+    run = CronosTrainConfig(
+        CronosEnvConfig(),
+        ACTConfig(device="cpu", pretrained_backbone_weights=None),
+        tmp_path / "run",
+        algorithm=algorithm,
+    )
+    run.validate()
+    assert run.env.privileged_state
+    assert set(run.policy.input_features) == {"observation.state", "observation.images.front"}
+    assert make_policy(run.policy, env_cfg=run.env).config.env_state_feature is None
+    # What is trained from the state reads it.
+    env = CronosEnvConfig(obs_type="environment_state_agent_pos")
+    run = CronosTrainConfig(
+        env, ACTConfig(device="cpu", pretrained_backbone_weights=None), tmp_path / "run", algorithm=algorithm
+    )
+    run.validate()
+    assert make_policy(run.policy, env_cfg=run.env).config.env_state_feature is not None
 
 
 def test_help_teaches(monkeypatch, capsys):

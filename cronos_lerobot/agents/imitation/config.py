@@ -106,6 +106,8 @@ class ImitationConfig(RLAlgorithmConfig):
             needs |= dict.fromkeys(("weighting_beta", "gamma"), "an --algorithm.weighting of return or advantage")
         if self.weighting != "advantage":
             needs["max_weight"] = "--algorithm.weighting=advantage"
+        if self.demos_share:
+            needs["warmup_segments"] = "--algorithm.demos_share=0"
         return needs
 
     def check_reward(self, reward: str) -> None:

@@ -272,6 +272,9 @@ class PPOConfig(RLAlgorithmConfig):
         if not self.self_imitation.coef:
             names = (f"self_imitation.{name}" for name in SELF_IMITATION_RANGES if name != "coef")
             needs |= dict.fromkeys(names, "an --algorithm.self_imitation.coef above 0")
+        elif self.demos_share == 1:
+            names = (f"self_imitation.{name}" for name in ("max_age", "tail_steps", "memory_gib"))
+            needs |= dict.fromkeys(names, "an --algorithm.demos_share below 1")
         return needs
 
     @classmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from cronos_lerobot.agents.ppo.config import ABOVE_0, COUNT, SHARE, Interval
@@ -71,6 +72,8 @@ class SteeringConfig(AgentConfig):
         for name, interval in RANGES.items():
             if (value := getattr(self, name)) not in interval:
                 raise ValueError(f"algorithm.{name} must be {interval}, got {value}.")
+        if not math.isfinite(self.target_entropy):
+            raise ValueError(f"algorithm.target_entropy must be finite, got {self.target_entropy}.")
         if self.observation not in OBSERVATIONS:
             raise ValueError(f"algorithm.observation must be one of {OBSERVATIONS}, got {self.observation!r}.")
         if self.num_target_critics > self.num_critics:
