@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,9 @@ DEMONSTRATIONS, STREAMS = "demonstrations", "streams"
 KINDS = (DEMONSTRATIONS, STREAMS)
 NO_FLAGS = ("root", "discover_packages_path", "features", "features_map")
 """Fields that are left out: folders of whoever made the dataset, and what follows from the flags."""
+
+CHANGEABLE = ("protocol.", "algorithm.")
+"""What the flags begin with that a resumed run may change."""
 
 MAYBE_FOLDERS = ("benchmark", "policy", "pretrained_path", "checkpoint", "adapter")
 """Fields that name a folder or something on the Hub; of a folder only that it was one. A hash says which."""
@@ -49,6 +52,14 @@ class Origin:
     commit: str | None = None
     start_policy: str | None = None
     """Of demonstrations that begin where a policy left the scene: a hash of that policy's files."""
+    gone_on: list[dict[str, Any]] = field(default_factory=list)
+    """Of streams, where their run went on with other flags of protocol or algorithm: the number of `episodes`
+    before that, of the recording before any filter, and the `flags` that hold from there on, the changed ones."""
+
+    def values(self, flag: str, default: Any) -> list[Any]:
+        """Everything that a flag has been, in its order; its default where none is said."""
+        changes = [change["flags"] for change in self.gone_on if flag in change["flags"]]
+        return [self.flags.get(flag, default), *(change[flag] for change in changes)]
 
     @property
     def scene(self) -> str:
@@ -111,6 +122,25 @@ def write_origin(root: Path, origin: Origin) -> None:
         file.flush()
         os.fsync(file.fileno())
     partial.replace(root / ORIGIN)
+
+
+def with_changes(there: Origin, here: Origin, num_episodes: int) -> Origin:
+    """The origin of streams that go on after `num_episodes`, with the flags that have changed since they began.
+
+    Args:
+        there: of the dataset.
+        here: of what is to be appended.
+        num_episodes: that the dataset keeps; what had changed after them has not.
+    """
+    kept = [change for change in there.gone_on if change["episodes"] < num_episodes]
+    # As JSON gives them back: a tuple is a list.
+    now, before = json.loads(json.dumps([here.flags, there.flags]))
+    for change in kept:
+        before |= change["flags"]
+    names = [name for name in now if name.startswith(CHANGEABLE) and now[name] != before.get(name)]
+    if names and there.flags:
+        kept.append({"episodes": num_episodes, "flags": {name: now[name] for name in sorted(names)}})
+    return replace(there, gone_on=kept)
 
 
 def read_origin(root: Path, features: Mapping[str, Mapping[str, Any]], what: str) -> Origin:

@@ -27,6 +27,7 @@ from lerobot.utils.constants import REWARD
 from lerobot_env_cronos.vector_env import GRASP_REWARD, SUCCESS_REWARD
 
 from cronos_lerobot.agents.ppo.gae import compute_gae
+from cronos_lerobot.data.origin import Origin
 from cronos_lerobot.data.schema import STEP, STREAM_ID, SUCCESS, VALUE
 from cronos_lerobot.data.streams import StreamDataset
 
@@ -97,6 +98,8 @@ def write_progress(streams: StreamDataset, output: Path, weighting: Weighting) -
     if output.is_dir():
         raise ValueError(f"{output} is a folder; name a file in it, {output / 'progress.parquet'} say")
     flags = streams.origin.flags
+    if weighting.weight_by == ADVANTAGE:
+        _check_discounts(streams.origin, weighting)
     gamma, gae_lambda = weighting.discounts(flags)
     made_with: dict[str, Any] = {"dataset": streams.repo_id, "weight_by": weighting.weight_by, "gamma": gamma}
     frames = streams.annotations([*INDICES, STREAM_ID, STEP, REWARD, SUCCESS, VALUE])
@@ -133,6 +136,15 @@ def _progress_rows(frames: pd.DataFrame, reward: str, gamma: float) -> list[np.n
     return rows
 
 
+def _check_discounts(origin: Origin, weighting: Weighting) -> None:
+    for name, given in (("gamma", weighting.gamma), ("gae_lambda", weighting.gae_lambda)):
+        values = origin.values(f"algorithm.{name}", None)
+        if given is None and len(values) > 1:
+            raise ValueError(
+                f"the recorded run was gone on with another --algorithm.{name}, {values}: say which with --{name}"
+            )
+
+
 def _check_values(frames: pd.DataFrame) -> None:
     values, episodes = frames[VALUE].to_numpy(), frames["episode_index"].to_numpy()
     instead = f"; --weight_by={PROGRESS} needs none"
@@ -145,7 +157,8 @@ def _check_values(frames: pd.DataFrame) -> None:
         raise ValueError(f"{VALUE} is 0 in every frame: who chose these actions had no critic{instead}")
     # The value of a decision is recorded with each of its actions: two a decision repeat half of them. The flags
     # need not tell, as those of a policy of one's own, and are lost with LeRobot's tools.
-    within = episodes[1:] == episodes[:-1]
+    # Before the first update a critic may say 0 of everything.
+    within = (episodes[1:] == episodes[:-1]) & (values[1:] != 0)
     repeated = int((within & (values[1:] == values[:-1])).sum())
     if repeated > within.sum() / 3:
         raise ValueError(
@@ -179,7 +192,7 @@ def reward_levels(rewards: np.ndarray, successes: np.ndarray, reward: str) -> np
         before, after = 0.0, rewards
     else:
         gained = np.cumsum(rewards)
-        before = SUCCESS_REWARD - gained[successes.argmax()] if successes.any() else -min(0.0, gained.min())
+        before = SUCCESS_REWARD - gained[successes.argmax()] if successes.any() else _lowest_start(gained)
         after = before + gained
     levels = np.round([before, *after], 1)
     is_level = np.isin(levels, np.round([0, GRASP_REWARD, SUCCESS_REWARD], 1))
@@ -189,6 +202,13 @@ def reward_levels(rewards: np.ndarray, successes: np.ndarray, reward: str) -> np
         # Found complete: no task can be done in one step.
         levels[0] = SUCCESS_REWARD
     return levels
+
+
+def _lowest_start(gained: np.ndarray) -> float:
+    """The lowest level from which what a segment without success gained leads to levels alone; 0 if none does."""
+    starts = (0.0, GRASP_REWARD, SUCCESS_REWARD)
+    valid = [start for start in starts if np.isin(np.round(start + gained, 1), np.round(starts, 1)).all()]
+    return valid[0] if valid else 0.0
 
 
 def progress(levels: np.ndarray, gamma: float) -> np.ndarray:

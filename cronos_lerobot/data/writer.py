@@ -23,7 +23,15 @@ from lerobot.datasets.utils import INFO_PATH
 from lerobot.utils.constants import DEFAULT_FEATURES
 
 from cronos_lerobot.data.drawing import UndrawnFrames
-from cronos_lerobot.data.origin import Origin, check_same, marked, read_origin, write_origin
+from cronos_lerobot.data.origin import (
+    STREAMS,
+    Origin,
+    check_same,
+    marked,
+    read_origin,
+    with_changes,
+    write_origin,
+)
 from cronos_lerobot.data.schema import Features, frame_format
 from cronos_lerobot.data.storage import INCOMPLETE, Shard, next_shard_index, truncate
 from cronos_lerobot.data.video import MAX_FILE_DURATION_S, VideoFile, fast_encoder
@@ -153,6 +161,8 @@ class SegmentWriter:
                 there = read_origin(meta.root, meta.features, f"the dataset in {root}")
                 check_same(there, origin, f"the dataset in {root}", may_differ)
             truncate(meta, meta.info.total_episodes if state is None else state["num_episodes"])
+            if origin is not None and origin.kind == STREAMS:
+                write_origin(meta.root, with_changes(there, origin, meta.info.total_episodes))
             writer._start(meta, encoder, max_pending_bytes, flush_interval_s)
             on_failure.pop_all()
         return writer

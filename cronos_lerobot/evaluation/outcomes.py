@@ -37,7 +37,12 @@ def observed(obs_type: str | None, env: Mapping[str, Any], rename_map: Mapping[s
 def observed_in(results: Mapping[str, Any]) -> dict[str, Any]:
     """The same of a results.json, whose identity has the task apart, and only where it is shown."""
     identity = results.get("identity") or {}
-    env = {**(identity.get("env") or {}), "task_observation": identity.get("task_observation", "none")}
+    env = {
+        **(identity.get("env") or {}),
+        "task_observation": identity.get("task_observation", "none"),
+        # What PocketVLA is shown is for its critic. Earlier versions do not say it.
+        "privileged_state": results.get("reads_privileged_state"),
+    }
     return observed(results.get("obs_type"), env, identity.get("rename_map"))
 
 

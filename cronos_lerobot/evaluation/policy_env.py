@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -38,6 +39,27 @@ def observations_of(features: Features) -> dict[str, Any]:
     # LeRobot passes images of another size on without a word.
     _, height, width = next(iter(images.values())).shape
     return derived | {"observation_height": height, "observation_width": width}
+
+
+def reads_privileged_state(config: PreTrainedConfig) -> bool:
+    """Whether a policy acts on the bodies' poses beside its pictures, which no robot has.
+
+    LeRobot makes an input of all that a dataset has. A policy with a critic of its own on them, PocketVLA, has
+    them among its inputs for that alone.
+    """
+    inputs = config.input_features or {}
+    has_pictures = any(feature.type is FeatureType.VISUAL for feature in inputs.values())
+    return has_pictures and OBS_ENV_STATE in inputs and not hasattr(config, "critic_observation")
+
+
+def warn_of_privileged_state(config: PreTrainedConfig) -> None:
+    """Log that a policy reads what no robot has, if it does."""
+    if reads_privileged_state(config):
+        logging.warning(
+            "The policy reads %s beside its pictures, the poses of all bodies, which no robot has: it was cloned "
+            "from a dataset that shows them (--env.privileged_state=true).",
+            OBS_ENV_STATE,
+        )
 
 
 def trained_scene(path: Path | None) -> dict[str, str]:

@@ -21,6 +21,7 @@ from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
 from cronos_lerobot.evaluation.config import CronosEvalConfig
 from cronos_lerobot.evaluation.film import film_best_and_worst, note_drawings
 from cronos_lerobot.evaluation.plan import Part, first_name
+from cronos_lerobot.evaluation.policy_env import reads_privileged_state, warn_of_privileged_state
 from cronos_lerobot.evaluation.results import independent_results, sequential_results
 from cronos_lerobot.evaluation.store import (
     ANEW,
@@ -269,6 +270,7 @@ class Evaluation:
         config = self.config
         if config.policy is None:
             return ExpertActor(env)
+        warn_of_privileged_state(config.policy)
         return load_actor(config.policy, self.env_config, config.eval.temperature, config.rename_map)
 
     def _close_env(self) -> None:
@@ -298,6 +300,7 @@ class Evaluation:
                 "source": self.benchmark.source,
             },
             "obs_type": self.env_config.obs_type,
+            "reads_privileged_state": config.policy is not None and reads_privileged_state(config.policy),
             # Parts of earlier commits do not say it.
             "temperature": finished[0].get("temperature", config.eval.temperature),
             "seed": config.seed,

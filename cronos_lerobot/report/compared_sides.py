@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from lerobot.utils.constants import OBS_ENV_STATE
+
 from cronos_lerobot.evaluation.outcomes import (
     AGREE_IN_CHAINS,
     WORTH_SAYING,
@@ -253,7 +255,10 @@ def periodic_evaluation(run: TrainingRun, number: int) -> Outcomes:
             " checkpoint with cronos-eval"
         )
     start = run.starts[-1] if run.starts else {}
-    env = run.config.get("env") or {}
+    env, policy = dict(run.config.get("env") or {}), run.config.get("policy") or {}
+    # What PocketVLA is shown is for its critic.
+    is_read = OBS_ENV_STATE in (policy.get("input_features") or {}) and "critic_observation" not in policy
+    env["privileged_state"] = env.get("privileged_state") and is_read
     setting = observed(env.get("obs_type"), env, run.config.get("rename_map")) | {
         "scene": env.get("scene"),
         "environment": start.get("environment"),

@@ -27,6 +27,7 @@ from cronos_lerobot.evaluation.policy_env import (
     check_task_observation,
     scene_of_dataset,
     trained_scene,
+    warn_of_privileged_state,
 )
 from cronos_lerobot.evaluation.policy_loading import load_policy
 from cronos_lerobot.evaluation.policy_source import UNDECISIVE, damage_named, load_policy_config
@@ -111,6 +112,7 @@ def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any
             return policy, *make_pre_post_processors(policy_config)
         if not config.resume:
             warn_of_actor(policy_config, config.algorithm.type)
+            warn_of_privileged_state(policy_config)
             warn_of_other_scene(policy_config, env_config.scene)
         # Like lerobot-train: the checkpoint's processors, on the device of this run.
         device = {"device_processor": {"device": policy_config.device}}

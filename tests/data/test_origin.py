@@ -11,7 +11,7 @@ from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.config import CronosEnvConfig
 from synthetic_streams import ORIGIN, record
 
-from cronos_lerobot.data.origin import check_same, flags_of, read_origin
+from cronos_lerobot.data.origin import Origin, check_same, flags_of, read_origin, with_changes
 from cronos_lerobot.data.perturbations import NoiseConfig
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.stream_filter import SegmentFilter, filter_streams
@@ -58,6 +58,23 @@ def test_a_dataset_names_no_folder_of_its_makers_policy(tmp_path):
     assert flags_of(config)["pretrained_path"] == "a folder"
     config.pretrained_path = "me/on_the_hub"
     assert flags_of(config)["pretrained_path"] == "me/on_the_hub"
+
+
+def test_streams_say_with_which_flags_their_run_went_on():
+    def origin(**flags):
+        return Origin("streams", "lerobot_env_cronos/kitchen_2x2-v1", "1f", flags={"seed": 1} | flags)
+
+    one, other = {"algorithm.gamma": 0.99, "protocol.curriculum": ()}, {"algorithm.gamma": 0.9}
+    begun = with_changes(origin(**one), origin(**one | {"protocol.curriculum": []}, seed=2), 4)
+    assert begun.gone_on == []
+    changed = with_changes(begun, origin(**one | other), 8)
+    assert changed.gone_on == [{"episodes": 8, "flags": other}]
+    # On with the same, then back to the first; from a checkpoint before it, as if it had not been.
+    assert with_changes(changed, origin(**one | other), 12) == changed
+    back = with_changes(changed, origin(**one), 16)
+    assert back.gone_on[1:] == [{"episodes": 16, "flags": {"algorithm.gamma": 0.99}}]
+    assert back.values("algorithm.gamma", None) == [0.99, 0.9, 0.99]
+    assert with_changes(back, origin(**one), 6).gone_on == []
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,27 @@ def write(root: Path, output: Path, **options) -> pd.DataFrame:
     return pd.read_parquet(output)
 
 
+def test_what_was_found_complete_and_taken_away_has_levels():
+    # Complete when the segment began, lifted by its first action (0.1), dropped by the fourth, or never.
+    lifted = np.array([-0.9, 0, 0, 0])
+    never = np.zeros(4, bool)
+    assert reward_levels(lifted, never, "difference").tolist() == [1, 0.1, 0.1, 0.1, 0.1]
+    assert reward_levels(lifted - [0, 0, 0, 0.1], never, "difference").tolist() == [1, 0.1, 0.1, 0.1, 0]
+    # A grasp that it began with and lost.
+    assert reward_levels(np.array([0, -0.1]), never[:2], "difference").tolist() == [0.1, 0.1, 0]
+    assert reward_levels(np.array([-0.5, 0]), never[:2], "difference") is None
+
+
+def test_discounts_of_a_run_that_changed_them_are_asked_for(tmp_path):
+    record_weighted(tmp_path / "streams")
+    streams = StreamDataset("me/stream", tmp_path / "streams", streaming=True)
+    change = {"episodes": 3, "flags": {"algorithm.gamma": 0.9}}
+    streams.origin = replace(streams.origin, flags={"algorithm.gamma": 0.99}, gone_on=[change])
+    with pytest.raises(ValueError, match=r"another --algorithm\.gamma, \[0\.99, 0\.9\]: say which with --gamma"):
+        write_progress(streams, tmp_path / "out.parquet", Weighting(weight_by="advantage"))
+    write_progress(streams, tmp_path / "out.parquet", Weighting(weight_by="advantage", gamma=0.9))
+
+
 def test_progress_of_every_frame(root, tmp_path):
     rows = write(root, tmp_path / "new/progress.parquet", gamma=GAMMA)
     np.testing.assert_array_equal(rows["index"], np.arange(26))

@@ -112,6 +112,13 @@ def test_config_errors_name_the_bad_value(field, value, caplog):
     assert str(value) in caplog.text
 
 
+@pytest.mark.parametrize("configurations", [[], [64], [-1], [1.7], [True, False], 3])
+def test_configurations_that_are_none_are_named(configurations):
+    """A mask would be taken for indices 1 and 0."""
+    with pytest.raises(ValueError, match=re.escape(f"one or more of 0..63, got {configurations!r}")):
+        IndependentVectorEnv(1, task=TASK, obs_type=STATE, configurations=configurations)
+
+
 @pytest.mark.parametrize("obs_type", ["pixels_agent_pos", STATE])
 def test_every_camera_is_looked_up_when_the_config_is_made(obs_type):
     """Videos are drawn from the first one, whatever the policy sees."""

@@ -104,6 +104,10 @@ def test_without_autoreset_the_mask_says_who_starts_again():
     assert env.unwrapped.done.tolist() == [True, False, True]
     np.testing.assert_array_equal(env.unwrapped.simulation.qpos[[0, 2]], before[[0, 2]])
     np.testing.assert_allclose(env.unwrapped.simulation.body_poses()[1], poses[9], atol=1e-9)
+    # Seeds as Gymnasium's other vector environments take them.
+    seeds = [3, 1, 2]
+    for given in (seeds, np.array(seeds), tuple(seeds)):
+        assert (env.reset(seed=given)[0]["agent_pos"] == env.reset(seed=seeds)[0]["agent_pos"]).all()
     with pytest.raises(ValueError, match=r"reset_mask must be \(3,\) bool with a True in it"):
         env.reset(options={"reset_mask": np.zeros(3, dtype=bool)})
     with pytest.raises(

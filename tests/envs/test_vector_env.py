@@ -269,6 +269,8 @@ def test_a_simulation_that_diverges_while_its_bodies_settle_is_put_back(monkeypa
         ({"obs_type": "pixels"}, "unknown obs_type 'pixels'.*pixels_agent_pos"),
         ({"num_threads": -3}, "num_threads must be at least 0 .*got -3"),
         ({"camera_name": "top"}, "unknown camera 'top'.*bridge.*front"),
+        ({"observation_height": 0}, "must be at least 1, got 0, 128 and"),
+        ({"render_size": (1, 2, 3)}, r"must be at least 1, got 128, 128 and \(1, 2, 3\)"),
     ],
 )
 def test_errors_name_the_bad_value_and_the_valid_ones(kwargs, message):
@@ -276,6 +278,8 @@ def test_errors_name_the_bad_value_and_the_valid_ones(kwargs, message):
         make(1, **kwargs)
     with pytest.raises(ValueError, match="unknown task"):
         make(1).set_task([0], [Task("banana", PLATE)])
+    with pytest.raises(ValueError, match=r"seeds must be whole numbers, .*got \[1, None\]"):
+        make(2).reset(seed=[1, None])
 
 
 INTERVENTIONS = {

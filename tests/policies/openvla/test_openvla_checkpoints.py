@@ -125,6 +125,14 @@ def test_bad_settings_are_refused(published):
         OpenVLAPolicy(OpenVLAConfig(input_features=INPUTS, output_features=OUTPUTS, device="cpu"))
     with pytest.raises(ValueError, match=r"'audio'.*projector"):
         make_config(published, lora_modules=["audio"])
+    for bad, message in (
+        ({"merge_adapter": True}, "give it as adapter"),
+        ({"lora_alpha": 32}, "lora_alpha=32 must be above 0, beside a lora_rank above 0, got 0"),
+        ({"lora_rank": 4, "lora_alpha": -5}, "lora_alpha=-5 must be above 0"),
+        ({"lora_rank": 4, "lora_dropout": 2.0}, "lora_dropout=2.0 must be at least 0 and below 1"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_config(published, **bad)
     with pytest.raises(ValueError, match="'fp8'"):
         make_config(published, dtype="fp8")
     with pytest.raises(ValueError, match="merge_adapter"):

@@ -46,6 +46,8 @@ def test_the_head_decides_the_class():
         ({"head": "flow", "chunk_size": 4, "n_action_steps": 5}, r"n_action_steps=5 .*at most chunk_size=4"),
         ({"head": "flow", "chunk_size": 0}, "chunk_size=0"),
         ({"head": "gaussian", "chunk_size": 4}, "chunk_size=4: head=gaussian predicts one action"),
+        ({"head": "flow", "temperature": 0.0}, "temperature=0.0 is of the bins .*head=flow has none"),
+        ({"keypoints": 0}, "keypoints=0 must be at least 1"),
         ({"head": "flow", "num_inference_steps": 0}, "num_inference_steps=0 must be at least 1"),
         ({"head": "diffusion"}, r"head='diffusion' is not one of \['gaussian', 'categorical', 'flow'\]"),
     ],

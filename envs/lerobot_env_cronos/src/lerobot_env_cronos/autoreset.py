@@ -77,7 +77,8 @@ class CronosGymVectorEnv(IndependentVectorEnv):
         mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             raise ValueError(f"reset_mask must be ({self.num_envs},) bool with a True in it, got {mask}")
-        seeds = [None if seed is None else seed + i for i in self._all] if not isinstance(seed, Sequence) else seed
+        is_one = seed is None or isinstance(seed, int | np.integer)
+        seeds = [None if seed is None else seed + i for i in self._all] if is_one else list(seed)
         if len(seeds) != self.num_envs:
             raise ValueError(f"got {len(seeds)} seeds for {self.num_envs} environments")
         ids = self._all[mask]

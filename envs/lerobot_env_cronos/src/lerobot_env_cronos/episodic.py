@@ -41,8 +41,7 @@ class EpisodicVectorEnv(CronosVectorEnv):
         check_split(split)
         self.split = split
         super().__init__(num_envs, scene, **kwargs)
-        everywhere = range(len(self.benchmark.configurations[split]))
-        self.starts = np.array(everywhere if configurations is None else configurations, dtype=int)
+        self.starts = _choose(configurations, len(self.benchmark.configurations[split]))
         self.done = np.zeros(num_envs, dtype=bool)
         self._last: dict[str, Any] | None = None
 
@@ -172,7 +171,7 @@ class CronosEnv(gym.Env):
         render_mode: None or `rgb_array`.
         **kwargs: see `CronosVectorEnv`.
 
-    `reset(options={"configuration": i})` picks configuration i; otherwise it is drawn from the seeded generator.
+    `reset(options={"configuration": i})` picks the i-th of `configurations`; otherwise the seeded generator draws.
     An episode is terminated when its task is complete and truncated after 80 steps. It stays so until the next
     `reset`: further steps change nothing, pay nothing, and return the same observation and flags.
     """
@@ -231,6 +230,17 @@ class CronosEnv(gym.Env):
     def close(self) -> None:
         """Free the renderers."""
         self._env.close()
+
+
+def _choose(configurations: Sequence[int] | None, available: int) -> np.ndarray:
+    """The configurations that episodes start from, all by default."""
+    if configurations is None:
+        return np.arange(available)
+    chosen = np.asarray(configurations)
+    is_list = chosen.ndim == 1 and chosen.size > 0 and np.issubdtype(chosen.dtype, np.integer)
+    if not is_list or chosen.min() < 0 or chosen.max() >= available:
+        raise ValueError(f"configurations must be one or more of 0..{available - 1}, got {configurations!r}")
+    return chosen
 
 
 def draw_start(

@@ -127,6 +127,8 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         seeds = seed + self._all if isinstance(seed, int | np.integer) else np.asarray(seed)
         if len(seeds) != self.num_envs:
             raise ValueError(f"got {len(seeds)} seeds for {self.num_envs} environments")
+        if not np.issubdtype(seeds.dtype, np.integer):
+            raise ValueError(f"seeds must be whole numbers, one for each environment, got {seed!r}")
         return starts[seeds % len(starts)]
 
     def step(self, actions: np.ndarray):
@@ -277,7 +279,10 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         self._judge(ids)
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """Everything that decides the future, as numpy arrays; see `Simulation.get_state`."""
+        """Everything that decides what steps do, as numpy arrays; see `Simulation.get_state`.
+
+        Not what a `reset()` without a seed will draw.
+        """
         state = self.simulation.get_state()
         valid = self.scene.tasks + self.scene.reset_tasks
         return state | {

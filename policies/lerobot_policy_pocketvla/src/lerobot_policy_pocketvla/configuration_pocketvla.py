@@ -1,5 +1,6 @@
 """Configuration of the PocketVLA policy."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -64,7 +65,8 @@ class PocketVLAConfig(PreTrainedConfig):
     """Largest logit of the gripper's sign (`gaussian` head): at temperature 1 the less likely command keeps a
     probability of 0.7 %, so that reinforcement learning still explores when to close and open."""
     temperature: float = 0.6
-    """Sampling temperature of `select_action`: logits are divided by it; 0 takes the likeliest bin."""
+    """Sampling temperature of `select_action`: logits are divided by it; 0 takes the likeliest bin. `flow`,
+    which begins with noise, has none."""
     action_bounds: BoundsSource = "bridge_orig"
     """Physical actions that -1 and 1 stand for: the 1st and 99th percentile of BridgeData V2, as in OpenVLA
     (7 dimensions), or the data set's own minimum and maximum. Fixed at the first training."""
@@ -155,11 +157,20 @@ class PocketVLAConfig(PreTrainedConfig):
                 "0 < sigma_min < sigma_init < sigma_max is needed, got "
                 f"{self.sigma_min}, {self.sigma_init}, {self.sigma_max}"
             )
-        if self.temperature < 0:
+        if not 0 <= self.temperature < math.inf:
             raise ValueError(f"temperature={self.temperature} must be 0 (greedy) or more")
+        if self.head == "flow" and self.temperature != PocketVLAConfig.temperature:
+            raise ValueError(
+                f"temperature={self.temperature} is of the bins that head=gaussian and head=categorical draw; "
+                "head=flow has none: leave it out"
+            )
         for name, least in (
             ("num_bins", 2),
             ("hidden_depth", 1),
+            ("hidden_width", 1),
+            ("task_width", 1),
+            ("value_width", 1),
+            ("keypoints", 1),
             ("vocabulary_size", 2),
             ("random_shift_px", 0),
             ("num_inference_steps", 1),

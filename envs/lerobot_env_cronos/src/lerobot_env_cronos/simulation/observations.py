@@ -74,6 +74,11 @@ class ObservationBuilder:
             raise ValueError(f"unknown obs_type {obs_type!r}; valid obs_types: {list(OBS_TYPES)}")
         if renderer not in RENDERERS:
             raise ValueError(f"unknown renderer {renderer!r}; valid renderers: {list(RENDERERS)}")
+        if len(render_size) != 2 or min(height, width, *render_size) < 1:
+            raise ValueError(
+                "observation_height, observation_width and render_size, height and width, must be at least 1, got "
+                f"{height}, {width} and {tuple(render_size)}"
+            )
         self.renderer = renderer
         self.cameras = parse_camera_names(camera_name)
         for camera in self.cameras:
