@@ -72,7 +72,9 @@ def make_status_table(root: Path) -> Table:
     for name, number in submitted.items():
         if name not in seen and number in queue:
             state, reason = queue[number]
-            table.add_row(name, state.lower(), "", reason, "", "", number)
+            # Another job of the same element runs, and this one after it.
+            waits = (state.lower(), reason) if state == PENDING else ("waiting", "")
+            table.add_row(name, waits[0], "", waits[1], "", "", number)
     return table
 
 

@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import jinja2
+import yaml
 from huggingface_hub import constants
 
 from cronos_lerobot.provenance import git_commit, package_versions
@@ -37,7 +38,9 @@ def render_card(kind: str, **values: Any) -> str:
         keep_trailing_newline=True,
         autoescape=False,
     )
-    environment.filters |= {"table": table, "code": code, "multiply": operator.mul, "sampling": describe_sampling}
+    environment.filters |= {
+        "table": table, "code": code, "multiply": operator.mul, "sampling": describe_sampling, "yaml": yaml_scalar,
+    }  # fmt: skip
     common = {"hub": constants.ENDPOINT, "versions": package_versions(), "commit": git_commit()}
     return environment.get_template(f"{kind}.md").render(common | values)
 
@@ -46,6 +49,11 @@ def table(rows: Iterable[Iterable[Any]], *header: str) -> str:
     """A Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def yaml_scalar(text: Any) -> str:
+    """Text as a value of YAML, in quotes where it would be read as something else."""
+    return yaml.safe_dump(str(text), allow_unicode=True, width=float("inf")).removesuffix("...\n").strip()
 
 
 def is_packaged(scene: str) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shlex
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
@@ -18,7 +20,11 @@ DEFAULTS = {field.name: field.default for field in fields(CronosEnvConfig)}
 
 
 def lerobot_eval_flags(
-    policy: dict[str, Any], env: dict[str, Any], scene: str | None, renderer: str | None = None
+    policy: dict[str, Any],
+    env: dict[str, Any],
+    scene: str | None,
+    renderer: str | None = None,
+    rename_map: Mapping[str, str] | None = None,
 ) -> list[str]:
     """For `lerobot-eval`, which knows nothing of the training.
 
@@ -27,13 +33,19 @@ def lerobot_eval_flags(
         env: what it was trained in, of its train_config.json; empty if no environment was.
         scene: of the training, if it is known.
         renderer: of the pictures that it learned from, if it is known.
+        rename_map: what its training renamed of what the data show, of its train_config.json.
     """
-    features = _features(policy)
+    features = _features(policy, rename_map)
     wanted = _observations(features, env) | {"task_observation": _task_observation(features, env, scene)}
     wanted |= {"renderer": renderer} if renderer and "observation_height" in wanted else {}
     changed = {name: value for name, value in wanted.items() if value != DEFAULTS[name]}
     shown = ({"scene": scene} if scene else {}) | {"obs_type": wanted["obs_type"]} | changed
-    return [*_module_flags(scene), "--env.type=cronos", *(_flag(name, value) for name, value in shown.items())]
+    flags = ["--env.type=cronos", *(_flag(name, value) for name, value in shown.items())]
+    return [*_module_flags(scene), *flags, *_rename_flags(rename_map)]
+
+
+def _rename_flags(rename_map: Mapping[str, str] | None) -> list[str]:
+    return [f"--rename_map={shlex.quote(json.dumps(dict(rename_map)))}"] if rename_map else []
 
 
 def _module_flags(scene: str | None) -> list[str]:
@@ -41,13 +53,20 @@ def _module_flags(scene: str | None) -> list[str]:
     return [] if scene is None or is_packaged(scene) else ["--env.discover_packages_path=<module of the scene>"]
 
 
-def cronos_eval_flags(policy: dict[str, Any], env: dict[str, Any], scene: str | None) -> list[str]:
+def cronos_eval_flags(
+    policy: dict[str, Any], env: dict[str, Any], scene: str | None, rename_map: Mapping[str, str] | None = None
+) -> list[str]:
     """For `cronos-eval`, which takes the rest from the checkpoint; none if that is all."""
-    told = _task_observation(_features(policy), env, scene)
+    features = _features(policy, rename_map)
+    told = _task_observation(features, env, scene)
     shown = {"scene": scene} if scene and not env.get("scene") else {}
+    if rename_map:
+        # What the policy takes has names of its own, which say nothing of cameras.
+        wanted = _observations(features, env)
+        shown |= {name: value for name, value in wanted.items() if value != DEFAULTS[name]}
     shown |= {"task_observation": told} if told != DEFAULTS["task_observation"] else {}
     flags = ["--env.type=cronos", *(_flag(name, value) for name, value in shown.items())] if shown else []
-    return [*_module_flags(scene), *flags]
+    return [*_module_flags(scene), *flags, *_rename_flags(rename_map)]
 
 
 def _flag(name: str, value: Any) -> str:
@@ -69,10 +88,14 @@ def _task_observation(features: Mapping[str, PolicyFeature], env: dict[str, Any]
     return max(told, key=TASK_OBSERVATIONS.index)
 
 
-def _features(policy: dict[str, Any]) -> dict[str, PolicyFeature]:
-    """Its `input_features`, without the configuration's class: a plugin's policy may not be installed here."""
+def _features(policy: dict[str, Any], rename_map: Mapping[str, str] | None = None) -> dict[str, PolicyFeature]:
+    """Its `input_features`, by the environment's names of them.
+
+    Without the configuration's class: a plugin's policy may not be installed here.
+    """
     features = policy.get("input_features") or {}
+    shown_as = {renamed: name for name, renamed in (rename_map or {}).items()}
     return {
-        name: PolicyFeature(FeatureType(feature["type"]), tuple(feature["shape"]))
+        shown_as.get(name, name): PolicyFeature(FeatureType(feature["type"]), tuple(feature["shape"]))
         for name, feature in features.items()
     }

@@ -12,6 +12,7 @@ from lerobot.utils.constants import (
     POLICY_POSTPROCESSOR_DEFAULT_NAME,
     POLICY_PREPROCESSOR_DEFAULT_NAME,
 )
+from lerobot_env_cronos import get_scene
 from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 from matplotlib.figure import Figure
 from safetensors import SafetensorError, safe_open
@@ -164,6 +165,8 @@ def _card(
     trained_in = env.get("scene") or trained_scene(checkpoint.model).get("scene")
     if config.scene and trained_in and config.scene != trained_in:
         raise ValueError(f"--scene={config.scene}, but the policy was trained in {trained_in}")
+    if config.scene and not trained_in:
+        get_scene(config.scene)
     scene = trained_in or config.scene or (results or {}).get("scene")
     if results and results["scene"] != scene:
         raise ValueError(f"--results={config.results} is of {results['scene']}, the policy of {scene}")
@@ -184,8 +187,8 @@ def _card(
         tags=[str(tag) for tag in policy.get("tags") or []],
         is_steered=(checkpoint.model / STEERING).is_file(),
         scene=scene,
-        lerobot_eval_flags=lerobot_eval_flags(policy, env, scene, renderer),
-        cronos_eval_flags=cronos_eval_flags(policy, env, scene),
+        lerobot_eval_flags=lerobot_eval_flags(policy, env, scene, renderer, trained.get("rename_map")),
+        cronos_eval_flags=cronos_eval_flags(policy, env, scene, trained.get("rename_map")),
         curves=curves,
         results=results,
         caveats=describe_caveats(results, policy, renderer) if results else [],

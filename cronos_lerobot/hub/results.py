@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 from huggingface_hub import EvalResultEntry, HfApi, eval_result_entries_to_yaml
 from huggingface_hub.constants import CONFIG_NAME
-from huggingface_hub.errors import RemoteEntryNotFoundError
+from huggingface_hub.errors import RemoteEntryNotFoundError, RevisionNotFoundError
 from huggingface_hub.hf_api import RepoFile
 from lerobot_env_cronos import Benchmark, gymnasium_id, load_benchmark
 from lerobot_env_cronos.benchmark.benchmark import SUITES
@@ -106,7 +106,14 @@ def check_policy(results: dict[str, Any], repo_id: str) -> None:
 def _check_commit(results: dict[str, Any], repo_id: str, commit: str | None) -> None:
     """Check that the policy of the commit that was evaluated is the one that stands at `commit`."""
     evaluated = results["policy_revision"]
-    if _policy_files(repo_id, evaluated) != _policy_files(repo_id, commit):
+    try:
+        files = _policy_files(repo_id, evaluated)
+    except RevisionNotFoundError as error:
+        raise PublishError(
+            f"the results are of {repo_id} as it was at {evaluated}, a commit that it no longer has: evaluate it"
+            " again, in a new --output_dir"
+        ) from error
+    if files != _policy_files(repo_id, commit):
         raise PublishError(
             f"the results are of {repo_id} as it was at {evaluated}, which has another policy now: evaluate it"
             " again, in a new --output_dir"

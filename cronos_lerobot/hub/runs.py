@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from huggingface_hub import constants
 from lerobot.configs.train import TRAIN_CONFIG_NAME
-from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import (
+    CHECKPOINTS_DIR,
+    LAST_CHECKPOINT_LINK,
+    PRETRAINED_MODEL_DIR,
+    TRAINING_STATE_DIR,
+)
 
 from cronos_lerobot.hub.cards import command_line, without_folders
 from cronos_lerobot.protocol.config import COUNTED_INTERVENTIONS
@@ -16,6 +22,7 @@ from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.report.protocol_names import describe_protocol
 from cronos_lerobot.report.runs import TrainingRun, config_of, read_training_run
 from cronos_lerobot.training.logging import MANIFEST, METRICS
+from cronos_lerobot.training.resume import RUN
 
 LEARNED = {
     "ppo": ("reinforcement learning", "reinforcement-learning"),
@@ -44,6 +51,7 @@ def find_checkpoint(path: Path) -> Checkpoint:
 
     Raises:
         FileNotFoundError: there is no policy there.
+        ValueError: the checkpoint is of an end that its run no longer has.
     """
     candidates = (
         path / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR,
@@ -62,8 +70,25 @@ def find_checkpoint(path: Path) -> Checkpoint:
     checkpoint = model.parent
     run = checkpoint.parent.parent
     if checkpoint.name.isdigit() and (run / METRICS).is_file() and (run / MANIFEST).is_file():
+        _check_history(checkpoint, run)
         return Checkpoint(model, run, int(checkpoint.name))
     return Checkpoint(model, None, None)
+
+
+def _check_history(checkpoint: Path, folder: Path) -> None:
+    """Refuse a checkpoint of an end that a run no longer has: it went on from an earlier one, in another way."""
+    note = checkpoint / TRAINING_STATE_DIR / RUN
+    if not note.is_file():
+        # A copy without the training's state.
+        return
+    saved, steps, run = json.loads(note.read_text()), int(checkpoint.name), read_training_run(folder)
+    had = [one["interventions"] for one in run.updates if one["interaction_steps"] == steps]
+    if not had or had[-1] != saved["interventions"]:
+        now = f"comes to {had[-1]}" if had else f"ends at step {run.last['interaction_steps']}"
+        raise ValueError(
+            f"{checkpoint} is not of the run that is in {folder} now: it had {saved['interventions']} "
+            f"interventions at step {steps}, and the run, which has gone on from an earlier checkpoint, {now}"
+        )
 
 
 def read_run(folder: Path, step: int | None = None) -> TrainingRun:

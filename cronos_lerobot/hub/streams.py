@@ -21,6 +21,7 @@ from cronos_lerobot.hub.cards import render_card
 from cronos_lerobot.hub.config import StreamConfig
 from cronos_lerobot.hub.runs import read_run, run_facts
 from cronos_lerobot.locks import FolderInUseError, FolderLock
+from cronos_lerobot.report.runs import TrainingRun
 from cronos_lerobot.training.logging import MANIFEST, METRICS
 
 FOLDERS = ("data", "meta", "videos")
@@ -126,19 +127,20 @@ def _stream_card(config: StreamConfig, info: dict[str, Any], origin: Origin) -> 
     filters, counts = _filters(config.root), statistics(streams)
     chosen_by_outcome = any(one["filter"].get(name) is not None for one in filters for name in OUTCOMES)
     run = _find_run(config)
-    if run and (scene := read_run(run).config["env"]["scene"]) != origin.scene:
+    trained = read_run(run) if run else None
+    if trained and (scene := trained.config["env"]["scene"]) != origin.scene:
         raise ValueError(f"{config.root} was recorded in {origin.scene}, the run {run} is of {scene}")
     return render_card(
         "streams",
         repo_id=config.repo_id,
         info=info,
         statistics=counts,
-        missing=_missing(streams),
+        missing=_missing(streams) or (_broken_off(streams, trained) if trained and not filters else None),
         filters=filters,
         chosen_by_outcome=chosen_by_outcome,
         # There are none of the policy's own where an expert did all segments.
         tells_success=not chosen_by_outcome and bool(counts["success_by_position"]),
-        run=run_facts(read_run(run)) if run else None,
+        run=run_facts(trained) if trained else None,
         interval=wilson_interval,
         **_common(info, origin),
     )
@@ -168,6 +170,13 @@ def _missing(streams: StreamDataset) -> str | None:
     except ValueError as error:
         return str(error)
     return None
+
+
+def _broken_off(streams: StreamDataset, run: TrainingRun) -> str | None:
+    """How far a recording came that ended before its run: all of its streams end at the same step."""
+    recorded = max(segment.step + segment.length for segment in streams.segments)
+    taken = run.last["interaction_steps"] // run.config["num_envs"]
+    return f"the recording ends after {recorded} of {taken} control steps" if recorded < taken else None
 
 
 def _demonstrations_card(config: StreamConfig, info: dict[str, Any], origin: Origin) -> str:

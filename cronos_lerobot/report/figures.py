@@ -177,7 +177,9 @@ def _reward(update: dict[str, Any]) -> float | None:
 
 
 def _label(group: Group) -> str:
-    return group.label if len(group.runs) == 1 else f"{group.label} ({len(group.runs)} seeds)"
+    # A $ would begin a formula.
+    label = group.label.replace("$", r"\$")
+    return label if len(group.runs) == 1 else f"{label} ({len(group.runs)} seeds)"
 
 
 def style_of(i: int) -> tuple[str, Line, str]:

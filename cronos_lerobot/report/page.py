@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import jinja2
 from matplotlib.figure import Figure
@@ -168,7 +169,7 @@ def _clip_rows(report: Report, output: Path) -> list[list[dict[str, Any]]]:
 def _embed(clip: clips.Clip, embedder: clips.Embedder, output: Path) -> dict[str, Any]:
     url = embedder.video(clip.path)
     link = clip.path.resolve().relative_to(output.resolve(), walk_up=True).as_posix()
-    return {"title": clip.title, "caption": clip.caption, "url": url, "link": link}
+    return {"title": clip.title, "caption": clip.caption, "url": url, "link": quote(link)}
 
 
 def _cell(value: Any) -> str:

@@ -16,6 +16,7 @@ from pathlib import Path
 from cronos_lerobot.experiments.scales import BASE_KINDS, DIVERSE_DEMO_FLAGS, WIDE
 from cronos_lerobot.scripts import probe
 from cronos_lerobot.scripts.pipeline import Step, StepFailedError, remember, run_steps
+from cronos_lerobot.scripts.yaml_text import is_plain
 
 ENV = ["--env.type=cronos", "--env.obs_type=environment_state_agent_pos"]
 DEMOS = "local/cronos_demos"
@@ -242,6 +243,8 @@ def main() -> None:
         f"{SHORTEN_ABOVE_MIN:.0f} minutes; smoke runs everything in a minute or two and learns nothing",
     )
     args = parser.parse_args()
+    if not is_plain(f"{args.output_dir}/x"):
+        parser.error(f"--output_dir={args.output_dir} is YAML to LeRobot's commands, and another text there")
     start = time.perf_counter()
     again = "run the same command again to go on from here"
     try:

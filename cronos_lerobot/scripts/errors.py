@@ -17,10 +17,13 @@ from httpx import HTTPError, TransportError
 from lerobot.configs import parser
 from lerobot.configs.parser import PluginLoadError
 from safetensors import SafetensorError
+from yaml import YAMLError
 
 from cronos_lerobot.training.resume import allow_single_file
 
-USER_ERRORS = (ValueError, OSError, ParsingError, ArgumentError, PluginLoadError, SafetensorError, HTTPError)
+USER_ERRORS = (
+    ValueError, OSError, ParsingError, ArgumentError, PluginLoadError, SafetensorError, HTTPError, YAMLError,
+)  # fmt: skip
 """What a wrong flag, a missing file or a damaged one raises, or the Hub. Any other error is a bug and shows its
 traceback."""
 

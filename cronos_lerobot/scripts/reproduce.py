@@ -14,8 +14,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import yaml
-
 from cronos_lerobot.experiments.definitions import COMMANDS, EXPERIMENTS, Base, Experiment, Row, find_rows
 from cronos_lerobot.experiments.flags import join_flags
 from cronos_lerobot.experiments.jobs import Job, is_done
@@ -30,6 +28,7 @@ from cronos_lerobot.scripts.launchers import (
     run_on_slurm,
 )
 from cronos_lerobot.scripts.listing import print_list, print_plan
+from cronos_lerobot.scripts.yaml_text import is_plain
 
 if TYPE_CHECKING:
     from cronos_lerobot.experiments.specs import Options
@@ -180,8 +179,8 @@ def parse_seeds(text: str | None, default: int) -> tuple[int, ...]:
         found = tuple(dict.fromkeys(seeds))
     except ValueError:
         found = ()
-    if not found:
-        raise ValueError(f"--seeds must be a number or a list such as 1,4, got {text!r}")
+    if not found or min(found) < 0:
+        raise ValueError(f"--seeds must be a number or a list such as 1,4, of seeds from 0 on, got {text!r}")
     return found
 
 
@@ -239,14 +238,6 @@ def make_options(args: argparse.Namespace, extra: list[str], bases: Iterable[Bas
         tuple(extra),
         recipes,
     )
-
-
-def is_plain(value: str) -> bool:
-    """Whether the value of a flag is to LeRobot's commands, which read YAML, the text that it is."""
-    try:
-        return yaml.safe_load(value) == value
-    except yaml.YAMLError:
-        return False
 
 
 def base_changes(args: argparse.Namespace) -> dict[str, int]:

@@ -9,8 +9,10 @@ from typing import Any
 import draccus
 from draccus.utils import ParsingError
 from httpx import HTTPError
+from yaml import YAMLError
 
 from cronos_lerobot.scripts.errors import stop
+from cronos_lerobot.scripts.yaml_text import quoted_texts
 
 
 def run_subcommand(
@@ -33,9 +35,9 @@ def run_subcommand(
         sys.exit(f"error: unknown command {name!r}; valid commands: {list(commands)}")
     config_class, run = commands[name]
     try:
-        run(draccus.parse(config_class, args=arguments))
-    except ParsingError as error:
-        sys.exit(f"error: {error.__cause__ or error}")
+        run(draccus.parse(config_class, args=quoted_texts(config_class, arguments)))
+    except (ParsingError, YAMLError) as error:
+        stop(error)
     except errors as error:
         sys.exit(f"error: {error}")
     except HTTPError as error:

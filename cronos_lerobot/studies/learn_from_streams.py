@@ -17,12 +17,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from cronos_lerobot.data.stream_filter import PROVENANCE
 from cronos_lerobot.locks import FolderInUseError
+from cronos_lerobot.protocol.metrics import summarise
 from cronos_lerobot.report.lerobot_evaluations import read_evaluation_runs
 from cronos_lerobot.report.statistics import Rate
 from cronos_lerobot.scripts.demo import SCALES, Scale, clone_step, eval_step, record_step, train_step
@@ -118,8 +118,9 @@ def make_table(seeds: Sequence[int], folder: Path, ways: Sequence[str] = ("filte
         means = []
         for split in SPLITS:
             values = [_rate(folder / f"eval/{way}_{seed}_{split}").value for seed in seeds]
-            means.append(f"{np.mean(values):.3f} ± {np.std(values, ddof=min(1, len(values) - 1)):.3f}")
-        table.add_row(f"{way}, mean ± std", *means)
+            means.append(str(summarise(values)))
+        if len(seeds) > 1:
+            table.add_row(f"{way}, mean ± std", *means)
     return table
 
 

@@ -5,11 +5,18 @@ import sys
 import pytest
 import yaml
 from lerobot.configs import PreTrainedConfig
+from lerobot.envs.utils import env_to_policy_features
+from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot_env_cronos import CronosEnvConfig
+from lerobot_policy_pocketvla import PocketVLAConfig
 from tiny_checkpoints import STATE, record_one, save_policy, write_train_config
 
 from cronos_lerobot.evaluation.config import CronosEvalConfig
-from cronos_lerobot.evaluation.policy_env import trained_renderer
+from cronos_lerobot.evaluation.policy_env import (
+    reads_privileged_state,
+    trained_renderer,
+    warn_of_privileged_state,
+)
 from cronos_lerobot.scripts.errors import parse_command_line
 
 FILAMENT = {"renderer": "filament"}
@@ -34,6 +41,26 @@ def test_the_renderer_is_the_runs_or_that_of_the_cloned_demonstrations(demos, tm
     assert trained_renderer(write_train_config(tmp_path, env={"type": "cronos"})) == {}
     assert trained_renderer(write_train_config(tmp_path, env={"type": "libero"} | FILAMENT)) == {}
     assert trained_renderer(tmp_path / "none") == {}
+
+
+@pytest.mark.parametrize(
+    ("make", "shown", "is_told"),
+    [
+        (ACTConfig, {"privileged_state": True}, True),
+        (ACTConfig, {}, False),
+        # From the state it is no secret.
+        (ACTConfig, STATE, False),
+        # For its critic.
+        (PocketVLAConfig, {"privileged_state": True}, False),
+    ],
+)
+def test_a_policy_that_reads_the_poses_beside_pictures_is_told_of(make, shown, is_told, caplog):
+    """LeRobot makes an input of all that a dataset has."""
+    features = env_to_policy_features(CronosEnvConfig(**shown))
+    config = make(device="cpu", input_features={key: f for key, f in features.items() if key != "action"})
+    assert reads_privileged_state(config) is is_told
+    warn_of_privileged_state(config)
+    assert ("reads observation.environment_state beside its pictures" in caplog.text) is is_told
 
 
 @pytest.mark.parametrize(

@@ -117,7 +117,8 @@ def test_list_names_every_row(monkeypatch, capsys):
     ("flags", "message"),
     [
         (["table1", "--rows", "t81"], "no row 't81'; it has t80, t1280"),
-        (["table1", "--seeds=x"], "--seeds must be a number or a list such as 1,4, got 'x'"),
+        (["table1", "--seeds=x"], "--seeds must be a number or a list such as 1,4, of seeds from 0 on, got 'x'"),
+        (["table1", "--seeds=1,-2"], "of seeds from 0 on, got '1,-2'"),
         (["table1", "--threads=0"], "--threads must be at least 1, got 0"),
         (["table1", "--jobs=0"], "--jobs must be at least 1, got 0"),
         (["table1", "--jobs=-2"], "--jobs must be at least 1, got -2"),

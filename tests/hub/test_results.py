@@ -54,8 +54,8 @@ def test_values_and_notes():
     assert "SEQ 0, 1, ... 75.0, 25.0 %" in sequential.notes
     assert "temperature 0.6; seed 3; pixels_agent_pos; cronos-lerobot 0.1.0" in sequential.notes
     assert independent.source_url == "https://example.org/log"
-    seen = {"env": {"privileged_state": True}, "task_observation": "one_hot"}
-    entries = make_entries(make_results(identity=seen), BENCHMARK, config)
+    seen = {"reads_privileged_state": True, "identity": {"task_observation": "one_hot"}}
+    entries = make_entries(make_results(**seen), BENCHMARK, config)
     assert "; pixels_agent_pos with the privileged state and the task; " in str(entries[0].notes)
 
 

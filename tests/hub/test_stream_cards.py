@@ -1,14 +1,18 @@
 """The card of a recording whose segments were chosen: by what, and no success where that is what chose them."""
 
 import json
+import shutil
 
+import draccus
 import pytest
+from lerobot_env_cronos import CronosEnvConfig
 from synthetic_streams import record
 
 from cronos_lerobot.data.stream_filter import PROVENANCE, SegmentFilter, filter_streams
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.hub.config import StreamConfig
 from cronos_lerobot.hub.streams import write_stream_repository
+from cronos_lerobot.training.config import CronosTrainConfig
 
 FAILS = "The policy fails often, above all early on"
 TABLE = "| segment since the scene reset | success |"
@@ -78,6 +82,24 @@ def test_a_recording_that_broke_off_is_told(recorded, tmp_path):
     card = card_of(tmp_path / "cut", tmp_path / "out")
     assert "The streams are not whole here (stream 1 ends after 28 steps, stream 0 after 32: the" in card
     assert "whole and in order" not in card
+
+
+def test_a_recording_that_ends_before_its_run_is_told(recorded, tmp_path):
+    """All of its streams end at one step, 32, as those of a whole one do."""
+    run = tmp_path / "run"
+    run.mkdir()
+    shutil.copytree(recorded, run / "streams")
+    config = json.loads(json.dumps(draccus.encode(CronosTrainConfig(env=CronosEnvConfig(), num_envs=3))))
+    start = {"config": config, "environment": "lerobot_env_cronos/kitchen_2x2-v1", "git_commit": None}
+    start |= {"command": ["cronos-train"], "versions": {"cronos-lerobot": "0.2.0"}}
+    (run / "manifest.json").write_text(json.dumps({"starts": [start]}))
+    for steps, told in ((96, ", whole and in order"), (480, "the recording ends after 32 of 160 control steps")):
+        record = {"kind": "update", "interaction_steps": steps, "interventions": 4, "updates": 1}
+        record |= {"interventions_by_kind": {"scene_reset": 4}}
+        (run / "metrics.jsonl").write_text(json.dumps(record) + "\n")
+        card = card_of(run / "streams", tmp_path / f"out{steps}")
+        assert told in card
+        assert ("whole and in order" in card) == (steps == 96)
 
 
 def test_a_filters_note_that_is_damaged_is_named(recorded, tmp_path):

@@ -315,7 +315,7 @@ def test_what_was_left_out_and_what_is_not_alike_is_said(tmp_path, monkeypatch, 
 
 def test_a_policy_that_was_shown_more_is_told(tmp_path, monkeypatch, capsys):
     pixels = {"obs_type": "pixels_agent_pos"}
-    seen = {"identity": {"env": {"privileged_state": True}, "task_observation": "one_hot"}}
+    seen = {"reads_privileged_state": True, "identity": {"task_observation": "one_hot"}}
     a = write_evaluation(tmp_path / "a", "me/a", tasks=["110"], **pixels, **seen)
     b = write_evaluation(tmp_path / "b", "me/b", tasks=["110"], **pixels)
     compare(monkeypatch, a, b)
