@@ -137,7 +137,7 @@ def _run(sim: WatchedSimulation, pair: Pair, kind: str, x: np.ndarray, num_steps
     for step in range(int(num_steps.max())):
         ids = np.flatnonzero(num_steps > step)
         leg = min(step // LEG_STEPS, 2)
-        sim.step(_action(sim, legs[leg], grippers[leg])[ids], ids)
+        sim.step(hand_action(sim, legs[leg], grippers[leg])[ids], ids)
         _count(sim, pair, kind, trials, step)
     return trials
 
@@ -194,7 +194,7 @@ def _begin(
     yaw = angle + np.pi * x[:, 18]
     turned = yaw + (2 * x[:, 19] - 1) * 0.8
     opened = x[:, 20] > 0.5
-    _move_hand(sim, start[kind], yaw, opened)
+    move_hand(sim, start[kind], yaw, opened)
     targets = [np.column_stack([p, w]) for p, w in ((first, yaw), (second, turned), (leave, turned))]
     sim.was_carried[:] = False
     return targets, [opened, np.where(x[:, 21] < 0.2, ~opened, opened), np.ones(n, dtype=bool)]
@@ -250,8 +250,8 @@ def _orientation(yaw: np.ndarray) -> np.ndarray:
     return np.stack([down, closing, np.cross(down, closing)], 2)
 
 
-def _move_hand(sim: Simulation, position: np.ndarray, yaw: np.ndarray, opened: np.ndarray) -> None:
-    """Teleport the hand, its fingers open or closed."""
+def move_hand(sim: Simulation, position: np.ndarray, yaw: np.ndarray, opened: np.ndarray) -> None:
+    """Teleport the hands to `position` (n, 3), turned by `yaw` (n,), their fingers `opened` (n,) or closed."""
     q = np.tile(HOME_QPOS, (len(yaw), 1))
     start, _, _ = forward_kinematics(q)
     for way in np.linspace(0.1, 1.0, 10):
@@ -267,8 +267,8 @@ def _nearest(yaw: np.ndarray) -> np.ndarray:
     return np.mod(yaw, np.pi)
 
 
-def _action(sim: Simulation, target: np.ndarray, opened: np.ndarray) -> np.ndarray:
-    """One control step (n, 7) of the hand towards `target` (n, 4)."""
+def hand_action(sim: Simulation, target: np.ndarray, opened: np.ndarray) -> np.ndarray:
+    """One control step (n, 7) of the hands towards `target` (n, 4), place and turn, with `opened` fingers (n,)."""
     p, R, _ = forward_kinematics(sim.arm_target)
     turn = matrix_to_rotation_vector(_orientation(_nearest(target[:, 3])) @ R.transpose(0, 2, 1))
     turn = np.clip(turn, -0.08, 0.08)
