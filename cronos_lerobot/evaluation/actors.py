@@ -156,7 +156,7 @@ class SelectingPolicy:
         self._processors.preprocessor = lambda batch: processors.preprocessor(before(batch))
         self._autocast = _autocast(policy, processors)
         self.is_per_environment = self._player.is_per_stream
-        self._seeded = self._generator_states()
+        self._seeded: list[bytes] = []
 
     def seed(self, seed: int) -> None:
         """Seed the global generators, from which LeRobot's policies draw."""

@@ -33,7 +33,7 @@ def run_independent(
     seed: int,
     processes: Processes | None = None,
     keeps_states: bool = False,
-) -> list[ChainResult]:
+) -> tuple[list[ChainResult], bool]:
     """Run every task of the environments' benchmark with a policy, and leave everything else as it was.
 
     An episode's random numbers are those of the episode and the step. If the policy takes them (`uniform`, see
@@ -52,23 +52,9 @@ def run_independent(
         keeps_states: return the trajectories, too.
 
     Returns:
-        The episodes, task by task.
+        The episodes, task by task, and whether any randomness was drawn for them: if not, another seed would give
+        the same ones.
     """
-    return _run(env, policy, processors, n_episodes, split, temperature, seed, processes, keeps_states)[0]
-
-
-def _run(
-    env: SequentialVectorEnv,
-    policy: Any,
-    processors: PolicyProcessors,
-    n_episodes: int,
-    split: str,
-    temperature: float,
-    seed: int,
-    processes: Processes | None = None,
-    keeps_states: bool = False,
-) -> tuple[list[ChainResult], bool]:
-    """What `run_independent` returns, and whether other random numbers might have given something else."""
     processes = processes or Processes()
     (part,) = make_parts(env.benchmark, ["independent"], [split], n_episodes, 0)
     env.split = split
@@ -102,7 +88,7 @@ def episode_lists(by_seed: Mapping[int, Sequence[Record]]) -> list[list[int]]:
 def evaluate_independent(
     env: SequentialVectorEnv, policy: Any, *args: Any, seed: int, repetitions: int = 1, **options: Any
 ) -> dict[str, Any]:
-    """`run_independent` in numbers.
+    """The episodes of `run_independent` in numbers.
 
     Of a policy that draws nothing, as ACT, an episode is not repeated: it would be the same one.
 
@@ -120,7 +106,7 @@ def evaluate_independent(
     """
     by_seed = {}
     for s in range(seed, seed + repetitions):
-        results, drew = _run(env, policy, *args, seed=s, **options)
+        results, drew = run_independent(env, policy, *args, seed=s, **options)
         by_seed[s] = chain_records(results)
         if not drew and repetitions > 1:
             logging.warning(NOT_REPEATED, repetitions)

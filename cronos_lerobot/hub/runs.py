@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.report.protocol_names import describe_protocol
 from cronos_lerobot.report.runs import TrainingRun, config_of, read_training_run
 from cronos_lerobot.training.logging import MANIFEST, METRICS
-from cronos_lerobot.training.resume import RUN
+from cronos_lerobot.training.resume import read_run as read_checkpoint
 
 LEARNED = {
     "ppo": ("reinforcement learning", "reinforcement-learning"),
@@ -77,11 +76,10 @@ def find_checkpoint(path: Path) -> Checkpoint:
 
 def _check_history(checkpoint: Path, folder: Path) -> None:
     """Refuse a checkpoint of an end that a run no longer has: it went on from an earlier one, in another way."""
-    note = checkpoint / TRAINING_STATE_DIR / RUN
-    if not note.is_file():
+    if not (checkpoint / TRAINING_STATE_DIR).is_dir():
         # A copy without the training's state.
         return
-    saved, steps, run = json.loads(note.read_text()), int(checkpoint.name), read_training_run(folder)
+    saved, steps, run = read_checkpoint(checkpoint), int(checkpoint.name), read_training_run(folder)
     had = [one["interventions"] for one in run.updates if one["interaction_steps"] == steps]
     if not had or had[-1] != saved["interventions"]:
         now = f"comes to {had[-1]}" if had else f"ends at step {run.last['interaction_steps']}"

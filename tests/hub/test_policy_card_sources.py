@@ -32,10 +32,10 @@ def test_a_checkpoint_of_an_end_that_its_run_no_longer_has_is_refused(tmp_path, 
     checkpoint = write_checkpoint(tmp_path, "pocketvla", CronosEnvConfig(**STATE), PPOConfig())
     note = checkpoint / "training_state/run.json"
     note.parent.mkdir()
-    note.write_text(json.dumps({"interventions": 4}))
+    note.write_text(json.dumps({"interventions": 4, "environment": None}))
     assert "after 32 interaction steps" in dry_run(checkpoint, tmp_path / "out")
     # Other resets from an earlier checkpoint on, and not as far yet.
-    note.write_text(json.dumps({"interventions": 9}))
+    note.write_text(json.dumps({"interventions": 9, "environment": None}))
     with pytest.raises(ValueError, match=r"it had 9 interventions at step 32, and the run, .*, comes to 4"):
         dry_run(checkpoint, tmp_path / "other")
     metrics = tmp_path / "run/metrics.jsonl"

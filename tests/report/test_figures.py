@@ -5,8 +5,9 @@ import pytest
 from matplotlib.figure import Figure
 from synthetic_runs import read_csv, write_training_run
 
-from cronos_lerobot.report.figures import agent_figure, draw_curve, style_of
+from cronos_lerobot.report.figures import agent_figure, draw_curve, style_of, training_figure
 from cronos_lerobot.report.page import write_report
+from cronos_lerobot.report.png import to_png
 from cronos_lerobot.report.runs import find_runs, group_runs
 from cronos_lerobot.report.series import Curve, mean_curve, segment_spans
 from cronos_lerobot.report.statistics import Rate
@@ -24,6 +25,16 @@ def test_more_rows_than_colours_are_told_apart():
     assert len({(color, hatch) for color, _, hatch in map(style_of, range(56))}) == 56
     draw_curve(ax, Curve(np.arange(2), *np.ones((3, 2)), False), 28, "28")
     assert ax.lines[28].is_dashed()
+
+
+def test_a_label_is_no_formula(tmp_path):
+    """Two dollars began and ended one, which this is not."""
+    write_training_run(tmp_path / "run")
+    (group,) = group_runs(find_runs([tmp_path / "run"]).training)
+    group.label = "gain$x_$"
+    figure = training_figure([group, group])
+    assert figure is not None
+    assert to_png(figure, 100)
 
 
 @pytest.mark.parametrize("intervals", [(160,), (160, 320), (160, 320, 640)])

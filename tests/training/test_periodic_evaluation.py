@@ -55,7 +55,7 @@ def of_cronos_train(processes, checkpoint, batch_size):
     config = CronosTrainConfig(CronosEnvConfig(**STATE), policy(checkpoint))
     network, *pipelines = make_policy_and_processors(config)
     env = make_eval_env(config, batch_size, processes.local_count)
-    results = run_independent(
+    results, _ = run_independent(
         env, network, make_processors(network, *pipelines), n_episodes=N_EPISODES, split="held_out",
         temperature=TEMPERATURE, seed=SEED, processes=processes, keeps_states=True,
     )  # fmt: skip
