@@ -99,8 +99,8 @@ class PocketVLAConfig(PreTrainedConfig):
     random_shift_px: int = 4
     """Largest random shift of the image in behaviour cloning (pixels); never applied elsewhere. 0: none."""
     dtype: Precision = "auto"
-    """Format of the convolutions: `auto` is bfloat16 where the hardware multiplies it, float32 elsewhere.
-    All else, action probabilities included, is float32."""
+    """Format of the convolutions: `auto` is bfloat16 where the hardware multiplies it and oneDNN may use it,
+    float32 elsewhere. All else, action probabilities included, is float32."""
 
     optimizer_lr: float = 1e-3
     """Peak learning rate of behaviour cloning."""
