@@ -49,8 +49,7 @@ def test_policies_of_pictures_are_cloned_in_float32_where_avx2_is_all_they_get()
     """On a processor with bfloat16 of its own they were emulated, eight times slower, and another policy."""
     code = "from lerobot_policy_pocketvla.precision import use_bfloat16; print(use_bfloat16('auto', 'cpu'))"
     environment = os.environ | portable_arithmetic(CLONING)
-    found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "False"
+    assert subprocess.check_output([sys.executable, "-c", code], env=environment, text=True).strip() == "False"
 
 
 @pytest.mark.skipif(not HELD, reason="this processor has no AVX2")
