@@ -61,3 +61,11 @@ def test_what_another_has_pushed_meanwhile_is_not_lost(here, evaluations, monkey
     assert published(here) == ["independent_held_out"]
     publish_results(evaluations["train"])
     assert published(here) == ["independent_held_out", "independent_train"]
+
+
+def test_results_of_a_commit_that_the_repository_no_longer_has(here, evaluations):
+    results = evaluations["train"].results / "results.json"
+    results.write_text(json.dumps(json.loads(results.read_text()) | {"policy_revision": "f" * 40}))
+    with pytest.raises(PublishError, match=f"as it was at {'f' * 40}, a commit that it no longer has: "):
+        publish_results(evaluations["train"])
+    assert FILE not in here.tree("models", POLICY)
