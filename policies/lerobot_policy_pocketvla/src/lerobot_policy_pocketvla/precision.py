@@ -11,7 +11,7 @@ def bfloat16_is_native(device: str) -> bool:
     """Whether the device multiplies bfloat16 in hardware; elsewhere it would be slower than float32.
 
     A processor that can, but whose oneDNN is held to AVX2, as the runs of experiments are, counts as one that
-    cannot: its convolutions would take some eight times as long as in float32.
+    cannot: its convolutions would be emulated, and take several times as long as in float32.
     """
     kind = torch.device(device).type
     if kind == "cuda":
