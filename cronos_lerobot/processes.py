@@ -56,6 +56,13 @@ class Processes:
         """`name` for what every process has of its own: the first one's is `name` itself."""
         return name if self.is_main else f"{name}/process_{self.rank}"
 
+    def own_seed(self, seed: int) -> int:
+        """`seed` for the global generators of this process: the first one's is `seed` itself.
+
+        The others' are not `seed` + rank, which are those of another run's processes.
+        """
+        return seed if self.is_main else int(np.random.SeedSequence([seed, self.rank]).generate_state(1)[0])
+
     def concatenate(self, array: np.ndarray, axis: int = 0) -> np.ndarray:
         """All processes' arrays, of one shape and type, joined along `axis` in the order of the ranks."""
         return array

@@ -62,7 +62,7 @@ def run_independent(
     was_training, rng_state = getattr(policy, "training", None), get_rng_state()
     try:
         actor = make_actor(policy, processors, temperature)
-        actor.seed(seed + processes.rank)
+        actor.seed(processes.own_seed(seed))
         own = part.chains[processes.rank :: processes.count]
         results = ChainRunner(env, actor, keeps_states=keeps_states).run(own, part.noise(seed))
         # Before the global generators are set back.

@@ -58,7 +58,7 @@ def train(config: CronosTrainConfig) -> None:
             set_seed(config.seed)
             policy, preprocessor, postprocessor = make_policy_and_processors(config)
             if not processes.is_main:
-                set_seed(config.seed + processes.rank)
+                set_seed(processes.own_seed(config.seed))
             env = make_env(config, mine.stop - mine.start, processes.local_count)
             stack.callback(env.close)
 

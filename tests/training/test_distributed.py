@@ -147,6 +147,13 @@ def test_a_run_of_two_processes_goes_on_in_one(tmp_path, caplog):
     assert policy == pytest.approx(weights, rel=1e-3, abs=1e-5)
 
 
+def test_processes_of_runs_with_neighbouring_seeds_draw_different_numbers():
+    first, second = together(lambda processes: [processes.own_seed(seed) for seed in range(5)])
+    assert first == [Processes().own_seed(seed) for seed in range(5)] == list(range(5))
+    assert len({*first, *second}) == 10
+    assert second[3] == np.random.SeedSequence([3, 1]).generate_state(1)[0]
+
+
 def first_draws(processes, cfg):
     """What Python's, NumPy's and PyTorch's own generators give after the run's checkpoint was loaded."""
     mine = processes.share_of(cfg.num_envs)

@@ -44,6 +44,8 @@ def test_a_process_that_has_only_failed_clones_next_to_nothing_of_it(tmp_path):
     assert first[1:] == second[1:]
     assert first[0] == second[0]
     assert first[0]["failed_segments"] == len(lost)
+    # The loss that is logged is the one that is learned from.
+    assert first[0]["loss"] == pytest.approx(alone[0]["loss"], rel=1e-4)
     for found, expected in zip(first[1:], alone[1:], strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
 

@@ -133,8 +133,10 @@ class ImitationAgent(LearningAgent):
             # Running means, as those of batch normalization, are each process's own of the batches that it had.
             for module in dict.fromkeys((self._learner, self.policy)):
                 self._processes.copy_from(int(shares.argmax()), module.buffers())
-        means = np.nanmean(self._processes.concatenate(np.array([steps])), axis=(0, 1))
-        metrics |= {"loss": float(means[0]), "grad_norm": float(means[1])}
+        losses, norms = self._processes.concatenate(np.array([steps])).mean(axis=1).T
+        # That of a process counts by as much as its gradient does, not at all without a batch (NaN).
+        loss = np.average(losses[shares > 0], weights=shares[shares > 0])
+        metrics |= {"loss": float(loss), "grad_norm": float(norms.mean())}
         return metrics | {"optimizer_steps": float(len(steps))}
 
     def shared_tensors(self) -> Iterable[Tensor]:
