@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any
+
+from cronos_lerobot.experiments.flags import DROPS_CHECKPOINTS, RESERVED
 
 INTERACTION_STEPS, INTERVENTIONS = "interaction_steps", "interventions"
 SUITES, BOTH = ("independent", "sequential"), ("train", "held_out")
@@ -31,6 +34,14 @@ def _check_tuple(name: str, value: Any, valid: list[str] | None = None) -> None:
         raise ValueError(f"{name} must be a tuple, such as ({value!r},), got {value!r}.")
     if valid is not None and not (value and set(value) <= set(valid)):
         raise ValueError(f"{name} must be some of {valid}, got {value!r}.")
+
+
+def _check_word(name: str, value: str) -> None:
+    """Raise a ValueError, if `value` is no part of a folder's name."""
+    if not re.fullmatch(r"[\w.+-]+", value):
+        raise ValueError(
+            f"{name} is part of a folder's name, one word of letters, digits and _.+-, got {value!r}."
+        )
 
 
 def _is_pair(value: Any) -> bool:
@@ -70,6 +81,14 @@ class Row:
     def __post_init__(self) -> None:
         if wrong := [flag for flag in self.flags if not flag.startswith("--") or "=" not in flag]:
             raise ValueError(f"flags of a row are --name=value, one word each, got {wrong[0]!r}.")
+        # Its runs may be evaluated on another split while they train.
+        reserved = [name for name in RESERVED if name != "--eval.split"]
+        if taken := [flag for flag in self.flags if flag.split("=")[0] in reserved]:
+            raise ValueError(f"{taken[0]} is set by the experiment: it cannot be among the flags of a row.")
+        if self.num_configurations < 1:
+            raise ValueError(f"num_configurations of a row must be at least 1, got {self.num_configurations}.")
+        if self.tag:
+            _check_word("the tag of a row", self.tag)
         for name in ("stages", "budgets"):
             if wrong := [pair for pair in getattr(self, name) if not _is_pair(pair)]:
                 raise ValueError(f"{name} of a row are pairs, each in a tuple of its own, got {wrong[0]!r}.")
@@ -187,6 +206,7 @@ class Experiment:
     """Of that figure: what a line joins the ends of, as its label and the names of its rows."""
 
     def __post_init__(self) -> None:
+        _check_word("the name of an experiment", self.name)
         for name, valid in (("axes", [INTERACTION_STEPS, INTERVENTIONS]), ("splits", list(BOTH))):
             _check_tuple(f"{name} of {self.name}", getattr(self, name), valid)
         for name in ("rows", "evaluations", "budgets", "joined"):
@@ -209,6 +229,11 @@ class Experiment:
                 f"splits of {self.name} have 'held_out', and no evaluation measures it: give evaluations="
                 "(CheckpointEvaluation('independent', ('held_out',), every_checkpoint=True),)."
             )
+        for row in self.rows if self.evaluations else ():
+            if dropping := [flag for flag in row.flags if flag.startswith(DROPS_CHECKPOINTS)]:
+                raise ValueError(
+                    f"{self.name}: {dropping[0]} of {row.name} drops checkpoints, which are evaluated."
+                )
         early = [row.name for row in self.rows if row.has_budget]
         if early and any(evaluation.every_checkpoint for evaluation in self.evaluations):
             raise ValueError(

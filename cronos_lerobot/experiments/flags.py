@@ -4,6 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
+RESERVED = (
+    "--steps",
+    "--seed",
+    "--output_dir",
+    "--num_envs",
+    "--save_freq",
+    "--protocol.update_interval",
+    "--policy.path",
+    "--env.scene",
+    "--env.obs_type",
+    "--eval.split",
+    "--eval.temperature",
+    "--resume",
+    "--config_path",
+)
+"""Flags of `cronos-train` that the experiment sets; a run with others would not be the one its folder says."""
+
+DROPS_CHECKPOINTS = ("--keep_checkpoints", "--save_checkpoint")
+"""Flags that may keep a run from having the checkpoints that are evaluated after it."""
+
 
 def read_flags(words: Iterable[str]) -> Iterator[tuple[str, str]]:
     """Name and value of `--name=value` and `--name value`.

@@ -200,8 +200,18 @@ def _introduction(result: ExperimentResult) -> list[str]:
 
 def _learning_notes(result: ExperimentResult) -> list[str]:
     """Nothing where flags after `--` choose another agent: they are named above."""
-    chosen = any(flag.startswith("--algorithm.type") for flag in result.options.extra)
-    return [] if chosen else ["", PPO_NOTES]
+    if any(flag.startswith("--algorithm.type=") for flag in result.options.extra):
+        return []
+    own = {
+        each.row.label: flag
+        for each in result.rows
+        for flag in each.row.flags
+        if flag.startswith("--algorithm.type=")
+    }
+    lines = [] if len(own) == len(result.rows) else ["", PPO_NOTES]
+    if own:
+        lines += ["", f"But for {'; '.join(f'{label}: `{flag}`' for label, flag in own.items())}."]
+    return lines
 
 
 def _about_the_paper(result: ExperimentResult) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -122,7 +123,7 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
     """One run of `cronos-train`."""
     options = spec.options
     extra, wanted, times = _eval_episodes(options)
-    episodes = min(wanted, spec.row.num_configurations)
+    episodes = min(wanted, _most_episodes(spec))
     # From few configurations as many episodes as from all.
     repetitions = times * (wanted // episodes if options.temperature else 1)
     command = [
@@ -160,6 +161,16 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
         environment=gymnasium_id(spec.scene),
         work=spec.steps,
         root=options.root,
+    )
+
+
+def _most_episodes(spec: RunSpec) -> int:
+    """As many as it trains on; with a benchmark of one's own how many that may be is seen when the run begins."""
+    given = [flag.split("=")[0] for flag in (*spec.row.flags, *spec.options.extra)]
+    return (
+        sys.maxsize
+        if "--env.benchmark" in given and spec.row.num_configurations == 64
+        else spec.row.num_configurations
     )
 
 
@@ -233,15 +244,21 @@ def base_evaluation_jobs(spec: RunSpec, evaluation: CheckpointEvaluation) -> lis
     """`cronos-eval` of the base policy, where a run's curves begin, in the run's environment."""
     if not evaluation.every_checkpoint:
         return []
-    base, options, own = spec.base, spec.options, _env_flags(spec.row.flags)
+    base, options = spec.base, spec.options
+
+    def needed_flags(flags: Iterable[str]) -> list[str]:
+        # Checkpoints of the runs have those of the policy in their config.
+        of_policy = [flag for flag in flags if options.policy_path and flag.startswith("--policy.")]
+        return [*_env_flags(flags), *of_policy]
+
+    # Rows that say the same in another order share it.
+    own = sorted(needed_flags(spec.row.flags))
     jobs, policy = [], base_policy(base, options)
-    # Checkpoints of the runs have these in their config.
-    settings = [flag for flag in options.extra if options.policy_path and flag.startswith("--policy.")]
     needed = None if options.policy_path else (base_jobs(base, options)[-1].name, policy)
     for split in evaluation.splits:
         folder = base_evaluation_folder(base, evaluation.suite, split, options, own)
         command = eval_command(policy, base.scene, evaluation.suite, split, folder, options)
-        command = _with_flags(command, own, _env_flags(options.extra), settings)
+        command = _with_flags(command, own, needed_flags(options.extra))
         name = f"base/{folder.parent.name}/{folder.name}"
         jobs.append(_eval_job(name, command, folder, needed, base.scene, options.root))
     return jobs

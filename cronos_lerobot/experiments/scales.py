@@ -175,11 +175,14 @@ def base_recipe(scale: Scale, scene: str, obs_type: str, *, clean: bool = False,
 def _for_tasks(recipe: BaseRecipe, scene: str) -> BaseRecipe:
     """A recipe of `MODEL` with as many demonstrations and gradient steps for each task of another scene."""
     from lerobot.utils.import_utils import register_third_party_plugins
-    from lerobot_env_cronos.scene.scenes import SCENES, get_scene
+    from lerobot_env_cronos.scene.scenes import SCENES, describe_unknown_scene, get_scene
 
     if scene not in SCENES:
         # An installed one is registered by the import of its package.
         register_third_party_plugins()
+    if scene not in SCENES:
+        # Demonstrations and clone are commands that no other module is given to.
+        raise ValueError(describe_unknown_scene(scene, None))
     tasks, of = len(get_scene(scene).tasks), len(get_scene(MODEL).tasks)
     steps = recipe.clone_steps * tasks // of
     more = replace(recipe, demos=recipe.demos * tasks // of, clone_steps=steps, checkpoint=steps)

@@ -146,7 +146,7 @@ def base_policy(base: Base, options: Options) -> str:
 
 
 def base_evaluation_folder(base: Base, suite: str, split: str, options: Options, own: Iterable[str] = ()) -> Path:
-    """`--output_dir` of an evaluation of the base policy; `own` are a row's flags of the environment."""
+    """`--output_dir` of an evaluation of the base policy; `own` are a row's flags that it needs."""
     if options.policy_path:
         given = hashlib.sha256(options.policy_path.encode()).hexdigest()[:8]
         folder = options.root / "base" / f"{base.scene}_{OBS_NAMES[options.obs_type]}_{given}"

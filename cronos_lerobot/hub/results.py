@@ -205,10 +205,12 @@ def make_entries(
 def _caveat(suite: str, split: str, n: int, size: int, results: dict[str, Any], changes: Sequence[str]) -> str:
     """In which ways an evaluation is not the benchmark's own, or not of the policy; empty if in none."""
     caveats = []
-    if n != size:
+    repetitions = 1 if suite == "sequential" else results.get("repetitions", 1)
+    if n != size * repetitions:
         whole = "chains" if suite == "sequential" else "episodes"
-        caveats.append(f"{n} of the {size} {whole} of {split} were evaluated")
-    if suite != "sequential" and (repetitions := results.get("repetitions", 1)) != 1:
+        each = f"{repetitions} times " if repetitions != 1 else ""
+        caveats.append(f"{n} of {each}the {size} {whole} of {split} were evaluated")
+    if repetitions != 1:
         caveats.append(f"every configuration was run {repetitions} times, the benchmark has each once")
     if renderer := (results.get("identity") or {}).get("renderer"):
         caveats.append(f"the policy saw pictures of the renderer {renderer}, the benchmark's are classic")

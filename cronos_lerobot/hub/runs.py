@@ -80,9 +80,11 @@ def _check_history(checkpoint: Path, folder: Path) -> None:
         # A copy without the training's state.
         return
     saved, steps, run = read_checkpoint(checkpoint), int(checkpoint.name), read_training_run(folder)
-    had = [one["interventions"] for one in run.updates if one["interaction_steps"] == steps]
-    if not had or had[-1] != saved["interventions"]:
-        now = f"comes to {had[-1]}" if had else f"ends at step {run.last['interaction_steps']}"
+    had = [one["interventions"] for one in (*run.updates, *run.ends) if one["interaction_steps"] == steps]
+    # Where a budget had ended it the run may have gone on from just there, which has no record then.
+    went_on = not had and any(start.get("interaction_steps") == steps for start in run.starts)
+    if not went_on and (not had or had[-1] != saved["interventions"]):
+        now = f"comes to {had[-1]}" if had else f"is at step {run.last['interaction_steps']}"
         raise ValueError(
             f"{checkpoint} is not of the run that is in {folder} now: it had {saved['interventions']} "
             f"interventions at step {steps}, and the run, which has gone on from an earlier checkpoint, {now}"
@@ -95,6 +97,7 @@ def read_run(folder: Path, step: int | None = None) -> TrainingRun:
     if step is not None:
         run.evaluations = [record for record in run.evaluations if record["interaction_steps"] <= step]
         run.updates = [record for record in run.updates if record["interaction_steps"] <= step]
+        run.ends = [record for record in run.ends if record["interaction_steps"] <= step]
         # Of before it was noted, all may have come to it.
         run.starts = run.starts[:1] + [one for one in run.starts[1:] if one.get("interaction_steps", 0) < step]
         run.config = config_of(folder, run.starts)

@@ -53,6 +53,8 @@ class TrainingRun:
     """One for each time the run was started, from manifest.json, whose steps are still the run's."""
     evaluations: list[Evaluation]
     updates: list[Update]
+    ends: list[dict[str, Any]] = field(default_factory=list)
+    """Where a budget ended it between two updates."""
 
     @property
     def name(self) -> str:
@@ -73,7 +75,7 @@ class TrainingRun:
     @property
     def last(self) -> dict[str, Any]:
         """The latest record, for its counters."""
-        return max([*self.updates, *self.evaluations], key=lambda record: record["interaction_steps"])
+        return max([*self.updates, *self.evaluations, *self.ends], key=lambda record: record["interaction_steps"])
 
     @property
     def changed(self) -> dict[str, str]:
@@ -240,8 +242,7 @@ def read_training_run(folder: Path) -> TrainingRun:
         folder,
         config_of(folder, starts),
         starts,
-        [record for record in records if record["kind"] == "evaluation"],
-        [record for record in records if record["kind"] == "update"],
+        *([record for record in records if record["kind"] == kind] for kind in ("evaluation", "update", "end")),
     )
 
 
@@ -335,8 +336,7 @@ def _add_run(group: Group, run: TrainingRun, notes: list[str] | None) -> None:
     if same is None:
         group.runs.append(run)
         return
-    is_longer = run.last["interaction_steps"] > same.last["interaction_steps"]
-    kept, dropped = (run, same) if is_longer else (same, run)
+    dropped, kept = sorted((run, same), key=lambda one: one.last["interaction_steps"])
     group.runs[group.runs.index(same)] = kept
     if notes is not None:
         steps, more = (one.last["interaction_steps"] for one in (dropped, kept))

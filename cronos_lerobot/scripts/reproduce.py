@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cronos_lerobot.experiments.definitions import COMMANDS, EXPERIMENTS, Base, Experiment, Row, find_rows
-from cronos_lerobot.experiments.flags import join_flags
+from cronos_lerobot.experiments.flags import DROPS_CHECKPOINTS, RESERVED, join_flags
 from cronos_lerobot.experiments.jobs import Job, is_done
 from cronos_lerobot.experiments.runner import usable_cores
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
@@ -35,22 +35,6 @@ if TYPE_CHECKING:
 
 # Modules that bring PyTorch are imported where they are needed: they take seconds, and mistakes are told before.
 ROOT = Path("outputs/reproduce")
-RESERVED = (
-    "--steps",
-    "--seed",
-    "--output_dir",
-    "--num_envs",
-    "--save_freq",
-    "--protocol.update_interval",
-    "--policy.path",
-    "--env.scene",
-    "--env.obs_type",
-    "--eval.split",
-    "--eval.temperature",
-    "--resume",
-    "--config_path",
-)
-"""Flags of `cronos-train` that the experiment sets; a run with others would not be the one its folder says."""
 EPILOG = """\
 examples:
   what there is
@@ -180,7 +164,9 @@ def parse_seeds(text: str | None, default: int) -> tuple[int, ...]:
     except ValueError:
         found = ()
     if not found or min(found) < 0:
-        raise ValueError(f"--seeds must be a number or a list such as 1,4, of seeds from 0 on, got {text!r}")
+        raise ValueError(
+            f"--seeds must be how many, from 1 on, or a list such as 1,4 (0, is seed 0 alone), got {text!r}"
+        )
     return found
 
 
@@ -198,7 +184,9 @@ def make_options(args: argparse.Namespace, extra: list[str], bases: Iterable[Bas
         raise ValueError(f"{taken[0]} after -- is of the runs alone: give --obs_type, before it, for all")
     if taken:
         raise ValueError(f"{taken[0]} is set by the experiment; it cannot be given after --")
-    for name, value in (flag.partition("=")[::2] for flag in extra):
+    flags = [flag.partition("=")[::2] for flag in extra]
+    # A benchmark of one's own may have more configurations.
+    for name, value in [] if "--env.benchmark" in dict(flags) else flags:
         # More than one of each configuration are as many of all.
         if name == "--eval.n_episodes" and value.isdigit() and int(value) > 64 and int(value) % 64:
             raise ValueError(f"{name}={value} must be at most 64, the configurations, or so many times 64")
@@ -275,8 +263,8 @@ def check_checkpoints(chosen: list[tuple[Experiment, tuple[Row, ...]]], options:
                 f"--protocol.reset_budget ends runs early, and {experiment.name} evaluates their checkpoints at"
                 " fixed steps; experiments without such evaluations take it, table1 for example"
             )
-        dropping = ("--keep_checkpoints", "--save_checkpoint")
-        if experiment.evaluations and (given := [flag for flag in options.extra if flag.startswith(dropping)]):
+        given = [flag for flag in options.extra if flag.startswith(DROPS_CHECKPOINTS)]
+        if experiment.evaluations and given:
             raise ValueError(f"{given[0]} drops checkpoints, and {experiment.name} evaluates them after the runs")
 
 
@@ -354,11 +342,11 @@ def main() -> None:
         options = make_options(args, sys.argv[split + 1 :], bases)
         check_checkpoints(chosen, options)
         slurm = make_slurm_options(args)
+        from cronos_lerobot.experiments.plan import make_jobs
+
+        jobs = make_jobs(chosen, options)
     except ValueError as error:
         sys.exit(f"error: {error}")
-    from cronos_lerobot.experiments.plan import make_jobs
-
-    jobs = make_jobs(chosen, options)
     if not args.report_only:
         check_runs(jobs, options)
     if args.dry_run:

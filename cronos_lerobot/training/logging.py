@@ -87,7 +87,7 @@ class RunLogger:
         )
 
     def log(self, kind: str, values: dict[str, Any]) -> None:
-        """Log one record; `kind` is `update` or `evaluation`. The counters of the loop are added."""
+        """Log one record; `kind` is `update`, `evaluation`, `end` and the like. The loop's counters are added."""
         interventions = self.loop.interventions_by_kind()
         record = {
             "kind": kind,
@@ -159,7 +159,8 @@ class RunLogger:
         from lerobot.common.wandb_utils import WandBLogger
 
         config = self.config
-        if config.resume and not (Path(config.output_dir or "") / "wandb").is_dir():
+        has_folder = (Path(config.output_dir or "") / "wandb").is_dir()
+        if config.resume and not has_folder and config.wandb.run_id is None:
             # A run that begins to be logged there has no former one to go on with.
             config = copy(config)
             config.resume = False

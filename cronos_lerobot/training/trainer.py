@@ -209,6 +209,7 @@ class Trainer:
         last_save, has_checkpoint = self.loop.n, self.config.checkpoint_path is not None
         updated = False
         env_state: dict[str, np.ndarray] | None = None
+        self._logged_steps = self.loop.n
         self.stopwatch.lap()
         for event in self._events():
             self._observe(event)
@@ -247,6 +248,9 @@ class Trainer:
             self._save(self.env.get_state() if env_state is None else env_state)
         # After the checkpoint: a run that goes on from it, with more steps or a larger budget, is as one that was
         # never ended, and has no evaluation here unless it was due.
+        if self.loop.n % self.config.steps_per_update:
+            # A budget ended it between two updates, whose records are else the latest.
+            self.logger.log("end", {})
         if self._last_evaluation < self.loop.n:
             self._evaluate()
         if summary := self.critic_log.summary():
@@ -317,7 +321,9 @@ class Trainer:
     def _log_update(self) -> None:
         wall, seconds = self.stopwatch.lap()
         shares = {name: spent / wall for name, spent in sorted(seconds.items())}
-        steps_per_s = self.config.steps_per_update / wall
+        # A run that goes on from between two updates has done a part of the first one's before.
+        steps_per_s = (self.loop.n - self._logged_steps) / wall
+        self._logged_steps = self.loop.n
         rollout = self.statistics.pop()
         record = {"rollout": rollout, "agent": self._update_metrics, "steps_per_s": steps_per_s}
         self.logger.log("update", record | self.critic_log.pop() | {"time_share": shares})

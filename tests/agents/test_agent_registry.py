@@ -49,6 +49,10 @@ def test_every_agent_of_this_package_has_a_config():
             "self_imitation.max_age": "demos_share below 1",
         }),
         (ImitationConfig(warmup_segments=3, demos_share=0.5, demos=DEMOS), {"warmup_segments": "demos_share=0"}),
+        (
+            ImitationConfig(demos_share=1.0, demos=DEMOS, weighting="advantage", memory_gib=1.0, tail_steps=9),
+            dict.fromkeys(("weighting", "memory_gib", "tail_steps"), "demos_share below 1"),
+        ),
         (ImitationConfig(gamma=0.5, max_weight=2.0), {"gamma": "weighting of return", "max_weight": "=advantage"}),
         (ImitationConfig(weighting="return", weighting_beta=1.0, max_weight=2.0), {"max_weight": "=advantage"}),
     ],

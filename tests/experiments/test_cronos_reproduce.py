@@ -117,8 +117,12 @@ def test_list_names_every_row(monkeypatch, capsys):
     ("flags", "message"),
     [
         (["table1", "--rows", "t81"], "no row 't81'; it has t80, t1280"),
-        (["table1", "--seeds=x"], "--seeds must be a number or a list such as 1,4, of seeds from 0 on, got 'x'"),
-        (["table1", "--seeds=1,-2"], "of seeds from 0 on, got '1,-2'"),
+        (
+            ["table1", "--seeds=x"],
+            "--seeds must be how many, from 1 on, or a list such as 1,4 (0, is seed 0 alone), got 'x'",
+        ),
+        (["table1", "--seeds=1,-2"], "(0, is seed 0 alone), got '1,-2'"),
+        (["table1", "--seeds=0"], "how many, from 1 on, or a list such as 1,4 (0, is seed 0 alone), got '0'"),
         (["table1", "--threads=0"], "--threads must be at least 1, got 0"),
         (["table1", "--jobs=0"], "--jobs must be at least 1, got 0"),
         (["table1", "--jobs=-2"], "--jobs must be at least 1, got -2"),
@@ -251,7 +255,7 @@ def test_own_experiment(tmp_path, monkeypatch, capsys):
     from cronos_lerobot.experiments.definitions import EXPERIMENTS
     flags = (
         "--protocol.discover_packages_path=my_strategy", "--protocol.extra_resets=[stuck]",
-        "--protocol.update_interval=320",
+        "--protocol.task_order=random",
     )
     rows = (Row(1280, end_effector_reset=True), Row(1280, end_effector_reset=True, tag="stuck", flags=flags))
     register_experiment(Experiment("stuck", "Resetting stuck scenes", rows))
@@ -274,8 +278,8 @@ def test_own_experiment(tmp_path, monkeypatch, capsys):
     assert "extra_resets" not in plain
     assert "--protocol.extra_resets=[stuck]" in stuck
     # A flag of the row replaces the experiment's.
-    assert stuck.count("update_interval") == 1
-    assert "update_interval=320" in stuck
+    assert stuck.count("task_order") == 1
+    assert "--protocol.task_order=random" in stuck
     call(monkeypatch, *flags, "--report_only")
     assert "1 of 1 seeds not begun" in capsys.readouterr().out
     with pytest.raises(ValueError, match="need different names"):

@@ -13,7 +13,7 @@ from forked_commands import run_forked
 from synthetic_runs import INSTRUCTIONS, write_training_run
 
 from cronos_lerobot.experiments import plots, tables
-from cronos_lerobot.experiments.definitions import EXPERIMENTS
+from cronos_lerobot.experiments.definitions import EXPERIMENTS, Experiment, Row
 from cronos_lerobot.experiments.few_resets import SCREENED
 from cronos_lerobot.experiments.jobs import write_record
 from cronos_lerobot.experiments.outputs import write_outputs
@@ -212,6 +212,12 @@ def test_flags_besides_those_of_the_rows_are_on_the_page(options, tmp_path):
     flags = "`--algorithm.type=ppo_paper '--protocol.curriculum=[[8,320]]'`"
     assert f"All runs have these flags besides, whatever a row is called: {flags}." in page
     assert "The learning algorithm is" not in page
+    # That of a row is named beside the others'.
+    own = Row(80, tag="cloned", flags=("--algorithm.type=imitation",))
+    for chosen, has_others in (((own,), False), ((Row(80), own), True)):
+        page = write_outputs(Experiment("mine", "", chosen), chosen, options, tmp_path / "own")
+        assert ("The learning algorithm is `ppo`" in page) is has_others
+        assert "But for T = 80, cloned: `--algorithm.type=imitation`." in page
 
 
 def test_takeovers_are_told_apart_with_what_one_counts(options, tmp_path):

@@ -84,6 +84,32 @@ def test_a_comma_that_is_missing_in_a_row(fields, message):
         Row(80, tag="mine", **fields)
 
 
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"flags": ("--steps=600000",)}, "--steps=600000 is set by the experiment"),
+        ({"flags": ("--protocol.update_interval=320",)}, "update_interval=320 is set by the experiment"),
+        ({"flags": ("--policy.path=me/other",)}, "--policy.path=me/other is set by the experiment"),
+        ({"flags": ("--eval.temperature=1",)}, "--eval.temperature=1 is set by the experiment"),
+        ({"tag": "v2: x"}, "the tag of a row is part of a folder's name, one word .*, got 'v2: x'"),
+        ({"tag": "a/b"}, "got 'a/b'"),
+        ({"num_configurations": 0}, "num_configurations of a row must be at least 1, got 0"),
+    ],
+)
+def test_rows_whose_runs_would_not_be_where_or_what_they_are_said_to_be(fields, message):
+    with pytest.raises(ValueError, match=message):
+        Row(80, **{"tag": "mine"} | fields)
+
+
+def test_names_and_checkpoints_of_an_experiment():
+    with pytest.raises(ValueError, match=r"name of an experiment is part of a folder's name, .*, got 'my/table'"):
+        Experiment("my/table", "", (Row(80),))
+    rows = (Row(80, tag="few", flags=("--keep_checkpoints=1",)),)
+    own_experiment(rows)
+    with pytest.raises(ValueError, match="mine: --keep_checkpoints=1 of t80_few drops checkpoints"):
+        own_experiment(rows, evaluations=(CHAINS,))
+
+
 def test_lists_will_do():
     evaluation = CheckpointEvaluation("independent", ["held_out"])
     own_experiment([Row(80)], splits=["train", "held_out"], evaluations=[evaluation], joined=[["a", ["t80"]]])

@@ -4,7 +4,7 @@ import pytest
 from planned_jobs import jobs_of, options
 
 from cronos_lerobot.experiments.command_check import check_commands
-from cronos_lerobot.experiments.definitions import Experiment, Row
+from cronos_lerobot.experiments.definitions import CheckpointEvaluation, Experiment, Row
 from cronos_lerobot.experiments.plan import make_jobs
 from cronos_lerobot.experiments.scales import PIXELS, STATE
 
@@ -39,6 +39,26 @@ def test_settings_of_a_policy_of_ones_own_hold_where_its_curves_begin():
     # What was evaluated without such flags stays the same command.
     plain = jobs_of("figure4", ["t80"], policy_path="me/act")[base.name]
     assert [flag for flag in base.command if flag != extra[0]] == list(plain.command)
+
+
+def test_settings_of_a_row_hold_where_its_curve_begins():
+    """The same ones in another order are one evaluation, which rows share."""
+    flags = ("--policy.n_action_steps=8", "--env.benchmark=me/bench")
+    rows = (Row(80), Row(80, tag="n8", flags=flags), Row(320, tag="n8", flags=flags[::-1]))
+    evaluations = (CheckpointEvaluation("independent", ("held_out",), every_checkpoint=True),)
+    experiment = Experiment("other", "", rows, evaluations=evaluations)
+    jobs = make_jobs([(experiment, rows)], options(policy_path="me/act"))
+    plain, own = [job.command for job in jobs if job.name.startswith("base/")]
+    assert not set(flags) & set(plain)
+    assert set(flags) < set(own)
+
+
+def test_a_benchmark_of_ones_own_may_have_more_configurations():
+    extra = ("--env.benchmark=me/large", "--eval.n_episodes=128")
+    (run,) = [job for name, job in jobs_of("table1", ["t80"], extra=extra).items() if name.endswith("seed1")]
+    assert {"--eval.n_episodes=128", "--eval.repetitions=1"} < set(run.command)
+    (run,) = [job for name, job in jobs_of("table1", ["t80"], extra=extra[1:]).items() if name.endswith("seed1")]
+    assert {"--eval.n_episodes=64", "--eval.repetitions=2"} < set(run.command)
 
 
 @pytest.mark.parametrize(

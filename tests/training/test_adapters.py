@@ -130,6 +130,7 @@ def test_diffusion_learns_by_its_chain_saves_resumes_and_is_a_lerobot_policy(tmp
     ("policy", "flag", "message"),
     [
         ("act", "noise_steps=1", r"noise_steps=1 is not for --policy\.type=act, which reads noise_std"),
+        ("act", "denoising_discount=0.9", r"discount=0\.9 is between .* which --policy\.type=act has not: give 1"),
         ("act", "noise_level=0.2", r"noise_level=0\.2 is not for --policy\.type=act, which reads noise_std"),
         ("diffusion", "noise_steps=1", r"noise_steps=1 is not for .*, which reads noise_level and noise_std"),
         (

@@ -16,6 +16,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig
 from safetensors.torch import load_file
 
+from cronos_lerobot.hub.runs import find_checkpoint, read_run
 from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.scripts import train as script
 
@@ -274,8 +275,12 @@ def test_a_budget_between_two_updates_is_no_end(tmp_path, monkeypatch, capfd):
     assert "its 2 interventions reach --protocol.reset_budget=2." in capfd.readouterr().err
     last = (stopped / "checkpoints/last").resolve()
     assert last.name == "000008"
+    found = find_checkpoint(stopped)
+    assert (found.step, read_run(stopped, found.step).last["interventions"]) == (8, 2)
     cronos_train(
         monkeypatch, "--resume=true", f"--config_path={last}/pretrained_model", "--protocol.reset_budget=null"
     )
+    # The run went on from it.
+    assert find_checkpoint(last).step == 8
     for name, tensor in weights(whole).items():
         assert torch.equal(tensor, weights(stopped)[name]), name

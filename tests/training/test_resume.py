@@ -5,6 +5,7 @@ import json
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,9 +17,11 @@ from test_trainer import STEPS_PER_UPDATE, assert_same_run, config, make_trainer
 
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.report.runs import read_training_run
+from cronos_lerobot.stopwatch import Stopwatch
 from cronos_lerobot.training import resume
 from cronos_lerobot.training.config import CronosTrainConfig
-from cronos_lerobot.training.logging import MetricsFile
+from cronos_lerobot.training.logging import MetricsFile, RunLogger
 from cronos_lerobot.training.record_config import RecordConfig
 from cronos_lerobot.training.recording import StreamObserver
 from cronos_lerobot.training.seeding import NamedGenerators
@@ -242,10 +245,34 @@ def test_a_run_that_a_budget_stopped_goes_on_as_if_it_had_not(tmp_path):
     train(config(tmp_path / "whole", **budget(None)))
     stopped = train(config(tmp_path / "stopped", **budget(4)))
     assert (stopped.loop.t, stopped.loop.updates, stopped.agent.buffer.rows) == (12, 1, 4)
+    # Of what it had come to there is a record until it goes on.
+    end = read_training_run(tmp_path / "stopped").last
+    assert (end["kind"], end["interaction_steps"], end["interventions"]) == ("end", 48, 5)
     torch.manual_seed(999)
     train(resumed(tmp_path / "stopped", **budget(None)), policy_seed=8)
     assert_same_run(tmp_path / "whole", tmp_path / "stopped")
     assert len(metrics(tmp_path / "stopped")) == 4
+
+
+def test_the_speed_after_such_a_stop_is_that_of_the_steps_that_were_left(tmp_path, monkeypatch):
+    """Each lap takes a second."""
+    monkeypatch.setattr(Stopwatch, "lap", lambda self: (1.0, {}))
+    train(config(tmp_path / "run", **budget(4)))
+    train(resumed(tmp_path / "run", **budget(None)), policy_seed=8)
+    lines = map(json.loads, (tmp_path / "run/metrics.jsonl").read_text().splitlines())
+    updates = [line for line in lines if line["kind"] == "update"]
+    assert [line["steps_per_s"] for line in updates] == [32, 16, 32, 32]
+
+
+def test_a_run_whose_wandb_folder_is_elsewhere_goes_on_with_its_run(monkeypatch, tmp_path):
+    """One that was not logged there begins."""
+    monkeypatch.setattr("lerobot.common.wandb_utils.WandBLogger", lambda config: config.resume)
+    opened = []
+    for run_id in ("abc", None):
+        cfg = config(tmp_path)
+        cfg.resume, cfg.wandb.run_id = True, run_id
+        opened.append(RunLogger._open_wandb(SimpleNamespace(config=cfg)))
+    assert opened == [True, False]
 
 
 def test_another_update_interval_after_such_a_stop_learns_from_every_transition(tmp_path):

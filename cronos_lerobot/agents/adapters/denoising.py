@@ -36,6 +36,7 @@ class DenoisingAdapter(Adapter):
 
     has_entropy = False
     """A Gaussian step's deviation is no parameter."""
+    is_chain = True
 
     def __init__(
         self, policy: Any, *, shape: tuple[int, int], num_steps: int, feature_width: int | None, first: int = 0

@@ -43,6 +43,7 @@ class PrivilegedCritic(Adapter):
         self.adapter: Any = adapter
         self.decision_steps, self.observation_steps = adapter.decision_steps, adapter.observation_steps
         self.options_read, self.has_entropy = adapter.options_read, adapter.has_entropy
+        self.is_chain = adapter.is_chain
         width = shapes[OBS_ENV_STATE][0] + shapes[OBS_STATE][0] + TEXT_WIDTH
         self.critic = Critic(width).to(next(adapter.policy.parameters()).device)
 

@@ -38,12 +38,14 @@ class Adapter(nn.Module):
         observation_steps: how many observations it looks at.
         options_read: names of the AdapterOptions that it follows; the others are refused where they are given.
         has_entropy: whether its decisions have an entropy that depends on the policy.
+        is_chain: whether the factors of a decision are the steps of a denoising chain.
     """
 
     decision_steps: int = 1
     observation_steps: int = 1
     options_read: frozenset[str] = frozenset(field.name for field in fields(AdapterOptions))
     has_entropy: bool = True
+    is_chain: bool = False
 
     def __init__(self, policy: Any) -> None:
         super().__init__()

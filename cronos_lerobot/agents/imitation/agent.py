@@ -108,7 +108,9 @@ class ImitationAgent(LearningAgent):
     def end_segment(self, success: np.ndarray, found_complete: np.ndarray) -> None:
         """Remember the successful segments of its streams, and the failed ones if they are weighted."""
         with_failed = self.config.weighting != "none"
-        for segment in self._open.close(found_complete[self._streams], self.config.tail_steps, with_failed):
+        closed = self._open.close(found_complete[self._streams], self.config.tail_steps, with_failed)
+        # Where demonstrations alone are cloned nothing is drawn of the memory.
+        for segment in closed if self.config.demos_share < 1 else ():
             self.memory.add(segment)
 
     def update(self) -> dict[str, float]:

@@ -106,6 +106,9 @@ class ImitationConfig(RLAlgorithmConfig):
             needs |= dict.fromkeys(("weighting_beta", "gamma"), "an --algorithm.weighting of return or advantage")
         if self.weighting != "advantage":
             needs["max_weight"] = "--algorithm.weighting=advantage"
+        if self.demos_share == 1:
+            of_memory = ("tail_steps", "memory_gib", "weighting", "weighting_beta", "max_weight", "gamma")
+            needs |= dict.fromkeys(of_memory, "an --algorithm.demos_share below 1")
         if self.demos_share:
             needs["warmup_segments"] = "--algorithm.demos_share=0"
         return needs

@@ -56,6 +56,11 @@ def _check_followed(policy: Any, config: Any, options: AdapterOptions) -> None:
                 f"--algorithm.{name}={given} is not for --policy.type={policy.config.type}, which "
                 + (f"reads {' and '.join(sorted(read))}." if read else "has no adapter that would read it.")
             )
+    if config.denoising_discount < 1 and isinstance(policy, Adapter) and not policy.is_chain:
+        raise ValueError(
+            f"--algorithm.denoising_discount={config.denoising_discount} is between the steps of a denoising "
+            f"chain, which --policy.type={policy.config.type} has not: give 1."
+        )
     if isinstance(policy, Adapter) and getattr(policy.config, "gradient_checkpointing", False):
         raise ValueError(
             "--policy.gradient_checkpointing=true has no effect in PPO, which learns from policies as they act, "
