@@ -84,7 +84,7 @@ def _check_history(checkpoint: Path, folder: Path) -> None:
     # Where a budget had ended it the run may have gone on from just there, which has no record then.
     went_on = not had and any(start.get("interaction_steps") == steps for start in run.starts)
     if not went_on and (not had or had[-1] != saved["interventions"]):
-        now = f"comes to {had[-1]}" if had else f"is at step {run.last['interaction_steps']}"
+        now = f"comes to {had[-1]}" if had else f"ends at step {run.last['interaction_steps']}"
         raise ValueError(
             f"{checkpoint} is not of the run that is in {folder} now: it had {saved['interventions']} "
             f"interventions at step {steps}, and the run, which has gone on from an earlier checkpoint, {now}"
