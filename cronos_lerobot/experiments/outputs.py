@@ -210,7 +210,8 @@ def _learning_notes(result: ExperimentResult) -> list[str]:
     }
     lines = [] if len(own) == len(result.rows) else ["", PPO_NOTES]
     if own:
-        lines += ["", f"But for {'; '.join(f'{label}: `{flag}`' for label, flag in own.items())}."]
+        named = ", ".join(f"{label} (`{flag}`)" for label, flag in own.items())
+        lines += ["", f"Rows with an agent of their own: {named}."]
     return lines
 
 

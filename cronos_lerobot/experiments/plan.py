@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -123,7 +122,7 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
     """One run of `cronos-train`."""
     options = spec.options
     extra, wanted, times = _eval_episodes(options)
-    episodes = min(wanted, _most_episodes(spec))
+    episodes = wanted if _may_have_more(spec) else min(wanted, spec.row.num_configurations)
     # From few configurations as many episodes as from all.
     repetitions = times * (wanted // episodes if options.temperature else 1)
     command = [
@@ -164,14 +163,10 @@ def train_job(spec: RunSpec, base: str | None) -> Job:
     )
 
 
-def _most_episodes(spec: RunSpec) -> int:
-    """As many as it trains on; with a benchmark of one's own how many that may be is seen when the run begins."""
-    given = [flag.split("=")[0] for flag in (*spec.row.flags, *spec.options.extra)]
-    return (
-        sys.maxsize
-        if "--env.benchmark" in given and spec.row.num_configurations == 64
-        else spec.row.num_configurations
-    )
+def _may_have_more(spec: RunSpec) -> bool:
+    """Whether there may be more configurations than 64: of a benchmark of one's own it is seen by the run."""
+    given = dict(read_flags((*spec.row.flags, *spec.options.extra)))
+    return "env.benchmark" in given and spec.row.num_configurations == 64
 
 
 def _recipe_flags(spec: RunSpec) -> list[str]:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cronos_lerobot.experiments.definitions import COMMANDS, EXPERIMENTS, Base, Experiment, Row, find_rows
-from cronos_lerobot.experiments.flags import DROPS_CHECKPOINTS, RESERVED, join_flags
+from cronos_lerobot.experiments.flags import DROPS_CHECKPOINTS, RESERVED, join_flags, read_flags
 from cronos_lerobot.experiments.jobs import Job, is_done
 from cronos_lerobot.experiments.runner import usable_cores
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
@@ -184,12 +184,13 @@ def make_options(args: argparse.Namespace, extra: list[str], bases: Iterable[Bas
         raise ValueError(f"{taken[0]} after -- is of the runs alone: give --obs_type, before it, for all")
     if taken:
         raise ValueError(f"{taken[0]} is set by the experiment; it cannot be given after --")
-    flags = [flag.partition("=")[::2] for flag in extra]
-    # A benchmark of one's own may have more configurations.
-    for name, value in [] if "--env.benchmark" in dict(flags) else flags:
-        # More than one of each configuration are as many of all.
-        if name == "--eval.n_episodes" and value.isdigit() and int(value) > 64 and int(value) % 64:
-            raise ValueError(f"{name}={value} must be at most 64, the configurations, or so many times 64")
+    given = dict(read_flags(extra))
+    episodes = given.get("eval.n_episodes", "")
+    # More than one of each configuration are as many of all; a benchmark of one's own may have more of these.
+    if "env.benchmark" not in given and episodes.isdigit() and int(episodes) > 64 and int(episodes) % 64:
+        raise ValueError(
+            f"--eval.n_episodes={episodes} must be at most 64, the configurations, or so many times 64"
+        )
     for name, path in (("root", args.root), ("policy.path", args.policy_path)):
         if path is not None and not is_plain(f"{path}/x"):
             raise ValueError(

@@ -16,7 +16,7 @@ from test_self_imitation import make_pocketvla
 from tiny_vlas import KINDS, make_processors, make_vla
 
 from cronos_lerobot.agents.imitation.agent import ImitationAgent, with_history
-from cronos_lerobot.agents.imitation.config import ImitationConfig
+from cronos_lerobot.agents.imitation.config import DemosConfig, ImitationConfig
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.agents.processing import make_processors as around
 from cronos_lerobot.agents.registry import AgentContext
@@ -104,6 +104,17 @@ def test_warmed_up_once_is_warm_for_good():
     (failed,) = resumed.memory.state_dict()
     resumed.memory.load_state_dict([failed | {"success": False}])
     assert resumed.update()["optimizer_steps"] == 0
+
+
+@pytest.mark.parametrize(("share", "kept"), [(0.5, 2), (1.0, 0)])
+def test_where_demonstrations_alone_are_cloned_nothing_is_remembered(share, kept, monkeypatch):
+    monkeypatch.setattr("cronos_lerobot.agents.imitation.agent.Demonstrations", lambda *of: None)
+    monkeypatch.setattr(ImitationAgent, "update", lambda self: {})
+    policy = make_pocketvla("categorical")
+    processors = around(policy, *make_pre_post_processors(policy.config))
+    agent = make_imitating(policy, processors, demos_share=share, demos=DemosConfig("me/demos"))
+    learn(agent)
+    assert len(agent.memory) == kept
 
 
 def test_a_history_is_a_batch_as_ppo_has_it():

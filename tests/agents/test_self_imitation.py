@@ -15,6 +15,7 @@ from test_act_adapter import make_act
 
 from cronos_lerobot.agents.adapters import builtin as _builtin  # noqa: F401 -- registers them
 from cronos_lerobot.agents.adapters.registry import AdapterOptions, make_trainable
+from cronos_lerobot.agents.imitation.config import DemosConfig
 from cronos_lerobot.agents.imitation.memory import Segment, SegmentMemory, own_share
 from cronos_lerobot.agents.imitation.weights import by_task
 from cronos_lerobot.agents.ppo.config import PPOConfig, SelfImitationConfig
@@ -82,6 +83,26 @@ def test_a_weighted_gradient_is_added_to_the_policys_and_to_no_other():
     assert policy.critic.weight.grad is None
     expected = flat(param.grad for param in twin.actor.parameters()).norm().item()
     assert metrics == pytest.approx({"clone_loss": loss.item(), "clone_grad_norm": expected}, rel=1e-5)
+
+
+@pytest.mark.parametrize(("share", "kept"), [(0.5, 2), (1.0, 0)])
+def test_where_demonstrations_alone_are_cloned_nothing_is_remembered(share, kept, monkeypatch):
+    monkeypatch.setattr("cronos_lerobot.agents.ppo.self_imitation.Demonstrations", lambda *of: None)
+    settings = {
+        "self_imitation": SelfImitationConfig(COEF),
+        "demos": DemosConfig("me/demos"),
+        "demos_share": share,
+    }
+    processors = PolicyProcessors(*identity_processors())
+    cloning = SelfImitation(
+        CloneablePolicy().eval(), processors, PPOConfig(**settings), 2, np.random.default_rng(0)
+    )
+    for success in (False, True):
+        seen = {"observation.state": np.zeros((2, 2))}
+        cloning.store(seen, ["a", "b"], np.zeros((2, 7)), np.zeros(2), np.zeros(2, bool))
+        cloning.end_step(np.full(2, success))
+    cloning.end_segment(np.zeros(2, bool), 1)
+    assert len(cloning.memory) == kept
 
 
 class Beside(Processes):

@@ -217,7 +217,7 @@ def test_flags_besides_those_of_the_rows_are_on_the_page(options, tmp_path):
     for chosen, has_others in (((own,), False), ((Row(80), own), True)):
         page = write_outputs(Experiment("mine", "", chosen), chosen, options, tmp_path / "own")
         assert ("The learning algorithm is `ppo`" in page) is has_others
-        assert "But for T = 80, cloned: `--algorithm.type=imitation`." in page
+        assert "Rows with an agent of their own: T = 80, cloned (`--algorithm.type=imitation`)." in page
 
 
 def test_takeovers_are_told_apart_with_what_one_counts(options, tmp_path):

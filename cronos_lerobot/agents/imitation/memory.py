@@ -91,6 +91,23 @@ class OpenSegments:
         return segments
 
 
+class NoSegments(OpenSegments):
+    """Stands where demonstrations alone are cloned: nothing of what happens would be drawn."""
+
+    def add(
+        self,
+        observation: Columns,
+        instructions: list[str],
+        action: np.ndarray,
+        reward: np.ndarray,
+        diverged: np.ndarray,
+    ) -> None:
+        """Copy nothing."""
+
+    def note(self, success: np.ndarray) -> None:
+        """Note nothing."""
+
+
 class SegmentMemory:
     """The newest segments, drawn from frame by frame.
 
