@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cronos_lerobot.scripts.errors import error_line
+from cronos_lerobot.scripts.listing import ends_with_its_reader
 
 EPILOG = """\
 A and B are output folders of cronos-eval, run folders of cronos-train, or folders above such ones: then all that
@@ -65,7 +66,8 @@ def main(arguments: Sequence[str]) -> None:
         suites = compare_sides(*sides, args.power)
     for note in dict.fromkeys(sides[0].notes + sides[1].notes):
         print(f"left out: {note}", file=sys.stderr)
-    if args.json:
-        print(json.dumps(to_json(*sides, suites, args.power), indent=2))
-    else:
-        print(to_text(suites, args.power))
+    with ends_with_its_reader():
+        if args.json:
+            print(json.dumps(to_json(*sides, suites, args.power), indent=2))
+        else:
+            print(to_text(suites, args.power))

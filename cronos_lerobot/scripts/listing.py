@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager
+
 from cronos_lerobot.experiments.definitions import EXPERIMENTS
 from cronos_lerobot.experiments.display import describe_missing
 from cronos_lerobot.experiments.jobs import (
@@ -17,6 +22,22 @@ from cronos_lerobot.experiments.jobs import (
 from cronos_lerobot.scripts.pipeline import command_line
 
 
+@contextmanager
+def ends_with_its_reader() -> Generator[None]:
+    """Print until nobody reads any more, as after ten lines of `| head`, and end without a traceback.
+
+    A context manager and a decorator, around what is printed when everything is done or nothing is to be done.
+    """
+    try:
+        yield
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Python flushes once more at its end (the library reference's note on SIGPIPE).
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+
+
+@ends_with_its_reader()
 def print_list() -> None:
     """Print the experiments and their rows."""
     for experiment in EXPERIMENTS.values():
@@ -27,6 +48,7 @@ def print_list() -> None:
             print(f"    {row.name:<{width}} {row.label}")
 
 
+@ends_with_its_reader()
 def print_plan(jobs: list[Job]) -> None:
     """Print every command, those that are done as comments."""
     for job in jobs:

@@ -1,6 +1,7 @@
 """`cronos-reproduce` as one types it: two rows of Table 1 at their smallest, and its command line."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -297,3 +298,12 @@ def test_own_experiment(tmp_path, monkeypatch, capsys):
         row = definitions.Row(1280, **untagged)
         with pytest.raises(ValueError, match=f"row t1280 of untold has {next(iter(untagged))} and no tag"):
             definitions.register_experiment(definitions.Experiment("untold", "", (row,)))
+
+
+def test_list_into_a_closed_pipe_ends_without_a_traceback():
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-c", "from cronos_lerobot.scripts.listing import print_list; print_list()"]
+    with open(writer, "wb") as closed:
+        ended = subprocess.run(command, stdout=closed, stderr=subprocess.PIPE, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (1, "")
