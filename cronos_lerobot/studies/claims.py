@@ -27,11 +27,17 @@ CLAIMS = MarkedTable("claims", Path("docs/results.md"), "cronos_lerobot.studies.
 def read_experiments(folder: Path) -> list[dict[str, Any]]:
     """What `cronos-reproduce` found, of every experiment of the paper below a folder, in the paper's order.
 
+    What was found of one experiment comes from the state before from pixels, and the longest runs first.
     Files of version 0 do not say whether the paper's claims hold, and are left out.
     """
     found = [json.loads(path.read_text()) for path in sorted(folder.glob("*/*.json"))]
     of_this_version = [one for one in found if isinstance(one, dict) and "orders" in one]
+    of_this_version.sort(key=lambda one: (_is_from_pixels(one), -one["steps"]))
     return [one for name in of_the_paper() for one in of_this_version if one["experiment"] == name]
+
+
+def _is_from_pixels(one: dict[str, Any]) -> bool:
+    return one["obs_type"].startswith("pixels")
 
 
 def of_the_paper() -> dict[str, Experiment]:
@@ -63,7 +69,7 @@ def make_table(experiments: list[dict[str, Any]]) -> str:
 def _experiment(one: dict[str, Any]) -> tuple[str, ...]:
     begun = [row["seeds"] for row in one["rows"] if row["seeds"]]
     seeds = "–".join(map(str, sorted({min(begun), max(begun)}))) if begun else "0"
-    kind = "pixels" if one["obs_type"].startswith("pixels") else "state"
+    kind = "pixels" if _is_from_pixels(one) else "state"
     name = f"{one['experiment']}, {one['scene']}, {kind}"
     rows, seeds = f"{len(begun)} of {len(one['rows'])}", f"{seeds} of {len(one['seeds'])}"
     return name, rows, seeds, f"{one['steps']:,}", f"{one['hours']:.1f}"

@@ -56,3 +56,19 @@ def test_nothing_found_is_one_line_and_what_says_nothing_has_its_reason(tmp_path
     assert lines[0] == ["2 sentences", "–", "–", "not run |"]
     assert lines[1][-1] == "not run |"
     assert lines[2][-1] == "not applicable: the base policy does 0.992 from the start |"
+
+
+def test_one_experiment_comes_from_the_state_first_and_its_longest_runs(tmp_path):
+    for name, obs_type, steps in (
+        ("a", "pixels_agent_pos", 300),
+        ("b", "pixels_agent_pos", 1_300),
+        ("c", "environment_state_agent_pos", 300),
+        ("d", "environment_state_agent_pos", 1_300),
+    ):
+        (tmp_path / name).mkdir()
+        found = FOUND | {"obs_type": obs_type, "steps": steps, "orders": []}
+        (tmp_path / name / "table1.json").write_text(json.dumps(found))
+    lines = [line.split(" | ") for line in make_table(read_experiments(tmp_path)).splitlines()[2:6]]
+    assert [(line[0].split(", ")[-1], line[3]) for line in lines] == [
+        ("state", "1,300"), ("state", "300"), ("pixels", "1,300"), ("pixels", "300"),
+    ]  # fmt: skip
