@@ -62,8 +62,10 @@ class Pairs:
 
     @property
     def units(self) -> str:
-        """Several of `unit`."""
+        """What the clusters are, in words that follow their number."""
         first, *rest = self.unit.split()
+        if len(np.unique(self.configurations)) == 1:
+            return self.unit
         return " ".join([f"{first}s", *rest])
 
     @property

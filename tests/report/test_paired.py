@@ -224,3 +224,6 @@ def test_episodes_of_one_configuration_go_together_by_repetition():
     assert found.method.endswith("over 64 repetitions of one configuration")
     many = [episode._replace(configuration=episode.seed % 16) for episode in episodes]
     assert len(Pairs.of(some, every, many).whole_differences) == 16
+    once = [number for number, episode in enumerate(episodes) if episode.seed == 7]
+    alone = Pairs.of(some[:, once], every[:, once], [episodes[number] for number in once])
+    assert compare_policies(alone, power=0.8).method.endswith("over 1 repetition of one configuration")
