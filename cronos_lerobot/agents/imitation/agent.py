@@ -25,7 +25,7 @@ from cronos_lerobot.agents.chunk_player import ChunkPlayer, Player, make_player
 from cronos_lerobot.agents.history import observation_steps
 from cronos_lerobot.agents.imitation.batches import Demonstrations, draw_batch
 from cronos_lerobot.agents.imitation.config import ImitationConfig
-from cronos_lerobot.agents.imitation.memory import NoSegments, OpenSegments, SegmentMemory, own_share
+from cronos_lerobot.agents.imitation.memory import OpenSegments, SegmentMemory, own_share
 from cronos_lerobot.agents.imitation.weights import Remembered, by_advantage, by_return, effective_share
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.agents.registry import AgentContext, register_agent
@@ -66,8 +66,7 @@ class ImitationAgent(LearningAgent):
         self._player = self._make_player(context.torch_rng("actions"))
         self._make_optimizer()
         policy_config = self.policy.config
-        segments = NoSegments if self.config.demos_share == 1 else OpenSegments
-        self._open = segments(self._streams.stop - self._streams.start)
+        self._open = OpenSegments(self._streams.stop - self._streams.start, kept=self.config.demos_share < 1)
         drop_last = getattr(policy_config, "drop_n_last_frames", 0) or 0
         self.memory = SegmentMemory(int(self.config.memory_gib * 2**30), drop_last)
         self._weights: np.ndarray | None = None

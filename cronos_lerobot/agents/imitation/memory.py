@@ -38,10 +38,12 @@ class OpenSegments:
 
     Args:
         num_streams: N of this process.
+        kept: whether anything is; where demonstrations alone are cloned nothing would be drawn of it.
     """
 
-    def __init__(self, num_streams: int) -> None:
+    def __init__(self, num_streams: int, kept: bool = True) -> None:
         self.num_streams = num_streams
+        self.kept = kept
         self.clear()
 
     def clear(self) -> None:
@@ -60,6 +62,8 @@ class OpenSegments:
         diverged: np.ndarray,
     ) -> None:
         """Copy one step of every stream, arrays (N, ...). What came before a divergence is forgotten."""
+        if not self.kept:
+            return
         row = observation | {ACTION: action.astype(np.float32), REWARD: reward.astype(np.float32)}
         self._rows.append({name: np.array(column) for name, column in row.items()})
         self._instructions = instructions
@@ -67,7 +71,8 @@ class OpenSegments:
 
     def note(self, success: np.ndarray) -> None:
         """Of the step last added: where the task was complete after it, (N,) bool."""
-        self._success.append(np.array(success))
+        if self.kept:
+            self._success.append(np.array(success))
 
     def close(self, found_complete: np.ndarray, tail_steps: int, with_failed: bool = False) -> list[Segment]:
         """Return the successful segments, up to `tail_steps` after the first success, and begin new ones.
@@ -89,23 +94,6 @@ class OpenSegments:
             segments.append(Segment(self._instructions[i], columns, success=success_i))
         self.clear()
         return segments
-
-
-class NoSegments(OpenSegments):
-    """Stands where demonstrations alone are cloned: nothing of what happens would be drawn."""
-
-    def add(
-        self,
-        observation: Columns,
-        instructions: list[str],
-        action: np.ndarray,
-        reward: np.ndarray,
-        diverged: np.ndarray,
-    ) -> None:
-        """Copy nothing."""
-
-    def note(self, success: np.ndarray) -> None:
-        """Note nothing."""
 
 
 class SegmentMemory:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cronos_lerobot.agents.base import Columns
 from cronos_lerobot.agents.imitation.batches import Demonstrations, draw_batch
-from cronos_lerobot.agents.imitation.memory import NoSegments, OpenSegments, Segment, SegmentMemory, own_share
+from cronos_lerobot.agents.imitation.memory import OpenSegments, Segment, SegmentMemory, own_share
 from cronos_lerobot.agents.imitation.weights import Remembered, by_task
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.processing import PolicyProcessors
@@ -57,7 +57,7 @@ class SelfImitation:
         self.config = config.self_imitation
         self._demos_share = config.demos_share
         self._cloned = _parameters_of_forward(policy)
-        self._open = (NoSegments if config.demos_share == 1 else OpenSegments)(num_streams)
+        self._open = OpenSegments(num_streams, kept=config.demos_share < 1)
         drop_last = getattr(policy.config, "drop_n_last_frames", 0) or 0
         self.memory = SegmentMemory(int(self.config.memory_gib * 2**30), drop_last)
         self._weights: np.ndarray | None = None
