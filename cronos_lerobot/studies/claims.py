@@ -17,6 +17,7 @@ from cronos_lerobot.experiments.columns import MISSING, WORDS
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Experiment
 from cronos_lerobot.experiments.orders import NOT_RUN
 from cronos_lerobot.experiments.results import paper_results
+from cronos_lerobot.experiments.scales import OBS_NAMES
 from cronos_lerobot.studies import marked_tables
 from cronos_lerobot.studies.marked_tables import MarkedTable
 
@@ -32,12 +33,8 @@ def read_experiments(folder: Path) -> list[dict[str, Any]]:
     """
     found = [json.loads(path.read_text()) for path in sorted(folder.glob("*/*.json"))]
     of_this_version = [one for one in found if isinstance(one, dict) and "orders" in one]
-    of_this_version.sort(key=lambda one: (_is_from_pixels(one), -one["steps"]))
+    of_this_version.sort(key=lambda one: (list(OBS_NAMES).index(one["obs_type"]), -one["steps"]))
     return [one for name in of_the_paper() for one in of_this_version if one["experiment"] == name]
-
-
-def _is_from_pixels(one: dict[str, Any]) -> bool:
-    return one["obs_type"].startswith("pixels")
 
 
 def of_the_paper() -> dict[str, Experiment]:
@@ -69,8 +66,7 @@ def make_table(experiments: list[dict[str, Any]]) -> str:
 def _experiment(one: dict[str, Any]) -> tuple[str, ...]:
     begun = [row["seeds"] for row in one["rows"] if row["seeds"]]
     seeds = "–".join(map(str, sorted({min(begun), max(begun)}))) if begun else "0"
-    kind = "pixels" if _is_from_pixels(one) else "state"
-    name = f"{one['experiment']}, {one['scene']}, {kind}"
+    name = f"{one['experiment']}, {one['scene']}, {OBS_NAMES[one['obs_type']]}"
     rows, seeds = f"{len(begun)} of {len(one['rows'])}", f"{seeds} of {len(one['seeds'])}"
     return name, rows, seeds, f"{one['steps']:,}", f"{one['hours']:.1f}"
 
