@@ -8,8 +8,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from cronos_lerobot.scripts.closed_pipe import ends_with_its_reader
 from cronos_lerobot.scripts.errors import error_line
-from cronos_lerobot.scripts.listing import ends_with_its_reader
 
 EPILOG = """\
 A and B are output folders of cronos-eval, run folders of cronos-train, or folders above such ones: then all that

@@ -1,6 +1,7 @@
 """`cronos-report compare`: folders of evaluations and runs, paired episode by episode."""
 
 import json
+import os
 import re
 import shutil
 import sys
@@ -96,6 +97,18 @@ def test_episodes_of_one_configuration_are_counted_by_repetition(tmp_path, monke
     text = capsys.readouterr().out
     assert "8 pairs of episodes from 8 repetitions of one configuration, sampling seed 1000, 1001" in text
     assert re.search(r"takes about \d+ more episodes of each policy, from \d+ repetitions of one config", text)
+
+
+@pytest.mark.parametrize("more", [[], ["--json"]])
+def test_a_comparison_into_a_closed_pipe_ends_without_a_traceback(more, tmp_path, monkeypatch):
+    a, b = (write_evaluation(tmp_path / name, f"me/{name}", tasks=["01010101"]) for name in "ab")
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w") as closed:
+        monkeypatch.setattr(sys, "stdout", closed)
+        with pytest.raises(SystemExit) as ended:
+            compare(monkeypatch, a, b, *more)
+    assert ended.value.code == 1
 
 
 def test_from_five_configurations_nothing_can_be_decided(tmp_path, monkeypatch, capsys):
