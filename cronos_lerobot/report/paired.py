@@ -13,6 +13,7 @@ from math import sqrt
 
 import numpy as np
 from lerobot_env_cronos.statistics import Z_95, wilson_interval
+from scipy.optimize import brentq
 from scipy.stats import t as student_t
 
 from cronos_lerobot.evaluation.outcomes import Episode
@@ -22,6 +23,11 @@ ALPHA = 0.05
 """Of all intervals, and of the decision for which `needed` episodes are counted."""
 FEWEST = 6
 """Configurations with which p of the sign-flip test, at least 2 / 2**k, can come below ALPHA."""
+FEW = 2
+"""Trainings of a side of which Satterthwaite's degrees of freedom make too much: against one policy, up to .13 of
+the cases in which nothing differs would be told to differ."""
+LEAST = 1e-300
+"""A probability below which nobody would ask."""
 MOST = 10**7
 """Configurations or trainings beyond which nobody would count."""
 
@@ -99,7 +105,7 @@ class Difference:
     """Configurations, or trainings of each side, with which a difference of this size is found with the power that
     is asked for; None if there is no difference, or nothing to tell it from."""
     detectable: float | None
-    """The difference that would have been found with that power."""
+    """The difference that would have been found with that power, about: by a t-test."""
 
     @property
     def is_separated(self) -> bool:
@@ -141,8 +147,8 @@ def compare_trainings(pairs: Pairs, power: float) -> Difference | None:
     between the configurations, less the interaction, which both of them have in them. A side of one policy, and
     what trainings have in common, such as the base that they begin with, is taken as it is: where the trainings
     are of several bases, it does not count how those differ. The t-interval has Satterthwaite's degrees of
-    freedom, and is no narrower than that of the configurations alone where trainings differ less than chance has
-    it.
+    freedom, or where FEW trainings stand against another number Cochran's quantile, and is no narrower than that
+    of the configurations alone where trainings differ less than chance has it.
     """
     sides = [side for side in (pairs.a, pairs.b) if len(side) > 1]
     if not sides:
@@ -160,23 +166,55 @@ def compare_trainings(pairs: Pairs, power: float) -> Difference | None:
     method = f"t-interval and p by training and {pairs.unit} ({counts}, {k} {pairs.units})"
     per_side = len(sides)
     needed = samples_needed(spread, value, power, lambda n: per_side * (n - 1))
-    terms = [v * v / (len(side) - 1) for v, side in zip(of_side, sides, strict=True)]
-    estimates = [(variance, variance**2 / (sum(terms) + (more**2 / (k - 1) if more else 0.0)))] if variance else []
+    parts = [(v, len(side) - 1) for v, side in zip(of_side, sides, strict=True)] + [(more, k - 1)] * (more > 0)
+    estimates = [parts] if variance else []
     # A variance between trainings that is estimated below 0 is none: no surer than of these policies alone.
     if configurations and trainings < both * (1 - 1e-9):
-        estimates.append((configurations, k - 1))
+        estimates.append([(configurations, k - 1)])
     if not estimates:
-        return Difference(value, None, None, method, None, None)
-    tests = [_t_test(value, one, df, power) for one, df in estimates]
+        p = sign_flip_p(pairs.whole_differences)
+        return Difference(value, None, p, f"{method}: nothing varies, so p is of these policies", None, None)
+    are_few = len(pairs.a) != len(pairs.b) and min(map(len, sides)) == FEW
+    method += " with Cochran's quantile" * are_few
+    tests = [_t_test(value, StudentSum(one, are_few), power) for one in estimates]
     half, p, found = map(max, zip(*tests, strict=True))
     return Difference(value, (value - half, value + half), p, method, needed, found)
 
 
-def _t_test(value: float, variance: float, df: float, power: float) -> tuple[float, float, float]:
-    """Half of Student's interval around a difference, p, and the difference that is found with that power."""
-    error, quantile = sqrt(variance), float(student_t.ppf(1 - ALPHA / 2, df))
-    p = 2 * float(student_t.sf(abs(value) / error, df))
-    return quantile * error, p, (quantile + float(student_t.ppf(power, df))) * error
+class StudentSum:
+    """About how an estimate is distributed whose variance is a sum of independent ones.
+
+    Args:
+        parts: variance, above 0 in all, and degrees of freedom of each.
+        is_weighted: with the mean of Student's quantiles, weighted by the variances (Cochran 1964, "Approximate
+            significance levels of the Behrens-Fisher test"), which is never too sure; else with Satterthwaite's
+            degrees of freedom, which takes a part of one degree of freedom that is small by chance for sure.
+    """
+
+    def __init__(self, parts: Sequence[tuple[float, int]], is_weighted: bool) -> None:
+        variances = [variance for variance, _ in parts]
+        self.error = sqrt(sum(variances))
+        if not is_weighted:
+            parts = [(1.0, self.error**4 / sum(v * v / df for v, df in parts))]
+        self._weights, self._dfs = np.array(parts).T
+
+    def quantile(self, tail: float) -> float:
+        """The deviation, in its standard errors, beyond which this much of it lies on one side."""
+        return float(np.average(student_t.isf(tail, self._dfs), weights=self._weights))
+
+    def p(self, deviation: float) -> float:
+        """Two-sided, of a deviation in standard errors."""
+        tails = student_t.sf(abs(deviation), self._dfs)
+        # Between that of the part with the fewest and that of the one with the most degrees of freedom; rounded.
+        low, high = max(float(tails.min()) * 0.999, LEAST), max(float(tails.max()) * 1.001, 2 * LEAST)
+        return 2 * float(brentq(lambda tail: self.quantile(tail) - abs(deviation), low, high, xtol=LEAST))
+
+
+def _t_test(value: float, estimate: StudentSum, power: float) -> tuple[float, float, float]:
+    """Half of the interval around a difference, p, and the difference that is found with that power."""
+    quantile = estimate.quantile(ALPHA / 2)
+    found = (quantile + estimate.quantile(1 - power)) * estimate.error
+    return quantile * estimate.error, estimate.p(value / estimate.error), found
 
 
 def cluster_variance(values: np.ndarray, clusters: np.ndarray) -> float:

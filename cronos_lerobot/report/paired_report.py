@@ -253,7 +253,7 @@ def _sentences(row: PairedRow, power: float) -> Iterator[str]:
         p = "" if found.p is None else f" (p = {found.p:.2g})"
         yield f"Not separated, of {of_what}{p}: this is no sign that they do alike."
         if found.detectable is not None:
-            yield f"  A difference of {found.detectable:.3f} would have been found with power {power}."
+            yield f"  A difference of about {found.detectable:.3f} would have been found with power {power}."
         if row.trainings and found.needed is not None:
             which = "of each side" if row.sampled == "AB" else f"of {row.sampled}"
             yield f"  One of {abs(found.value):.3f} takes at least {found.needed} trainings {which}."

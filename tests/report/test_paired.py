@@ -7,6 +7,7 @@ from scipy.stats import ttest_1samp, ttest_ind, ttest_rel
 from cronos_lerobot.evaluation.outcomes import Episode
 from cronos_lerobot.report.paired import (
     Pairs,
+    StudentSum,
     compare_policies,
     compare_trainings,
     detectable,
@@ -188,6 +189,52 @@ def test_intervals_cover_the_difference_as_often_as_they_say(by_configuration, b
         covered += found.ci95[0] < true < found.ci95[1]
     # Of 300 with 95 %, 3 standard deviations below 285 are 273.7.
     assert covered >= 274
+
+
+def test_two_trainings_against_one_policy_have_cochrans_quantile():
+    # Between the two, .5 and 1, it is .125 / 2, with 1 degree of freedom; between their configurations, .5, 1, .5,
+    # 1, it is 1/12 / 4 with 3, less the interaction: all cells +-.25, .5 over 3, of the mean of eight 1/48.
+    after = np.array([[0, 1, 0, 1], [1, 1, 1, 1]])
+    found = compare_trainings(Pairs(np.zeros((1, 4), int), after, np.arange(4)), power=0.8)
+    assert found.ci95 == pytest.approx((0.75 - 12.7062 / 4, 0.75 + 12.7062 / 4), abs=1e-4)
+    # t = 3 of 1 degree of freedom: 1 - 2 arctan(3) / pi.
+    assert found.p == pytest.approx(1 - 2 * np.arctan(3) / np.pi)
+    assert found.method.endswith("with Cochran's quantile")
+    # A part of 2 and one of 63: a third and two thirds of their quantiles, and p goes back to where they meet.
+    parts = StudentSum([(1.0, 2), (2.0, 63)], is_weighted=True)
+    assert parts.quantile(0.025) == pytest.approx((4.3027 + 2 * 1.9983) / 3, abs=1e-4)
+    assert parts.p(-parts.quantile(0.025)) == pytest.approx(0.05)
+    assert parts.p(0.0) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(("trainings", "most"), [(2, 26), (3, 32)])
+def test_level_of_several_trainings_against_one_policy(trainings, most):
+    """Nothing differs: the one succeeds as often as the others do on average, in each of 64 configurations."""
+    rng, rejected, runs = np.random.default_rng(9), 0, 300
+    scenes = np.arange(64).repeat(4)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(40)
+    for _ in range(runs):
+        easy = rng.normal(0, 1, 64)[scenes]
+        average = _logistic(easy + 0.5 * nodes[:, None]).T @ weights / weights.sum()
+        rates = _logistic(easy + rng.normal(0, 0.5, (trainings, 1)))
+        sides = [(rng.random(p.shape) < p).astype(int) for p in (average[None], rates)]
+        rejected += compare_trainings(Pairs(*sides, scenes), power=0.8).is_separated
+    print(f"{trainings} trainings whose rates vary by some .1 against one policy: level {rejected / runs:.3f}")
+    # Of 300 with 5 %, 3 standard deviations above 15 are 26.3; of three trainings the level is up to .07, 32.
+    assert rejected <= most
+
+
+def test_where_nothing_varies_the_configurations_decide():
+    worst, best = np.zeros((3, 64), int), np.ones((3, 64), int)
+    found = compare_trainings(Pairs(worst, best, np.arange(64)), power=0.8)
+    # 64 configurations, all one way.
+    assert (found.value, found.ci95, found.p) == (1, None, 2 / 2**64)
+    assert found.is_separated
+    assert compare_trainings(Pairs(best, best[:2], np.arange(64)), power=0.8).p == 1
+
+
+def _logistic(x):
+    return 1 / (1 + np.exp(-x))
 
 
 def _true_difference(variance):
