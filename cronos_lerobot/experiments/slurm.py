@@ -12,13 +12,22 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
+from cronos_lerobot.experiments.arrays import (
+    Elements,
+    after_any,
+    after_each,
+    behind_runs,
+    needs_of_others,
+    plan_arrays,
+    to_be_made,
+)
 from cronos_lerobot.experiments.display import LineDisplay
-from cronos_lerobot.experiments.jobs import BASE, EVALUATION, RUN, Job, changes, continuation, is_done, read_record
+from cronos_lerobot.experiments.jobs import BASE, EVALUATION, RUN, Job, is_done, read_record
 from cronos_lerobot.experiments.runner import DONE, FAILED, Runner
 from cronos_lerobot.experiments.submitted import Submission, other_flags, read_submissions, write_submissions
 from cronos_lerobot.locks import FolderLock
@@ -99,10 +108,6 @@ class SlurmOptions:
             # Requeued where a node fails; gone where what it waits for failed.
             "additional_parameters": {"requeue": True, "kill-on-invalid-dep": "yes"},
         }
-
-
-Elements = list[list[Job]]
-"""Of an array: the jobs of each, needs before those who need them."""
 
 
 class Task:
@@ -194,42 +199,6 @@ class Task:
         return DelayedSubmission(task)
 
 
-def _to_be_made(jobs: Sequence[Job]) -> list[Job]:
-    """Those that are not done, or will not be: what is begun anew takes with it what was made of it."""
-    unfinished = [job for job in jobs if not changes(job) and not is_done(job)]
-    gone = [folder for job in unfinished if continuation(job) is None for folder in job.made_from_it]
-    lost = [job for job in jobs if is_done(job) and any(job.output.is_relative_to(folder) for folder in gone)]
-    return [*unfinished, *lost]
-
-
-def plan_arrays(jobs: Sequence[Job], waiting: Iterable[Job]) -> tuple[Elements, Elements, Elements]:
-    """Return what each element of the three arrays runs.
-
-    Args:
-        jobs: all of them.
-        waiting: those that are to be run.
-
-    Returns:
-        Base policies, each with its demonstrations; runs, and after them what waits for no run of these; and the
-        evaluations of the first of these runs, element by element.
-    """
-    names = {job.name for job in waiting}
-    jobs = [job for job in jobs if job.name in names]
-    bases: dict[str, list[Job]] = {}
-    evaluations: dict[str, list[Job]] = {}
-    runs: list[Job] = []
-    for job in jobs:
-        if job.stage == BASE:
-            bases.setdefault(job.name.rpartition("/")[0], []).append(job)
-        elif job.stage == EVALUATION:
-            evaluations.setdefault(job.needs[0] if job.needs else job.name, []).append(job)
-        else:
-            runs.append(job)
-    runs.sort(key=lambda job: job.name not in evaluations)
-    behind = [evaluations.pop(job.name) for job in runs if job.name in evaluations]
-    return list(bases.values()), [*([job] for job in runs), *evaluations.values()], behind
-
-
 def slurm_folder(root: Path) -> Path:
     """Where what was submitted of a root is remembered."""
     return root / "slurm"
@@ -278,7 +247,7 @@ class Cluster:
             if text := other_flags(jobs, in_queue):
                 raise SlurmError(text)
             queued = {name: what.element for name, what in in_queue.items()}
-            waiting = _to_be_made([job for job in jobs if job.name not in queued])
+            waiting = to_be_made([job for job in jobs if job.name not in queued])
             bases, runs, evaluations = plan_arrays(jobs, waiting)
             made = {job.name: job for job in jobs}
             submitted: dict[str, str] = {}
@@ -288,7 +257,7 @@ class Cluster:
                 # The rest of the warning is for what follows a killed command.
                 grace_s = 0.75 * self.options.warning_s
                 limits = threads, limit_s, grace_s, self.options.requeues
-                tasks = [Task(element, _needs(element, made), *limits) for element in elements]
+                tasks = [Task(element, needs_of_others(element, made), *limits) for element in elements]
                 parameters = self.options.parameters(threads, parallel) | {"dependency": dependency}
                 numbers = self._submit_array(_array_name(name), tasks, parameters)
                 for element, number in zip(elements, numbers, strict=True):
@@ -299,10 +268,10 @@ class Cluster:
                 array(BASE, bases, None)
                 # `any`: what an element needs it looks for itself, and others may have theirs.
                 begun, runs = behind_runs(runs, queued, made)
-                numbers = array(RUN, runs, _after_any(runs, queued | submitted))
-                array(EVALUATION, evaluations, _after_each(numbers, len(evaluations)))
+                numbers = array(RUN, runs, after_any(runs, queued | submitted))
+                array(EVALUATION, evaluations, after_each(numbers, len(evaluations)))
                 if begun:
-                    array(EVALUATION, begun, _after_any(begun, queued))
+                    array(EVALUATION, begun, after_any(begun, queued))
             finally:
                 # What the cluster has taken is remembered, also where it refused the rest.
                 new = {name: Submission(number, list(made[name].command)) for name, number in submitted.items()}
@@ -331,37 +300,6 @@ class Cluster:
     def log(self, number: str) -> Path:
         """What an element printed."""
         return self.logs / f"{number}_0_log.out"
-
-
-def _needs(element: list[Job], made: dict[str, Job]) -> list[Job]:
-    """The jobs that an element needs and others make."""
-    own = {job.name for job in element}
-    return [made[name] for name in dict.fromkeys(need for job in element for need in job.needs) if name not in own]
-
-
-def behind_runs(elements: Elements, queued: Container[str], made: Mapping[str, Job]) -> tuple[Elements, Elements]:
-    """Those that wait for a run in the queue, and the others, which need not wait for it."""
-    parts: tuple[Elements, Elements] = [], []
-    for element in elements:
-        needs = [need for job in element for need in job.needs]
-        parts[not any(need in queued and made[need].stage != BASE for need in needs)].append(element)
-    return parts
-
-
-def _after_any(elements: Elements, ids: Mapping[str, str]) -> str | None:
-    """The dependency of an array on all that its elements need."""
-    needed = {need for element in elements for job in element for need in job.needs}
-    first = sorted({number for name, number in ids.items() if name in needed})
-    return f"afterany:{':'.join(first)}" if first else None
-
-
-def _after_each(ids: list[str], number: int) -> str | None:
-    """The dependency of an array of `number` elements on the first ones of another, one by one."""
-    if not number:
-        return None
-    if number == 1:
-        return f"afterok:{ids[0]}"
-    return f"aftercorr:{ids[0].split('_')[0]}"
 
 
 def _array_name(stage: str) -> str:

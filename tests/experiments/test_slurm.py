@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 from slurm_cluster import SlurmCluster, missing
 
+from cronos_lerobot.experiments.arrays import behind_runs, plan_arrays
 from cronos_lerobot.experiments.follow import Follower
 from cronos_lerobot.experiments.jobs import BASE, EVALUATION, RUN, Job, read_record, write_record
 from cronos_lerobot.experiments.runner import ENDING_SIGNALS
-from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, Task, behind_runs, plan_arrays
+from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, Task
 from cronos_lerobot.experiments.submitted import read_submitted
 
 needs_slurm = pytest.mark.skipif(
