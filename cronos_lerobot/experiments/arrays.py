@@ -4,15 +4,41 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping, Sequence
 
-from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job, changes, continuation, is_done
+from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job, changes, continuation, is_done, missing
 
 Elements = list[list[Job]]
 """Of an array: the jobs of each, needs before those who need them."""
 
 
-def to_be_made(jobs: Sequence[Job]) -> list[Job]:
-    """Those that are not done, or will not be: what is begun anew takes with it what was made of it."""
-    unfinished = [job for job in jobs if not changes(job) and not is_done(job)]
+def held_up(jobs: Iterable[Job], queued: Container[str] = ()) -> list[str]:
+    """The names of those that cannot run whatever is run: they need what is not theirs, or lack what they read.
+
+    Args:
+        jobs: needs come before those who need them.
+        queued: what is in the queue, by name, and may be done soon.
+    """
+    found: list[str] = []
+    known: dict[str, Job] = {}
+    wrong: set[str] = set()
+    for job in jobs:
+        known[job.name] = job
+        if changes(job):
+            wrong.add(job.name)
+        elif not is_done(job):
+            is_early = any(name in queued or (name in known and not is_done(known[name])) for name in job.needs)
+            if any(name in wrong for name in job.needs) or (not is_early and missing(job)):
+                found.append(job.name)
+                wrong.add(job.name)
+    return found
+
+
+def to_be_made(jobs: Sequence[Job], queued: Container[str] = ()) -> list[Job]:
+    """Those that are not done, or will not be: what is begun anew takes with it what was made of it.
+
+    Not what is `held_up`.
+    """
+    blocked = held_up(jobs, queued)
+    unfinished = [job for job in jobs if not changes(job) and not is_done(job) and job.name not in blocked]
     gone = [folder for job in unfinished if continuation(job) is None for folder in job.made_from_it]
     lost = [job for job in jobs if is_done(job) and any(job.output.is_relative_to(folder) for folder in gone)]
     return [*unfinished, *lost]

@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-from cronos_lerobot.experiments.jobs import RUNNING, Job, changes, is_done, read_record
-from cronos_lerobot.experiments.runner import CHANGED, DONE, FAILED, Display
-from cronos_lerobot.experiments.slurm import PENDING, Cluster, SlurmError, squeue
+from cronos_lerobot.experiments.arrays import held_up
+from cronos_lerobot.experiments.jobs import RUNNING, Job, changes, is_done, missing, read_record
+from cronos_lerobot.experiments.runner import BLOCKED, CHANGED, DONE, FAILED, MISSING, Display
+from cronos_lerobot.experiments.slurm import LATE_S, PENDING, Cluster, squeue
+from cronos_lerobot.experiments.submitted import SlurmError
 
 POLL_S = 5.0
 """How often the queue is asked [s]."""
-LATE_S = 90.0
-"""A job that looks for so long [s] found neither queued nor done is over. NFS may show a note a minute late."""
 
 
 class Follower:
@@ -39,9 +39,12 @@ class Follower:
         Raises:
             KeyboardInterrupt: Ctrl-C; the jobs go on.
         """
+        blocked = held_up(self.jobs, self.submitted)
         for job in self.jobs:
             if changes(job):
                 self._finish(job, CHANGED)
+            elif job.name in blocked and job.name not in self.submitted:
+                self._finish(job, BLOCKED, MISSING if missing(job) else None)
             elif is_done(job) and job.name not in self._again:
                 self.states[job.name] = DONE
             elif job.name in self.submitted:
@@ -97,6 +100,6 @@ class Follower:
         self.display.event(job, f"left the queue and is not done{log}")
         self._finish(job, FAILED)
 
-    def _finish(self, job: Job, state: str) -> None:
+    def _finish(self, job: Job, state: str, event: str | None = None) -> None:
         self.states[job.name] = state
-        self.display.event(job, state)
+        self.display.event(job, event or state)

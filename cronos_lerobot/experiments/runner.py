@@ -8,8 +8,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -30,6 +30,7 @@ from cronos_lerobot.experiments.jobs import (
     this_commit,
     write_record,
 )
+from cronos_lerobot.experiments.signals import blocked
 from cronos_lerobot.locks import FolderInUseError, FolderLock
 from cronos_lerobot.training.stopping import SAME_S
 
@@ -66,6 +67,8 @@ class _Child:
     job: Job
     process: subprocess.Popen
     lock: int
+    record: dict[str, Any]
+    """Its note: the folder with the one on disk may be deleted meanwhile."""
     started: float = field(default_factory=time.time)
     is_asked: bool = False
     """Whether it was asked to end."""
@@ -179,7 +182,7 @@ class Runner:
         write_record(job, record)
         command = resumed or list(job.command)
         # A session of its own: Ctrl-C reaches us alone, and we stop it and whatever it has started.
-        with job.log.open("ab") as log, _blocked(TIME_LIMIT_SIGNAL):
+        with job.log.open("ab") as log, blocked(TIME_LIMIT_SIGNAL):
             log.write(f"$ {' '.join(command)}\n".encode())
             log.flush()
             process = subprocess.Popen(
@@ -191,7 +194,7 @@ class Runner:
                 start_new_session=True,
                 pass_fds=(claim,),
             )
-        self._children.append(_Child(job, process, claim))
+        self._children.append(_Child(job, process, claim, record))
         self.display.event(job, "resumed" if resumed else "started")
 
     def _wait_for_others(self, job: Job) -> None:
@@ -204,13 +207,13 @@ class Runner:
         for child in list(self._children):
             code = child.process.poll()
             if code is not None:
-                self._end(child, DONE if code == 0 else FAILED, {"returncode": code})
-                self._finish(child.job, DONE if code == 0 else FAILED)
+                state = DONE if code == 0 and child.job.output.exists() else FAILED
+                self._end(child, state, {"returncode": code})
+                self._finish(child.job, state)
 
     def _end(self, child: _Child, status: str, extra: dict[str, Any]) -> None:
-        record = read_record(child.job)
-        seconds = record["seconds"] + time.time() - child.started
-        write_record(child.job, record | {"status": status, "seconds": round(seconds, 1)} | extra)
+        seconds = child.record["seconds"] + time.time() - child.started
+        write_record(child.job, child.record | {"status": status, "seconds": round(seconds, 1)} | extra)
         os.close(child.lock)
         self._children.remove(child)
 
@@ -259,16 +262,6 @@ class Runner:
             except KeyboardInterrupt:
                 if time.monotonic() > began + SAME_S:
                     return
-
-
-@contextmanager
-def _blocked(number: signal.Signals) -> Generator[None]:
-    """What is started within does not see this signal."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {number})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _signal_groups(children: Sequence[_Child], number: int) -> None:

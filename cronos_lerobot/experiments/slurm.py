@@ -13,7 +13,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -29,16 +29,22 @@ from cronos_lerobot.experiments.arrays import (
 from cronos_lerobot.experiments.display import LineDisplay
 from cronos_lerobot.experiments.jobs import BASE, EVALUATION, RUN, Job, is_done, read_record
 from cronos_lerobot.experiments.runner import DONE, FAILED, Runner
-from cronos_lerobot.experiments.submitted import Submission, other_flags, read_submissions, write_submissions
+from cronos_lerobot.experiments.signals import deferred
+from cronos_lerobot.experiments.submitted import (
+    SlurmError,
+    Submission,
+    other_flags,
+    other_options,
+    read_submissions,
+    write_submissions,
+)
 from cronos_lerobot.locks import FolderLock
 
 PENDING = "PENDING"
 """Slurm's state of an element that waits, also of one that was requeued."""
+LATE_S = 90.0
+"""How long what another node has written is looked for [s]: NFS may show it a minute late."""
 INSTALL = "--launcher=slurm needs submitit: pip install '.[slurm]' in a clone"
-
-
-class SlurmError(Exception):
-    """Slurm, or what is needed to talk to it, is not there or refuses."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +93,13 @@ class SlurmOptions:
         days, hours, more, seconds = rest
         return minutes + 1440 * days + 60 * hours + more + -(-seconds // 60)
 
+    @property
+    def flags(self) -> dict[str, str]:
+        """Those that are not None, as flags and their values."""
+        values = {f"--slurm.{option.name}": getattr(self, option.name) for option in fields(self)}
+        values["--slurm.setup"] = "; ".join(self.setup)
+        return {flag: str(value) for flag, value in values.items() if value not in (None, "")}
+
     def parameters(self, threads: int, parallel: int | None) -> dict[str, Any]:
         """The parameters of submitit's SlurmExecutor.
 
@@ -133,6 +146,7 @@ class Task:
     ) -> None:
         self.jobs, self.needs, self.threads = tuple(jobs), tuple(needs), threads
         self.limit_s, self.grace_s, self.requeues = limit_s, grace_s, requeues
+        self._late_s = LATE_S
         self._began = time.monotonic()
         self._waiting: list[Job] = []
         """What was not done at this start."""
@@ -149,7 +163,7 @@ class Task:
         """
         self._began = time.monotonic()
         self._waiting = [job for job in self.jobs if not is_done(job)]
-        if missing := [job.name for job in self.needs if not is_done(job)]:
+        if missing := self._await_needs():
             raise RuntimeError(f"blocked: {', '.join(missing)} is not done")
         own = {job.name for job in self.jobs}
         jobs = [replace(job, needs=tuple(need for need in job.needs if need in own)) for job in self.jobs]
@@ -165,6 +179,15 @@ class Task:
         if bad := {name: state for name, state in states.items() if state != DONE}:
             raise RuntimeError(f"not done: {bad}")
         return states
+
+    def _await_needs(self) -> list[str]:
+        """The names of what is needed and not done, also after a while."""
+        deadline = time.monotonic() + self._late_s
+        while missing := [job.name for job in self.needs if not is_done(job)]:
+            if time.monotonic() >= deadline:
+                break
+            time.sleep(self._late_s / 20)
+        return missing
 
     def _await_end(self) -> NoReturn:
         """Wait for what follows SIGTERM: what ends by itself in the grace time of a preemption is not requeued."""
@@ -224,6 +247,11 @@ class Cluster:
             if not shutil.which(program):
                 raise SlurmError(f"--launcher=slurm: there is no {program} here; start it on a login node")
         self.folder, self.options = folder.resolve(), options
+        root = self.folder.parent
+        if "%" in str(root):
+            raise SlurmError(
+                f"Slurm reads a % in a path as its own: choose another --root than {self.folder.parent}"
+            )
         self.logs = self.folder / "logs"
         self._submitit = submitit
 
@@ -241,15 +269,18 @@ class Cluster:
         Raises:
             SlurmError: a job is in the queue with other flags, or the cluster refuses an array.
         """
+        options = self.options.flags | ({"--jobs": str(parallel)} if parallel else {})
+        made = {job.name: job for job in jobs}
         with FolderLock(self.folder):
             known, queue = read_submissions(self.folder), squeue()
             in_queue = {name: what for name, what in known.items() if what.element in queue}
             if text := other_flags(jobs, in_queue):
                 raise SlurmError(text)
+            if text := other_options({name: what for name, what in in_queue.items() if name in made}, options):
+                print(text, flush=True)
             queued = {name: what.element for name, what in in_queue.items()}
-            waiting = to_be_made([job for job in jobs if job.name not in queued])
+            waiting = to_be_made([job for job in jobs if job.name not in queued], queued)
             bases, runs, evaluations = plan_arrays(jobs, waiting)
-            made = {job.name: job for job in jobs}
             submitted: dict[str, str] = {}
 
             def array(name: str, elements: Elements, dependency: str | None) -> list[str]:
@@ -259,23 +290,25 @@ class Cluster:
                 limits = threads, limit_s, grace_s, self.options.requeues
                 tasks = [Task(element, needs_of_others(element, made), *limits) for element in elements]
                 parameters = self.options.parameters(threads, parallel) | {"dependency": dependency}
-                numbers = self._submit_array(_array_name(name), tasks, parameters)
-                for element, number in zip(elements, numbers, strict=True):
-                    submitted.update({job.name: number for job in element})
+                # What the cluster has taken is remembered, whatever comes.
+                with deferred():
+                    numbers = self._submit_array(_array_name(name), tasks, parameters)
+                    for element, number in zip(elements, numbers, strict=True):
+                        submitted.update({job.name: number for job in element})
+                    new = {
+                        name: Submission(number, list(made[name].command), options)
+                        for name, number in submitted.items()
+                    }
+                    write_submissions(self.folder, known | new)
                 return numbers
 
-            try:
-                array(BASE, bases, None)
-                # `any`: what an element needs it looks for itself, and others may have theirs.
-                begun, runs = behind_runs(runs, queued, made)
-                numbers = array(RUN, runs, after_any(runs, queued | submitted))
-                array(EVALUATION, evaluations, after_each(numbers, len(evaluations)))
-                if begun:
-                    array(EVALUATION, begun, after_any(begun, queued))
-            finally:
-                # What the cluster has taken is remembered, also where it refused the rest.
-                new = {name: Submission(number, list(made[name].command)) for name, number in submitted.items()}
-                write_submissions(self.folder, known | new)
+            array(BASE, bases, None)
+            # `any`: what an element needs it looks for itself, and others may have theirs.
+            begun, runs = behind_runs(runs, queued, made)
+            numbers = array(RUN, runs, after_any(runs, queued | submitted))
+            array(EVALUATION, evaluations, after_each(numbers, len(evaluations)))
+            if begun:
+                array(EVALUATION, begun, after_any(begun, queued))
         return {name: number for name, number in (queued | submitted).items() if name in made}
 
     def _submit_array(self, name: str, tasks: list[Task], parameters: dict[str, Any]) -> list[str]:

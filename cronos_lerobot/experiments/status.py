@@ -13,8 +13,8 @@ from cronos_lerobot.experiments.display import duration
 from cronos_lerobot.experiments.jobs import RUNNING, STOPPED, Job, status
 from cronos_lerobot.experiments.progress import train_progress
 from cronos_lerobot.experiments.runner import DONE
-from cronos_lerobot.experiments.slurm import PENDING, SlurmError, slurm_folder, squeue
-from cronos_lerobot.experiments.submitted import read_submitted
+from cronos_lerobot.experiments.slurm import PENDING, slurm_folder, squeue
+from cronos_lerobot.experiments.submitted import SlurmError, read_submitted
 
 NOTES = ("base/*/*.job.json", "runs/*/*/seed*/*.job.json", "runs/*/*/seed*/eval/*.job.json")
 """Where the notes of jobs lie in a root."""
@@ -47,7 +47,11 @@ def _name(output: Path, root: Path) -> str:
 
 
 def make_status_table(root: Path) -> Table:
-    """A table of all jobs of a root that were started or are in the queue."""
+    """A table of all jobs of a root that were started or are in the queue.
+
+    Raises:
+        SlurmError: the note of what is in the queue is damaged.
+    """
     submitted = read_submitted(slurm_folder(root))
     try:
         queue = squeue() if submitted else {}

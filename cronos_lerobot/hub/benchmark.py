@@ -29,6 +29,8 @@ FRAMEWORK = "cronos-lerobot"
 """`evaluation_framework` of eval.yaml."""
 ENV_FILE = "env.py"
 """What LeRobot's EnvHub runs."""
+DATA = "configurations/*.parquet"
+"""What every benchmark has."""
 REPLACES = [f"{config}/*" for config in CONFIGS] + ["pictures/*"]
 """What a new version of a benchmark removes of the old one."""
 

@@ -43,9 +43,9 @@ def data_folder() -> Path:
     of that commit follow it there. In a clone or a dry run they lie beside it.
     """
     folder = Path(__file__).absolute().parent
-    if folder.parent.name != "snapshots":
+    kind, *name = folder.parents[min(1, len(folder.parents) - 1)].name.split("--")
+    if folder.parent.name != "snapshots" or kind not in ("models", "datasets") or not name:
         return folder
-    kind, *name = folder.parents[1].name.split("--")
     return Path(
         snapshot_download(
             "/".join(name),

@@ -115,8 +115,13 @@ def replaced(there: Iterable[str], patterns: Sequence[str]) -> list[str]:
     ]
 
 
-def check_holds(target: Target, file: str) -> None:
-    """Check that a repository is new, empty, or holds a file by which it is known to be what is pushed again.
+def check_holds(target: Target, known_by: Sequence[str], advice: str) -> None:
+    """Check that a repository is new, has no more than a card, or is known to be what is pushed again.
+
+    Args:
+        target: the repository.
+        known_by: patterns of files; it is if it holds one of them.
+        advice: what to do if it is not, for the error.
 
     Raises:
         PublishError: it holds something else, which a push would overwrite, or the Hub refused.
@@ -125,11 +130,11 @@ def check_holds(target: Target, file: str) -> None:
     with explained(target):
         if not api.repo_exists(target.repo_id, repo_type=target.repo_type):
             return
-        there = set(api.list_repo_files(target.repo_id, repo_type=target.repo_type)) - {".gitattributes"}
-    if there and file not in there:
+        files = api.list_repo_files(target.repo_id, repo_type=target.repo_type)
+    there = sorted(set(files) - {".gitattributes", "README.md"})
+    if there and not replaced(there, known_by):
         raise PublishError(
-            f"{target.repo_type} {target.repo_id} holds something else ({', '.join(sorted(there)[:3])}, ...):"
-            " choose another --repo_id, or --env_hub=false"
+            f"{target.repo_type} {target.repo_id} holds something else ({', '.join(there[:3])}, ...): {advice}"
         )
 
 

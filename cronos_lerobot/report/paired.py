@@ -192,11 +192,12 @@ class StudentSum:
     """
 
     def __init__(self, parts: Sequence[tuple[float, int]], is_weighted: bool) -> None:
-        variances = [variance for variance, _ in parts]
-        self.error = sqrt(sum(variances))
-        if not is_weighted:
-            parts = [(1.0, self.error**4 / sum(v * v / df for v, df in parts))]
-        self._weights, self._dfs = np.array(parts).T
+        variances, dfs = np.array(parts, float).T
+        self.error = sqrt(variances.sum())
+        if is_weighted:
+            self._weights, self._dfs = variances, dfs
+        else:
+            self._weights, self._dfs = np.ones(1), variances.sum() ** 2 / np.sum(variances**2 / dfs, keepdims=True)
 
     def quantile(self, tail: float) -> float:
         """The deviation, in its standard errors, beyond which this much of it lies on one side."""

@@ -39,11 +39,13 @@ from cronos_lerobot.scripts.subcommands import run_subcommand
 def publish_benchmark(config: BenchmarkConfig) -> None:
     """`cronos-publish benchmark`."""
     config.validate()
-    from cronos_lerobot.hub.benchmark import ENV_FILE, REPLACES, choose_benchmark, write_benchmark_repository
+    from cronos_lerobot.hub.benchmark import DATA, ENV_FILE, REPLACES, choose_benchmark, write_benchmark_repository
 
     if not config.dry_run:
+        # Benchmarks that were made otherwise have the data alone.
+        check_holds(config.target, (ENV_FILE, DATA), "choose another --repo_id")
         for target in config.targets[1:]:
-            check_holds(target, ENV_FILE)
+            check_holds(target, (ENV_FILE,), "choose another --repo_id, or --env_hub=false")
     # The data and what runs it are two repositories: one name for both, whatever their commits are called.
     benchmark = choose_benchmark(config)
     tag = f"benchmark-{benchmark.fingerprint}"

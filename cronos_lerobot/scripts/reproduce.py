@@ -19,7 +19,8 @@ from cronos_lerobot.experiments.flags import DROPS_CHECKPOINTS, RESERVED, join_f
 from cronos_lerobot.experiments.jobs import Job, is_done
 from cronos_lerobot.experiments.runner import usable_cores
 from cronos_lerobot.experiments.scales import OBS_NAMES, SCALES, STATE, base_recipe
-from cronos_lerobot.experiments.slurm import SlurmError, SlurmOptions
+from cronos_lerobot.experiments.slurm import SlurmOptions
+from cronos_lerobot.experiments.submitted import SlurmError
 from cronos_lerobot.scripts.launchers import (
     add_launcher_flags,
     finish,
@@ -298,7 +299,10 @@ def print_status(root: Path) -> None:
 
     from cronos_lerobot.experiments.status import make_status_table
 
-    table = make_status_table(root)
+    try:
+        table = make_status_table(root)
+    except SlurmError as error:
+        sys.exit(f"error: {error}")
     if not table.row_count:
         sys.exit(f"error: nothing was started in {root} yet")
     # Into a file or a narrow terminal whole lines are better than columns cut short.

@@ -1,6 +1,7 @@
 """What becomes of jobs in a cluster's queue, told by a made-up queue and the jobs' notes."""
 
 import json
+import signal
 import sys
 from dataclasses import replace
 
@@ -9,10 +10,11 @@ from tiny_jobs import Tape
 
 from cronos_lerobot.experiments import follow, status
 from cronos_lerobot.experiments.follow import Follower
-from cronos_lerobot.experiments.jobs import EVALUATION, Job, write_record
-from cronos_lerobot.experiments.slurm import Cluster, SlurmError, SlurmOptions, slurm_folder
-from cronos_lerobot.experiments.submitted import read_submitted
+from cronos_lerobot.experiments.jobs import BASE, EVALUATION, Job, made_by, write_record
+from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, slurm_folder
+from cronos_lerobot.experiments.submitted import SlurmError, read_submitted
 from cronos_lerobot.scripts import reproduce
+from cronos_lerobot.scripts.launchers import run_on_slurm
 
 
 class MadeUpCluster:
@@ -186,6 +188,102 @@ def test_what_is_in_the_queue_with_other_flags_is_refused(tmp_path, monkeypatch)
     jobs = [run_job(moved, name, "--algorithm.target_kl=0.01") for name in ("a", "b", "c")]
     assert cluster.submit(jobs, threads=1, parallel=None) == {"a": "5_0", "b": "2_1", "c": "2_2"}
     assert taken[-3:] == [[], [["a"]], []]
+
+
+def test_what_is_in_the_queue_keeps_its_time_limit_and_that_is_said(tmp_path, monkeypatch, capsys):
+    queue = {}
+    cluster, taken = cluster_of(tmp_path, monkeypatch, queue)
+    jobs = [run_job(tmp_path, name) for name in ("a", "b", "c")]
+    cluster.submit(jobs, threads=1, parallel=8)
+    queue |= dict.fromkeys(("2_1", "2_2"), ("PENDING", "Resources"))
+    assert cluster.submit(jobs, threads=1, parallel=8)["a"] == "5_0"
+    assert capsys.readouterr().out == ""
+    queue["5_0"] = ("RUNNING", "None")
+    cluster.options = SlurmOptions(time="2-00:00:00", mem="64G")
+    assert cluster.submit(jobs, threads=1, parallel=None) == {"a": "5_0", "b": "2_1", "c": "2_2"}
+    assert capsys.readouterr().out == (
+        "in the queue with --slurm.time=24:00:00, --jobs=8, no --slurm.mem, which they keep: 2_1 2_2 5_0\n"
+        "(scancel takes them out, and the same command submits them again)\n"
+    ).replace("2_1 2_2 5_0", "5_0 2_1 2_2")
+    assert taken[-3:] == [[], [], []]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_the_cluster_has_taken_is_remembered_if_somebody_interrupts(number, tmp_path, monkeypatch):
+    """As sbatch has answered, and before the second array."""
+    cluster, taken = cluster_of(tmp_path, monkeypatch, {})
+    monkeypatch.setattr("cronos_lerobot.scripts.launchers.Cluster", lambda folder, options: cluster)
+    submit_array = Cluster._submit_array
+
+    def interrupted(self, name, tasks, parameters):
+        made = submit_array(self, name, tasks, parameters)
+        if tasks:
+            signal.raise_signal(number)
+            # A program that is started now, as sbatch, does not hear what a terminal sends to all.
+            assert number in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+        return made
+
+    def interrupt(number, frame):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Cluster, "_submit_array", interrupted)
+    run = run_job(tmp_path, "a")
+    evaluation = replace(run_job(tmp_path, "a/eval"), needs=("a",), stage=EVALUATION)
+    before = signal.signal(number, interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt, match=f"--root={tmp_path}` shows them, `scancel 2` cancels them"):
+            run_on_slurm([run, evaluation], SlurmOptions(), tmp_path, threads=1, parallel=None)
+        assert signal.getsignal(number) is interrupt
+    finally:
+        signal.signal(number, before)
+    assert taken == [[], [["a"]]]
+    assert read_submitted(cluster.folder) == {"a": "2_0"}
+    assert number not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def test_what_needs_a_base_of_other_flags_is_not_submitted_and_is_blocked_at_once(tmp_path, monkeypatch, capsys):
+    clone = replace(run_job(tmp_path, "clone", "--steps=1"), stage=BASE)
+    clone.output.mkdir()
+    note(clone, "done", command=["cronos-train", "--steps=2", f"--output_dir={clone.output}"])
+    run = replace(run_job(tmp_path, "run"), needs=("clone",))
+    evaluation = replace(run_job(tmp_path, "run/eval"), needs=("run",), stage=EVALUATION)
+    # Of another machine, and its checkpoint stayed there.
+    came, done = run_job(tmp_path, "came"), replace(run_job(tmp_path, "done"), needs=("clone",))
+    for made in (came, done):
+        made.output.mkdir()
+        note(made, "done", made_by=made_by(made))
+    reads = replace(run_job(tmp_path, "came/eval"), needs=("came",), reads=(came.output / "checkpoints",))
+    cluster, taken = cluster_of(tmp_path, monkeypatch, {})
+    jobs = [clone, run, evaluation, came, done, reads, run_job(tmp_path, "own")]
+    submitted = cluster.submit(jobs, threads=1, parallel=None)
+    assert (submitted, taken) == ({"own": "2_0"}, [[], [["own"]], []])
+    monkeypatch.setattr(follow, "squeue", lambda: {"2_0": ("RUNNING", "None")})
+    follower = Follower(jobs[:-1], submitted, MadeUpCluster(), Tape())
+    assert follower.run() == {
+        "clone": "changed", "run": "blocked", "run/eval": "blocked", "came": "done", "done": "done",
+        "came/eval": "blocked",
+    }  # fmt: skip
+    assert ("came/eval", "missing") in follower.display.events
+
+
+def test_a_run_of_a_clone_in_the_queue_is_not_held_up(tmp_path, monkeypatch):
+    cluster, _ = cluster_of(tmp_path, monkeypatch, {})
+    clone = replace(run_job(tmp_path, "clone"), stage=BASE)
+    run = replace(run_job(tmp_path, "run"), needs=("clone",), reads=(clone.output / "checkpoints",))
+    cluster.submit([clone], threads=1, parallel=None)
+    monkeypatch.setattr("cronos_lerobot.experiments.slurm.squeue", lambda: {"1_0": ("RUNNING", "None")})
+    assert cluster.submit([clone, run], threads=1, parallel=None) == {"clone": "1_0", "run": "5_0"}
+
+
+def test_a_damaged_note_of_the_queue_is_named(tmp_path, monkeypatch, capsys):
+    cluster, _ = cluster_of(tmp_path, monkeypatch, {})
+    cluster.folder.mkdir()
+    for text in ("", "[]", '{"a": {"other": 1}}'):
+        (cluster.folder / "submitted.json").write_text(text)
+        with pytest.raises(SlurmError, match=r"submitted\.json is damaged"):
+            cluster.submit([run_job(tmp_path, "a")], threads=1, parallel=None)
+        with pytest.raises(SystemExit, match=r"error: .*submitted\.json is damaged"):
+            print_status(tmp_path, monkeypatch, capsys)
 
 
 def test_what_waits_for_a_queued_run_is_an_array_of_its_own(tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from cronos_lerobot.experiments.follow import Follower
 from cronos_lerobot.experiments.jobs import BASE, EVALUATION, RUN, Job, read_record, write_record
 from cronos_lerobot.experiments.runner import ENDING_SIGNALS
 from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, Task
-from cronos_lerobot.experiments.submitted import read_submitted
+from cronos_lerobot.experiments.submitted import SlurmError, read_submitted
 
 needs_slurm = pytest.mark.skipif(
     bool(missing()), reason=f"no Slurm here ({', '.join(missing())}): Debian has it in slurm-wlm and munge"
@@ -55,7 +55,8 @@ def cluster():
 def fast(monkeypatch):
     monkeypatch.setattr("cronos_lerobot.experiments.follow.POLL_S", 0.2)
     # A job that is being requeued is not in the queue for a moment; 4 s, where a user's run gives it 90.
-    monkeypatch.setattr("cronos_lerobot.experiments.follow.LATE_S", 4.0)
+    for module in ("follow", "slurm"):
+        monkeypatch.setattr(f"cronos_lerobot.experiments.{module}.LATE_S", 4.0)
     monkeypatch.setattr("cronos_lerobot.experiments.runner.POLL_S", 0.05)
 
 
@@ -165,6 +166,28 @@ def test_an_old_interruption_of_what_is_blocked_is_not_taken_for_a_signal(tmp_pa
     )
     with pytest.raises(RuntimeError, match="'bad': 'failed', 'blocked': 'blocked'"):
         Task([bad, blocked], [], 1, limit_s=60, grace_s=1)()
+
+
+def test_a_note_of_another_node_that_comes_late_is_waited_for(tmp_path, monkeypatch):
+    clone, run = job(tmp_path, "clone"), job(tmp_path, "run", "(out / 'x').touch()", needs=("clone",))
+    task = Task([run], [clone], 1, limit_s=60, grace_s=1)
+    looked = []
+
+    def sleep(seconds):
+        looked.append(seconds)
+        if len(looked) == 3:
+            monkeypatch.undo()
+            Task([clone], [], 1, limit_s=60, grace_s=1)()
+
+    monkeypatch.setattr("cronos_lerobot.experiments.slurm.time.sleep", sleep)
+    assert task() == {"run": "done"}
+    assert len(looked) == 3
+
+
+def test_a_path_that_slurm_would_read_as_its_own_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("shutil.which", lambda program: program)
+    with pytest.raises(SlurmError, match=r"a % in a path as its own: choose another --root than .*/a%j$"):
+        Cluster(tmp_path / "a%j/slurm", SlurmOptions())
 
 
 @needs_slurm

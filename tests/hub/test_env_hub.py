@@ -5,6 +5,8 @@ import re
 
 import pytest
 
+from cronos_lerobot.hub import env_file
+
 SMALL = ("--scene=playroom_2x2", "--num_configurations=2", "--num_orderings=2", "--chain_length=2",
          "--pictures=false")  # fmt: skip
 SAME = """
@@ -106,12 +108,19 @@ make_env("me/env_bench", trust_remote_code=True)
     assert "need the package lerobot_env_cronos: `pip install ./envs/lerobot_env_cronos`" in outcome.output
 
 
-def test_a_model_of_the_same_name_is_not_overwritten(hub, commands):
+def test_a_model_or_dataset_of_the_same_name_is_not_overwritten(hub, commands):
     commands.run("python", """
 from huggingface_hub import HfApi
 HfApi().create_repo("me/taken")
 HfApi().upload_file(path_or_fileobj=b"{}", path_in_repo="config.json", repo_id="me/taken")
+HfApi().create_repo("me/my_stream", repo_type="dataset")
+stream = dict(repo_id="me/my_stream", repo_type="dataset")
+HfApi().upload_file(path_or_fileobj=b"{}", path_in_repo="meta/info.json", **stream)
 """)  # fmt: skip
+    outcome = commands.try_("cronos-publish", "benchmark", "--repo_id=me/my_stream", *SMALL, "--seed=5")
+    assert outcome.code == 1
+    sentence = "dataset me/my_stream holds something else (meta/info.json, ...): choose another --repo_id\n"
+    assert sentence in outcome.output
     publish = ("cronos-publish", "benchmark", "--repo_id=me/taken", *SMALL, "--seed=5")
     outcome = commands.try_(*publish)
     assert outcome.code == 1
@@ -120,3 +129,9 @@ HfApi().upload_file(path_or_fileobj=b"{}", path_in_repo="config.json", repo_id="
     commands.run(*publish, "--env_hub=false")
     assert "env.py" in hub.tree("datasets", "me/taken")
     assert set(hub.tree("models", "me/taken")) == {"config.json"}
+
+
+def test_a_clone_below_a_folder_that_is_called_like_the_hubs_is_no_download(tmp_path, monkeypatch):
+    for folder in ("snapshots/bench", "a--b/snapshots/bench"):
+        monkeypatch.setattr(env_file, "__file__", str(tmp_path / folder / "env.py"))
+        assert env_file.data_folder() == tmp_path / folder
