@@ -7,30 +7,11 @@ import shutil
 import sys
 
 import pytest
-from synthetic_evaluations import BENCHMARK, write_evaluation
+from synthetic_evaluations import write_compared_run as write_run
+from synthetic_evaluations import write_evaluation
 from synthetic_runs import INSTRUCTIONS
 
 from cronos_lerobot.scripts import report
-
-
-def write_run(folder, seed, tasks, steps=10240, **changes):
-    """A run of cronos-train with one evaluation before and one after."""
-    folder.mkdir(parents=True)
-    lines = []
-    for step, strings in ((0, ["0" * len(tasks[0])] * len(tasks)), (steps, tasks)):
-        episodes = [[1000, number, c, int(x)] for number, line in enumerate(strings) for c, x in enumerate(line)]
-        line = {"kind": "evaluation", "interaction_steps": step, "interventions": 0, "split": "train"}
-        line |= {
-            "temperature": 0.6,
-            "per_task": {text: {} for text in INSTRUCTIONS[: len(tasks)]},
-            "episodes": episodes,
-        }
-        lines.append(json.dumps(line))
-    (folder / "metrics.jsonl").write_text("\n".join(lines))
-    config = {"seed": seed, "env": {"scene": "kitchen_2x2"}, "protocol": {"scene_reset_interval": 80} | changes}
-    start = {"config": config, "environment": BENCHMARK["environment"], "benchmark": BENCHMARK}
-    (folder / "manifest.json").write_text(json.dumps({"starts": [start]}))
-    return folder
 
 
 def compare(monkeypatch, *arguments):
