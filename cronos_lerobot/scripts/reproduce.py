@@ -95,17 +95,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--policy.path", dest="policy_path", metavar="PATH", help="base policy (default: make one)"
     )
-    for name, text in (
-        ("demos", "demonstrations that the base policy is cloned from"),
-        ("clone_steps", "gradient steps of the cloning"),
-        ("checkpoint", "the step of the cloning whose policy is taken: a quarter, half, 3/4 or all of them"),
-    ):
-        parser.add_argument(f"--base.{name}", dest=f"base_{name}", type=int, metavar="N", help=text)
-    parser.add_argument(
-        "--base.clean", dest="base_clean", nargs="?", const=True, default=False, type=parse_bool,
-        metavar="true|false",
-        help="clone it from demonstrations that go straight from home to success, as the paper's do",
-    )  # fmt: skip
+    add_base_flags(parser)
     parser.add_argument("--temperature", type=float, default=0.6, help="of every evaluation (default: 0.6)")
     parser.add_argument(
         "--root", type=Path, default=ROOT, help=f"holds base policies and runs, shared by all (default: {ROOT})"
@@ -122,6 +112,21 @@ def make_parser() -> argparse.ArgumentParser:
         )
     add_launcher_flags(parser)
     return parser
+
+
+def add_base_flags(parser: argparse.ArgumentParser) -> None:
+    """`--base.*`: how the base policy is made."""
+    for name, text in (
+        ("demos", "demonstrations that the base policy is cloned from"),
+        ("clone_steps", "gradient steps of the cloning"),
+        ("checkpoint", "the step of the cloning whose policy is taken: a quarter, half, 3/4 or all of them"),
+    ):
+        parser.add_argument(f"--base.{name}", dest=f"base_{name}", type=int, metavar="N", help=text)
+    parser.add_argument(
+        "--base.clean", dest="base_clean", nargs="?", const=True, default=False, type=parse_bool,
+        metavar="true|false",
+        help="clone it from demonstrations that go straight from home to success, as the paper's do",
+    )  # fmt: skip
 
 
 def parse_bool(text: str) -> bool:
