@@ -192,20 +192,24 @@ class StudentSum:
     """
 
     def __init__(self, parts: Sequence[tuple[float, int]], is_weighted: bool) -> None:
-        variances, dfs = np.array(parts, float).T
-        self.error = sqrt(variances.sum())
-        if is_weighted:
-            self._weights, self._dfs = variances, dfs
-        else:
-            self._weights, self._dfs = np.ones(1), variances.sum() ** 2 / np.sum(variances**2 / dfs, keepdims=True)
+        variance = sum(v for v, _ in parts)
+        self.error = sqrt(variance)
+        self._weights, self._dfs = np.array(parts, float).T
+        if not is_weighted:
+            satterthwaite = variance**2 / sum(v * v / df for v, df in parts)
+            self._weights, self._dfs = np.ones(1), np.array([satterthwaite])
 
     def quantile(self, tail: float) -> float:
         """The deviation, in its standard errors, beyond which this much of it lies on one side."""
+        if len(self._dfs) == 1:
+            return float(student_t.ppf(1 - tail, self._dfs[0]))
         return float(np.average(student_t.isf(tail, self._dfs), weights=self._weights))
 
     def p(self, deviation: float) -> float:
         """Two-sided, of a deviation in standard errors."""
         tails = student_t.sf(abs(deviation), self._dfs)
+        if len(tails) == 1:
+            return 2 * float(tails[0])
         # Between that of the part with the fewest and that of the one with the most degrees of freedom; rounded.
         low, high = max(float(tails.min()) * 0.999, LEAST), max(float(tails.max()) * 1.001, 2 * LEAST)
         return 2 * float(brentq(lambda tail: self.quantile(tail) - abs(deviation), low, high, xtol=LEAST))
