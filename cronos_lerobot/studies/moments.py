@@ -48,14 +48,16 @@ def compare_moments(runs: list[TrainingRun], before: int, after: int) -> str:
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("folders", nargs="+", type=Path, help="rows of cronos-reproduce: folders of seed?/train")
+    parser.add_argument("folders", nargs="+", type=Path, help="rows of cronos-reproduce, or one seed of a row")
     parser.add_argument("--steps", nargs=2, type=int, required=True, metavar="N", help="before and after")
     args = parser.parse_args()
     for folder in args.folders:
-        runs = [read_training_run(path) for path in sorted(folder.glob("seed*/train"))]
-        if not runs:
-            parser.error(f"{folder} has no seed*/train")
-        print(f"{folder.name}: {compare_moments(runs, *args.steps)}")
+        places = sorted([*folder.glob("seed*/train"), *folder.glob("train")])
+        if not places:
+            parser.error(f"{folder} has neither seed*/train nor train")
+        runs = [read_training_run(place) for place in places]
+        name = folder.name if len(runs) > 1 else f"{places[0].parents[1].name}/{places[0].parent.name}"
+        print(f"{name}: {compare_moments(runs, *args.steps)}")
 
 
 if __name__ == "__main__":

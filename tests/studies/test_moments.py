@@ -25,8 +25,9 @@ def test_the_same_trainings_before_and_after(tmp_path, monkeypatch, capsys):
 
 def test_one_run_is_one_policy_and_other_moments_are_refused(tmp_path, monkeypatch, capsys):
     write_compared_run(tmp_path / "row/seed1/train", 1, ["11111111"])
-    run_study(monkeypatch, tmp_path / "row", "--steps", 0, 10240)
+    run_study(monkeypatch, tmp_path / "row/seed1", "--steps", 0, 10240)
     # All eight configurations one way: 2 / 2^8. Wilson's of 0 and of 8 of 8 are .3244 wide: 1 - sqrt(2) x .3244.
-    assert capsys.readouterr().out == "row: 0.000 -> 1.000: +1.000 [+0.541, +1.000], p = 0.0078, of this policy\n"
+    line = "row/seed1: 0.000 -> 1.000: +1.000 [+0.541, +1.000], p = 0.0078, of this policy\n"
+    assert capsys.readouterr().out == line
     with pytest.raises(ValueError, match=r"after 5,120 steps, but after \[0, 10240\]"):
         run_study(monkeypatch, tmp_path / "row", "--steps", 0, 5120)
