@@ -172,8 +172,9 @@ def compare_trainings(pairs: Pairs, power: float) -> Difference | None:
     if configurations and trainings < both * (1 - 1e-9):
         estimates.append([(configurations, k - 1)])
     if not estimates:
-        p = sign_flip_p(pairs.whole_differences)
-        return Difference(value, None, p, f"{method}: nothing varies, so p is of these policies", None, None)
+        if value:
+            method += ": nothing varies, so p is of these policies"
+        return Difference(value, None, sign_flip_p(pairs.whole_differences) if value else None, method, None, None)
     are_few = len(pairs.a) != len(pairs.b) and min(map(len, sides)) == FEW
     method += " with Cochran's quantile" * are_few
     tests = [_t_test(value, StudentSum(one, are_few), power) for one in estimates]
