@@ -253,6 +253,8 @@ class Cluster:
                 f"Slurm reads a % in a path as its own: choose another --root than {self.folder.parent}"
             )
         self.logs = self.folder / "logs"
+        self.elements: dict[str, str] = {}
+        """The id of the element that has each job in the queue, by name, as far as `submit` has come."""
         self._submitit = submitit
 
     def submit(self, jobs: Sequence[Job], threads: int, parallel: int | None) -> dict[str, str]:
@@ -279,6 +281,7 @@ class Cluster:
             if text := other_options({name: what for name, what in in_queue.items() if name in made}, options):
                 print(text, flush=True)
             queued = {name: what.element for name, what in in_queue.items()}
+            self.elements = {name: element for name, element in queued.items() if name in made}
             waiting = to_be_made([job for job in jobs if job.name not in queued], queued)
             bases, runs, evaluations = plan_arrays(jobs, waiting)
             submitted: dict[str, str] = {}
@@ -300,6 +303,7 @@ class Cluster:
                         for name, number in submitted.items()
                     }
                     write_submissions(self.folder, known | new)
+                    self.elements |= submitted
                 return numbers
 
             array(BASE, bases, None)
@@ -309,7 +313,7 @@ class Cluster:
             array(EVALUATION, evaluations, after_each(numbers, len(evaluations)))
             if begun:
                 array(EVALUATION, begun, after_any(begun, queued))
-        return {name: number for name, number in (queued | submitted).items() if name in made}
+        return self.elements
 
     def _submit_array(self, name: str, tasks: list[Task], parameters: dict[str, Any]) -> list[str]:
         """Submit an array; returns its elements' ids.

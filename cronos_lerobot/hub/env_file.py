@@ -43,7 +43,7 @@ def data_folder() -> Path:
     of that commit follow it there. In a clone or a dry run they lie beside it.
     """
     folder = Path(__file__).absolute().parent
-    kind, *name = folder.parents[min(1, len(folder.parents) - 1)].name.split("--")
+    kind, *name = folder.parent.parent.name.split("--")
     if folder.parent.name != "snapshots" or kind not in ("models", "datasets") or not name:
         return folder
     return Path(

@@ -24,8 +24,7 @@ ALPHA = 0.05
 FEWEST = 6
 """Configurations with which p of the sign-flip test, at least 2 / 2**k, can come below ALPHA."""
 FEW = 2
-"""Trainings of a side of which Satterthwaite's degrees of freedom make too much: against one policy, up to .13 of
-the cases in which nothing differs would be told to differ."""
+"""Trainings of a side of which Satterthwaite's degrees of freedom make too much."""
 LEAST = 1e-300
 """A probability below which nobody would ask."""
 MOST = 10**7

@@ -8,10 +8,9 @@ from pathlib import Path
 
 from cronos_lerobot.experiments.display import make_display
 from cronos_lerobot.experiments.follow import Follower
-from cronos_lerobot.experiments.jobs import Job, is_done
+from cronos_lerobot.experiments.jobs import Job
 from cronos_lerobot.experiments.runner import DONE, Runner
 from cronos_lerobot.experiments.slurm import Cluster, SlurmOptions, slurm_folder
-from cronos_lerobot.experiments.submitted import read_submitted
 
 LAUNCHERS = ("local", "slurm")
 SLURM_FLAGS = {
@@ -89,20 +88,13 @@ def run_on_slurm(
         with make_display(jobs) as display:
             return Follower(jobs, submitted, cluster, display).run()
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(_how_to_come_back(jobs, root)) from None
-
-
-def _how_to_come_back(jobs: list[Job], root: Path) -> str:
-    """What to say after Ctrl-C, perhaps in the middle of submitting."""
-    noted = read_submitted(slurm_folder(root))
-    elements = [noted[job.name] for job in jobs if job.name in noted and not is_done(job)]
-    if not elements:
-        return "interrupted: the same command goes on from here"
-    arrays = " ".join(sorted({element.split("_")[0] for element in elements}, key=int))
-    return (
-        "the jobs go on in the queue: the same command follows them again,\n"
-        f"`cronos-reproduce status --root={root}` shows them, `scancel {arrays}` cancels them"
-    )
+        if not cluster.elements:
+            raise KeyboardInterrupt("interrupted: the same command goes on from here") from None
+        arrays = " ".join(sorted({element.split("_")[0] for element in cluster.elements.values()}, key=int))
+        raise KeyboardInterrupt(
+            "the jobs go on in the queue: the same command follows them again,\n"
+            f"`cronos-reproduce status --root={root}` shows them, `scancel {arrays}` cancels them"
+        ) from None
 
 
 def finish(states: dict[str, str]) -> bool:

@@ -14,6 +14,7 @@ import numpy as np
 from cronos_lerobot.report.compared_sides import paired_episodes, periodic_evaluation
 from cronos_lerobot.report.paired import Pairs, compare_policies, compare_trainings
 from cronos_lerobot.report.runs import TrainingRun, read_training_run
+from cronos_lerobot.scripts.errors import error_line
 
 
 def evaluation_at(run: TrainingRun, steps: int) -> int:
@@ -42,7 +43,8 @@ def compare_moments(runs: list[TrainingRun], before: int, after: int) -> str:
     rates = [" ".join(f"{rate:.3f}" for rate in side.mean(axis=1)) for side in lengths]
     interval = "" if found.ci95 is None else f" [{found.ci95[0]:+.3f}, {found.ci95[1]:+.3f}]"
     of = "trainings like these" if len(runs) > 1 else "this policy"
-    return f"{rates[0]} -> {rates[1]}: {found.value:+.3f}{interval}, p = {found.p:.2g}, of {of}"
+    p = "" if found.p is None else f", p = {found.p:.2g}"
+    return f"{rates[0]} -> {rates[1]}: {found.value:+.3f}{interval}{p}, of {of}"
 
 
 def main() -> None:
@@ -55,9 +57,9 @@ def main() -> None:
         places = sorted([*folder.glob("seed*/train"), *folder.glob("train")])
         if not places:
             parser.error(f"{folder} has neither seed*/train nor train")
-        runs = [read_training_run(place) for place in places]
-        name = folder.name if len(runs) > 1 else f"{places[0].parents[1].name}/{places[0].parent.name}"
-        print(f"{name}: {compare_moments(runs, *args.steps)}")
+        name = folder.name if len(places) > 1 else f"{places[0].parents[1].name}/{places[0].parent.name}"
+        with error_line():
+            print(f"{name}: {compare_moments([read_training_run(place) for place in places], *args.steps)}")
 
 
 if __name__ == "__main__":

@@ -52,15 +52,6 @@ def test_needs_come_first_and_done_jobs_are_skipped(tmp_path):
     assert read_record(needed)["command"] == list(needed.command)
 
 
-def test_a_folder_that_is_deleted_while_its_job_runs_fails_that_job_alone(tmp_path):
-    (tmp_path / "a").mkdir()
-    a = python_job(tmp_path / "a", "a", f"import shutil; time.sleep(0.3); shutil.rmtree({str(tmp_path / 'a')!r})")
-    b = python_job(tmp_path, "b", "time.sleep(0.6)")
-    states, _ = run([a, b], parallel=2)
-    assert states == {"a": "failed", "b": "done"}
-    assert (read_record(a)["status"], read_record(b)["status"]) == ("failed", "done")
-
-
 def test_as_many_at_a_time_as_asked(tmp_path):
     jobs = [python_job(tmp_path, name, "time.sleep(0.3)") for name in "abcde"]
     assert run(jobs[:2], parallel=1)[1].most == 1

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from tiny_jobs import Tape, python_job
+from tiny_jobs import Tape, python_job, run
 
 from cronos_lerobot.experiments.jobs import (
     Job,
@@ -201,3 +201,12 @@ def _raise_if_gone(pid):
     # A zombie that nobody has waited for yet is gone too.
     if f"{pid} (sleep) Z" in Path(f"/proc/{pid}/stat").read_text():
         raise ProcessLookupError
+
+
+def test_a_folder_that_is_deleted_while_its_job_runs_fails_that_job_alone(tmp_path):
+    (tmp_path / "a").mkdir()
+    a = python_job(tmp_path / "a", "a", f"import shutil; time.sleep(0.3); shutil.rmtree({str(tmp_path / 'a')!r})")
+    b = python_job(tmp_path, "b", "time.sleep(0.6)")
+    states, _ = run([a, b], parallel=2)
+    assert states == {"a": "failed", "b": "done"}
+    assert (read_record(a)["status"], read_record(b)["status"]) == ("failed", "done")

@@ -207,7 +207,7 @@ def test_two_trainings_against_one_policy_have_cochrans_quantile():
     assert parts.p(0.0) == pytest.approx(1)
 
 
-@pytest.mark.parametrize(("trainings", "most"), [(2, 26), (3, 32)])
+@pytest.mark.parametrize(("trainings", "most"), [(2, 26), (3, 34)])
 def test_level_of_several_trainings_against_one_policy(trainings, most):
     """Nothing differs: the one succeeds as often as the others do on average, in each of 64 configurations."""
     rng, rejected, runs = np.random.default_rng(9), 0, 300
@@ -220,7 +220,7 @@ def test_level_of_several_trainings_against_one_policy(trainings, most):
         sides = [(rng.random(p.shape) < p).astype(int) for p in (average[None], rates)]
         rejected += compare_trainings(Pairs(*sides, scenes), power=0.8).is_separated
     print(f"{trainings} trainings whose rates vary by some .1 against one policy: level {rejected / runs:.3f}")
-    # Of 300 with 5 %, 3 standard deviations above 15 are 26.3; of three trainings the level is up to .07, 32.
+    # Of 300 with 5 %, 3 standard deviations above 15 are 26.3; of three trainings the level is some .07: 34.
     assert rejected <= most
 
 

@@ -29,5 +29,12 @@ def test_one_run_is_one_policy_and_other_moments_are_refused(tmp_path, monkeypat
     # All eight configurations one way: 2 / 2^8. Wilson's of 0 and of 8 of 8 are .3244 wide: 1 - sqrt(2) x .3244.
     line = "row/seed1: 0.000 -> 1.000: +1.000 [+0.541, +1.000], p = 0.0078, of this policy\n"
     assert capsys.readouterr().out == line
-    with pytest.raises(ValueError, match=r"after 5,120 steps, but after \[0, 10240\]"):
+    with pytest.raises(SystemExit, match=r"error: .*after 5,120 steps, but after \[0, 10240\]"):
         run_study(monkeypatch, tmp_path / "row", "--steps", 0, 5120)
+
+
+def test_where_nothing_changes_there_is_no_p(tmp_path, monkeypatch, capsys):
+    for seed in (1, 2):
+        write_compared_run(tmp_path / f"row/seed{seed}/train", seed, ["0000"])
+    run_study(monkeypatch, tmp_path / "row", "--steps", 0, 10240)
+    assert capsys.readouterr().out == "row: 0.000 0.000 -> 0.000 0.000: +0.000, of trainings like these\n"
