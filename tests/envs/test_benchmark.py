@@ -1,18 +1,15 @@
-"""Benchmarks of one's own: files, their checks, and the environments that run them."""
-
-import json
+"""Your own benchmarks: files, their checks, and the environments that run them."""
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
-from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, get_scene, load_benchmark
+from env_rollouts import STATE
+from lerobot_env_cronos import CronosEnvConfig, get_scene, load_benchmark
 from lerobot_env_cronos.benchmark.benchmark import draw_benchmark, packaged_benchmark
-from lerobot_env_cronos.benchmark.configurations import SEED, SPLITS, load_configurations
 from lerobot_env_cronos.benchmark.files import BenchmarkError, read_benchmark, write_benchmark
+from lerobot_env_cronos.benchmark.poses import are_same
 
-STATE = "environment_state_agent_pos"
 # A change of these is another benchmark: a new version of the environment id.
 FINGERPRINTS = {
     "kitchen_2x2": "b6d16e60c5a22994",
@@ -33,15 +30,6 @@ def mine(tmp_path_factory):
 @pytest.mark.parametrize("scene", FINGERPRINTS)
 def test_the_packages_benchmark_is_frozen(scene):
     assert packaged_benchmark(scene).fingerprint == FINGERPRINTS[scene]
-
-
-@pytest.mark.parametrize(("scene", "independent"), [("kitchen_2x2", 256), ("kitchen_3x3", 576)])
-def test_sizes_of_the_packages_benchmark(scene, independent):
-    benchmark = packaged_benchmark(scene)
-    for split in ("train", "held_out"):
-        assert benchmark.size("independent", split) == independent
-        assert benchmark.size("sequential", split) == 640
-        np.testing.assert_array_equal(benchmark.configurations[split], load_configurations(scene, split))
 
 
 @pytest.mark.parametrize("scene", ["kitchen_2x2", "kitchen_3x3"])
@@ -68,26 +56,12 @@ def test_the_fingerprint_is_of_poses_and_chains():
     assert len({drawn.fingerprint, *(other.fingerprint for other in others)}) == 4
 
 
-@pytest.mark.parametrize("seed", [7, SEED])
-def test_each_split_and_the_orderings_are_drawn_by_themselves(seed):
-    """Whatever is asked for, a seed's first configurations and chains are the same, and nobody else's."""
-    few, many = (draw_benchmark("kitchen_2x2", seed, number, num_orderings=4) for number in (4, 8))
-    for split in SPLITS:
-        np.testing.assert_array_equal(many.configurations[split][:4], few.configurations[split])
-        chains = [[group.tasks for group in drawn.sequential[split]] for drawn in (few, many)]
-        assert chains[0] == chains[1]
-    known = [*many.configurations.values(), *packaged_benchmark("kitchen_2x2").configurations.values()]
-    first = np.concatenate(known)[:, 0, 0]
-    assert len(set(first)) == len(first) == 8 + 8 + 64 + 64
-
-
-def test_what_cannot_be_drawn():
-    # 4 tasks have 12 orderings of two.
+@pytest.mark.parametrize("wrong", [{"num_orderings": 13, "chain_length": 2}, {"chain_length": 5}])
+def test_what_cannot_be_drawn(wrong):
+    """4 tasks have 12 orderings of two."""
     assert draw_benchmark("kitchen_2x2", 0, 1, num_orderings=12, chain_length=2).size("sequential", "train") == 12
-    with pytest.raises(ValueError, match=r"num_orderings must be 1 to 12, .*got 13"):
-        draw_benchmark("kitchen_2x2", 0, 1, num_orderings=13, chain_length=2)
-    with pytest.raises(ValueError, match=r"chain_length must be 1 to 4, .*got 5"):
-        draw_benchmark("kitchen_2x2", 0, 1, chain_length=5)
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        draw_benchmark("kitchen_2x2", 0, 1, **wrong)
 
 
 def test_drawn_chains_are_balanced_and_no_part_of_the_training_cycle():
@@ -128,105 +102,125 @@ def change(folder, file, row, **values):
 
 
 ROWS = [
-    ("sequential/held_out", 4, {"instructions": ["put the spoon on the carpet"] * 3},
-     r"held_out, row 4: unknown task 'put the spoon on the carpet' of playroom_2x2; valid tasks: .*bear"),
-    ("independent/train", 2, {"instruction": "put the ketchup bottle on the carpet"},
-     r"independent/train, row 2: unknown task 'put the ketchup bottle"),
-    ("independent/train", 1, {"object": "spoon"}, r"row 1: unknown object 'spoon'; valid ones: \['toy bear', "),
-    ("independent/train", 1, {"receptacle": "plate"}, r"row 1: unknown receptacle 'plate'; valid ones: \['newsp"),
-    ("independent/train", 1, {"object": "plastic bottle"}, r"row 1: instruction is 'put the toy bear .*'plastic "),
-    ("sequential/train", 5, {"environment": "lerobot_env_cronos/playroom_2x2-v0"},
-     r"me/mine@abc, sequential/train, row 5, was made with lerobot_env_cronos/playroom_2x2-v0; this is version 1,"
-     r" whose physics and success test differ: publish it anew, or use it with cronos-lerobot 0.1"),
-    ("configurations/train", 1, {"environment": "lerobot_env_cronos/attic_9x9-v1"},
-     r"configurations/train, row 1: unknown scene 'attic_9x9'; valid scenes: \['kitchen_2x2'"),
-    ("configurations/train", 1, {"environment": "lerobot_env_cronos/kitchen_2x2-v1"},
-     r"row 1: environment is lerobot_env_cronos/kitchen_2x2-v1, other rows have .*playroom_2x2-v1"),
-    ("configurations/train", 0, {"environment": "playroom"}, r"row 0, does not say which version of the environ"),
-    ("configurations/train", 2, {"configuration": 7}, r"row 2: configuration must be 2, .*got 7"),
-    ("configurations/held_out", 2, {"toy_bear_x_m": 0.9}, r"held_out, row 2: the toy bear at \[0.9, .*out of the"),
-    ("configurations/train", 2, {"carpet_z_m": -0.2}, r"row 2: the carpet must be between the table .*z = -0.2 m"),
-    ("configurations/train", 2, {"carpet_qw": 3.0}, r"row 2: the carpet has a quaternion of length"),
-    ("configurations/train", 2, {"carpet_y_m": float("nan")}, r"row 2: the carpet has a pose that is not finite"),
-    ("configurations/train", 2, {"carpet_y_m": None}, r"row 2: carpet_y_m must be of type float, got None"),
-    ("independent/held_out", 3, {"configuration": 3}, r"row 3: configuration must be 0 to 2, got 3"),
-    ("independent/held_out", 3, {"window_steps": 100}, r"row 3: window_steps must be 80, got 100"),
-    ("independent/held_out", 3, {"task": 0}, r"row 3: task 0 is \[.*\] here and \[.*\] in an earlier row"),
-    ("independent/held_out", 2, {"configuration": 1}, r"row 2: task 0 starts from configuration 1 a second time"),
-    ("sequential/held_out", 0, {"instructions": []}, r"row 0: a chain needs a task"),
-]  # fmt: skip
+    ("sequential/held_out", 4, {"instructions": ["put the spoon on the carpet"] * 3}, "held_out, row 4.*spoon"),
+    ("independent/train", 2, {"instruction": "put the ketchup bottle on the carpet"}, "train, row 2.*ketchup"),
+    ("sequential/train", 5, {"environment": "lerobot_env_cronos/playroom_2x2-v0"}, "environment.*v0"),
+    ("configurations/train", 1, {"environment": "lerobot_env_cronos/kitchen_2x2-v1"}, "environment"),
+    ("configurations/train", 2, {"configuration": 7}, "row 2: configuration"),
+    ("configurations/held_out", 2, {"toy_bear_x_m": 0.9}, "held_out, row 2: the toy bear"),
+    ("configurations/train", 2, {"carpet_z_m": -0.2}, "row 2: the carpet"),
+    ("configurations/train", 2, {"carpet_qw": 3.0}, "row 2: the carpet"),
+    ("configurations/train", 2, {"carpet_y_m": float("nan")}, "row 2: the carpet"),
+    ("configurations/train", 2, {"carpet_y_m": None}, "carpet_y_m"),
+    ("independent/held_out", 3, {"configuration": 3}, "row 3: configuration"),
+    ("independent/held_out", 3, {"window_steps": 100}, "row 3: window_steps"),
+    ("independent/held_out", 3, {"task": 0}, "row 3: task 0"),
+    ("independent/held_out", 2, {"configuration": 1}, "row 2: task 0 starts from configuration 1"),
+    ("sequential/held_out", 0, {"instructions": []}, "other tasks"),
+]
 
 
 @pytest.mark.parametrize(("file", "row", "values", "message"), ROWS)
 def test_a_bad_row_is_named(file, row, values, message, mine, tmp_path):
     write_benchmark(mine[0], tmp_path)
     change(tmp_path, file, row, **values)
-    with pytest.raises(BenchmarkError, match=message):
+    with pytest.raises(BenchmarkError, match=f"me/mine@abc, .*{message}"):
         read_benchmark(tmp_path, "me/mine@abc")
+
+
+@pytest.mark.parametrize("environment", ["lerobot_env_cronos/playroom_2x2-v0", "lerobot_env_cronos/attic-v1", "x"])
+def test_a_benchmark_of_no_scene_is_refused(environment, mine, tmp_path):
+    write_benchmark(mine[0], tmp_path)
+    for path in tmp_path.glob("*/*.parquet"):
+        table = pq.read_table(path)
+        column = pa.array([environment] * len(table))
+        pq.write_table(table.set_column(table.column_names.index("environment"), "environment", column), path)
+    with pytest.raises(BenchmarkError, match=environment.rpartition("/")[2].removesuffix("-v1")):
+        read_benchmark(tmp_path, "it")
 
 
 def test_chains_of_different_lengths(mine, tmp_path):
     write_benchmark(mine[0], tmp_path)
     for row in (3, 4, 5):
         change(tmp_path, "sequential/train", row, instructions=["put the toy bear on the carpet"])
-    with pytest.raises(BenchmarkError, match="row 3: a chain of 1 tasks; in earlier rows they have 3"):
+    with pytest.raises(BenchmarkError, match=r"one length.*\[1, 3\]"):
         read_benchmark(tmp_path, "it")
 
 
-def test_splits_of_different_tasks_or_lengths(mine, tmp_path):
-    write_benchmark(mine[0], tmp_path / "tasks")
-    path = tmp_path / "tasks/independent/held_out.parquet"
-    table = pq.read_table(path)
-    pq.write_table(table.filter(pc.field("task") != 3), path)
-    with pytest.raises(BenchmarkError, match=r"independent/held_out: tasks .*; those of the training split are"):
-        read_benchmark(tmp_path / "tasks", "it")
-    write_benchmark(mine[0], tmp_path / "chains")
-    path = tmp_path / "chains/sequential/held_out.parquet"
-    rows = pq.read_table(path)
-    shorter = [row | {"instructions": row["instructions"][:2]} for row in rows.to_pylist()]
-    pq.write_table(pa.Table.from_pylist(shorter, schema=rows.schema), path)
-    with pytest.raises(BenchmarkError, match=r"sequential/held_out: chains of \[2\] tasks; those .* have \[3\]"):
-        read_benchmark(tmp_path / "chains", "it")
+HOSTILE = {
+    # Files of kilobytes that hold gigabytes.
+    "rows": lambda table: repeat_row(table, 1_000_000),
+    "a text": lambda table: repeat_row(table, 50_000, "x" * 1_000_000),
+    "metadata": lambda table: table.replace_schema_metadata({"lerobot_env_cronos.bodies": "[" * 900_000}),
+    "nested metadata": lambda table: table.replace_schema_metadata({"lerobot_env_cronos.bodies": "[" * 100_000}),
+    "columns": lambda table: pa.table(
+        {name: table.column(name) for name in table.column_names}
+        | {f"nobody_{i}_x_m": pa.array([0.0] * len(table)) for i in range(11_000)}
+    ),
+}
 
 
-def test_chains_of_different_lengths_whichever_ordering_comes_first(mine, tmp_path):
+def repeat_row(table, number, text=None):
+    """A table of one row, many times, stored as a dictionary."""
+    first = {name: table.column(name).slice(0, 1).combine_chunks() for name in table.column_names}
+    if text is not None:
+        first["environment"] = pa.array([text])
+    indices = pa.array(np.zeros(number, dtype=np.int32))
+    return pa.table({name: pa.DictionaryArray.from_arrays(indices, value) for name, value in first.items()})
+
+
+@pytest.mark.parametrize("what", HOSTILE)
+def test_a_small_file_that_holds_gigabytes_is_refused_in_a_short_message(what, mine, tmp_path):
     write_benchmark(mine[0], tmp_path)
-    for row in (0, 1, 2):
-        change(tmp_path, "sequential/train", row, ordering=1)
-    for row in (3, 4, 5):
-        change(tmp_path, "sequential/train", row, ordering=0, instructions=["put the toy bear on the carpet"])
-    with pytest.raises(BenchmarkError, match="row 3: a chain of 1 tasks; in earlier rows they have 3"):
+    path = tmp_path / "configurations/train.parquet"
+    pq.write_table(HOSTILE[what](pq.read_table(path)), path, compression="zstd")
+    assert path.stat().st_size < 4e6
+    before = pa.default_memory_pool().max_memory()
+    with pytest.raises(BenchmarkError) as raised:
+        read_benchmark(tmp_path, "it")
+    assert len(str(raised.value)) < 1000
+    assert pa.default_memory_pool().max_memory() < before + 1e8
+
+
+def test_a_list_of_very_many_values_is_refused(mine, tmp_path):
+    write_benchmark(mine[0], tmp_path)
+    path = tmp_path / "sequential/train.parquet"
+    table, number = pq.read_table(path).slice(0, 1), 5_000_000
+    texts = pa.DictionaryArray.from_arrays(pa.array(np.zeros(number, np.int8)), pa.array(["put the toy bear"]))
+    chain = pa.ListArray.from_arrays(pa.array([0, number], pa.int32()), texts)
+    pq.write_table(table.set_column(table.column_names.index("instructions"), "instructions", chain), path)
+    with pytest.raises(BenchmarkError, match="too large"):
+        read_benchmark(tmp_path, "it")
+
+
+def test_columns_that_are_not_needed_are_not_read(mine, tmp_path):
+    write_benchmark(mine[0], tmp_path)
+    path = tmp_path / "independent/train.parquet"
+    table = pq.read_table(path)
+    large = pa.DictionaryArray.from_arrays(pa.array([0] * len(table)), pa.array(["x" * 10_000_000]))
+    pq.write_table(table.append_column("note", large), path, compression="zstd")
+    assert read_benchmark(tmp_path, "it").fingerprint == mine[0].fingerprint
+
+
+def test_held_out_configurations_are_held_out(mine, tmp_path):
+    write_benchmark(mine[0], tmp_path)
+    same = pq.read_table(tmp_path / "configurations/train.parquet").to_pylist()[2] | {"configuration": 1}
+    change(tmp_path, "configurations/held_out", 1, **same)
+    with pytest.raises(BenchmarkError, match=r"held_out, row 1.*training configuration 2"):
         read_benchmark(tmp_path, "it")
 
 
 @pytest.mark.parametrize(
-    ("moved_m", "turned_rad", "sign", "is_same"),
-    [
-        (0, 0, 1, True),
-        (1e-9, 0, 1, True),
-        (0, 0, -1, True),
-        (0.004, 0.08, -1, True),
-        (0.006, 0, 1, False),
-        (0, 0.1, 1, False),
-    ],
+    ("moved_m", "turned_rad", "sign", "same"),
+    [(0, 0, 1, True), (0, 0, -1, True), (0.004, 0.08, -1, True), (0.006, 0, 1, False), (0, 0.1, 1, False)],
 )
-def test_held_out_configurations_are_held_out(moved_m, turned_rad, sign, is_same, mine, tmp_path):
-    write_benchmark(mine[0], tmp_path)
-    same = pq.read_table(tmp_path / "configurations/train.parquet").to_pylist()[2]
-    same |= {"configuration": 1, "toy_bear_x_m": same["toy_bear_x_m"] + moved_m}
-    quaternion = np.array([same[f"carpet_q{axis}"] for axis in "wxyz"])
-    turned = sign * np.array([np.cos(turned_rad / 2), 0, 0, np.sin(turned_rad / 2)])
-    # A turn about z after `quaternion`, which is one about z, too.
-    w, z = (
-        quaternion[0] * turned[0] - quaternion[3] * turned[3],
-        quaternion[0] * turned[3] + quaternion[3] * turned[0],
-    )
-    change(tmp_path, "configurations/held_out", 1, **same | {"carpet_qw": w, "carpet_qz": z})
-    if is_same:
-        with pytest.raises(BenchmarkError, match="held_out, row 1: the same as training configuration 2"):
-            read_benchmark(tmp_path, "it")
-    else:
-        read_benchmark(tmp_path, "it")
+def test_configurations_are_the_same_within_5_mm_and_5_degrees(moved_m, turned_rad, sign, same):
+    """A quaternion and its negative are one orientation."""
+    pose = np.array([[[0.3, 0.1, 0.02, 1.0, 0, 0, 0], [0.2, 0.0, 0.02, 1.0, 0, 0, 0]]])
+    other = pose.copy()
+    other[0, 1, 0] += moved_m
+    other[0, 1, 3:] = sign * np.array([np.cos(turned_rad / 2), 0, 0, np.sin(turned_rad / 2)])
+    assert are_same(pose, other).tolist() == [[same]]
 
 
 def test_bodies_that_stand_in_one_another_are_refused(mine, tmp_path):
@@ -250,21 +244,21 @@ def test_missing_and_unknown_columns_and_files(mine, tmp_path):
     write_benchmark(mine[0], tmp_path)
     path = tmp_path / "configurations/train.parquet"
     table = pq.read_table(path)
-    pq.write_table(table.rename_columns([name.replace("toy_bear", "robot") for name in table.column_names]), path)
-    with pytest.raises(BenchmarkError, match=r"columns \['toy_bear_x_m', .* are missing"):
-        read_benchmark(tmp_path, "it")
-    pq.write_table(table.append_column("spoon_x_m", pa.array([0.1] * 3)), path)
-    with pytest.raises(
-        BenchmarkError, match=r"column 'spoon_x_m' is of no body of playroom_2x2; its bodies: \['toy"
-    ):
-        read_benchmark(tmp_path, "it")
-    path.write_text(json.dumps({"not": "parquet"}))
-    with pytest.raises(BenchmarkError, match="configurations/train: not a parquet file"):
+    wrong = {
+        "toy_bear_x_m": table.drop_columns("toy_bear_x_m"),
+        "spoon_x_m": table.append_column("spoon_x_m", pa.array([0.1] * 3)),
+        "configuration": table.drop_columns("configuration"),
+        "1 to": table.slice(0, 0),
+    }
+    for named, changed in wrong.items():
+        pq.write_table(changed, path)
+        with pytest.raises(BenchmarkError, match=f"configurations/train.*{named}"):
+            read_benchmark(tmp_path, "it")
+    path.write_text("not parquet")
+    with pytest.raises(BenchmarkError, match="configurations/train"):
         read_benchmark(tmp_path, "it")
     path.unlink()
-    with pytest.raises(
-        BenchmarkError, match=r"it, configurations/train: there is no configurations/train.parquet"
-    ):
+    with pytest.raises(BenchmarkError, match=r"configurations/train\.parquet"):
         read_benchmark(tmp_path, "it")
 
 
@@ -274,10 +268,9 @@ def test_missing_and_unknown_columns_and_files(mine, tmp_path):
 def test_the_scene_follows_from_the_benchmark(mine):
     _, folder = mine
     assert CronosEnvConfig(benchmark=str(folder), obs_type=STATE).scene == "playroom_2x2"
-    with pytest.raises(ValueError, match="is of playroom_2x2, not of kitchen_3x3"):
-        CronosEnvConfig(benchmark=str(folder), scene="kitchen_3x3", obs_type=STATE)
-    with pytest.raises(ValueError, match="no benchmark 'no folder': expected <owner>"):
-        CronosEnvConfig(benchmark="no folder")
+    for wrong in ({"benchmark": str(folder), "scene": "kitchen_3x3"}, {"benchmark": "no folder"}):
+        with pytest.raises(ValueError, match="benchmark"):
+            CronosEnvConfig(**wrong)
 
 
 @pytest.mark.parametrize("suite", ["independent", "sequential"])
@@ -306,15 +299,5 @@ def test_one_task_or_ordering_by_name(mine):
     config = CronosEnvConfig(**options, task="put the toy bear on the carpet")
     assert len(config.create_envs(1)["independent_train"]) == 1
     assert list(CronosEnvConfig(**options, suite="sequential", task="1").create_envs(1)["sequential_train"]) == [1]
-    with pytest.raises(ValueError, match=r"unknown ordering '2' of .*; valid orderings: \['0', '1'\]"):
+    with pytest.raises(ValueError, match="ordering '2'"):
         CronosEnvConfig(**options, suite="sequential", task="2")
-
-
-def test_streams_are_reset_to_its_configurations(mine):
-    benchmark, folder = mine
-    env = CronosVectorEnv(5, "playroom_2x2", obs_type=STATE, benchmark=str(folder))
-    env.reset(seed=1)
-    expected = benchmark.configurations["train"][[1, 2, 0, 1, 2], 0, :2]
-    np.testing.assert_allclose(env.simulation.body_pose("toy bear")[:, :2], expected, atol=2e-3)
-    with pytest.raises(ValueError, match=r"configurations must be 0 to 2 of train, benchmark .*got \[3\]"):
-        env.scene_reset(np.array([0]), np.array([3]))

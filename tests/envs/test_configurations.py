@@ -1,25 +1,28 @@
-"""The frozen benchmark configurations."""
+"""The frozen benchmark configurations: golden bytes; bodies lie apart, in view, within reach, and stay."""
 
 import hashlib
 import itertools
+import sys
 from importlib import resources
 
 import numpy as np
 import pytest
-from lerobot_env_cronos import SCENES, CronosVectorEnv, get_scene
-from lerobot_env_cronos.benchmark import configurations
+from env_rollouts import keep_still, make
+from lerobot_env_cronos import SCENES, get_scene
+from lerobot_env_cronos.benchmark import freeze
 from lerobot_env_cronos.benchmark.configurations import (
     CLEARANCE_M,
-    OBJECT_YAWS,
-    SEED,
     SPLITS,
     footprint_corners,
     footprint_gap,
     load_configurations,
-    sample_configuration,
-    sample_place,
 )
+from lerobot_env_cronos.scene.robot import HOME_QPOS
+from lerobot_env_cronos.scene.scenes import BODIES
+from lerobot_env_cronos.scene.view import is_in_view
+from lerobot_env_cronos.simulation.kinematics import forward_kinematics, inverse_kinematics
 
+DATA = resources.files("lerobot_env_cronos").joinpath("data")
 # A change of these is a new version of the environment id.
 GOLDEN_SHA256 = {
     "kitchen_2x2": "f08ab525b109e4c28d902d29b98175eb1caf1fa9bb51cce9f28fa228bed3cf7d",
@@ -30,57 +33,23 @@ GOLDEN_SHA256 = {
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_data_is_frozen(scene):
-    data = resources.files("lerobot_env_cronos").joinpath(f"data/{scene}.json").read_bytes()
-    assert hashlib.sha256(data).hexdigest() == GOLDEN_SHA256[scene]
+    assert hashlib.sha256(DATA.joinpath(f"{scene}.json").read_bytes()).hexdigest() == GOLDEN_SHA256[scene]
 
 
-def test_a_seed_draws_what_is_frozen():
-    """Poses are rounded in the file, as they are drawn."""
-    scene = get_scene("playroom_2x2")
-    drawn = np.random.default_rng(SEED)
-    frozen = np.concatenate([load_configurations(scene.name, split) for split in SPLITS])
-    again = [sample_configuration(scene, drawn).round(6) for _ in range(len(frozen))]
-    np.testing.assert_array_equal(again, frozen)
-
-
-def test_places_are_those_of_a_look_at_each_in_turn(monkeypatch):
-    """Among six carpets, and among nine, where there is none: as many are drawn as it takes."""
-    monkeypatch.setattr(configurations, "MAX_ATTEMPTS", 700)
-    scene, body = get_scene("kitchen_3x3"), "kitchen shovel"
-    middles = np.array([[x, y] for x in (0.17, 0.295, 0.42) for y in (-0.15, 0.0, 0.15)])
-    others = [footprint_corners("carpet", xy, 0.0) for xy in middles]
-
-    def one_by_one(others, rng):
-        for _ in range(700):
-            xy, yaw = rng.uniform(scene.spawn_low, scene.spawn_high), rng.choice(OBJECT_YAWS)
-            if all(footprint_gap(footprint_corners(body, xy, yaw), o) > CLEARANCE_M for o in others):
-                return xy
-        return None
-
-    for seed in range(3):
-        mine, theirs = np.random.default_rng(seed), np.random.default_rng(seed)
-        for _ in range(2):
-            pose, _ = sample_place(scene, body, others[:6], mine)
-            np.testing.assert_array_equal(pose[:2], one_by_one(others[:6], theirs))
-    with pytest.raises(RuntimeError, match="no free place for the kitchen shovel among 9 bodies"):
-        sample_place(scene, body, others, mine)
-    assert one_by_one(others, theirs) is None
-    assert mine.random() == theirs.random()
+@pytest.mark.parametrize(("what", "packaged"), [("configurations", "{}.json"), ("orderings", "orderings/{}.json")])
+def test_the_command_draws_what_is_frozen(tmp_path, monkeypatch, what, packaged):
+    monkeypatch.setattr(sys, "argv", ["freeze", what, "playroom_2x2", f"--output={tmp_path}"])
+    freeze.main()
+    path = tmp_path / "playroom_2x2.json"
+    assert path.read_bytes() == DATA.joinpath(packaged.format("playroom_2x2")).read_bytes()
 
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_splits_have_64_configurations_and_share_none(scene):
     train, held_out = (load_configurations(scene, split) for split in SPLITS)
-    n = len(get_scene(scene).bodies)
-    assert train.shape == held_out.shape == (64, n, 7)
-    distance = np.abs(train[:, None] - held_out[None]).max(axis=(2, 3))
-    assert distance.min() > 0.01
+    assert train.shape == held_out.shape == (64, len(get_scene(scene).bodies), 7)
+    assert np.abs(train[:, None] - held_out[None]).max(axis=(2, 3)).min() > 0.01
     assert len(np.unique(train.reshape(64, -1), axis=0)) == 64
-
-
-def test_unknown_split_names_the_valid_ones():
-    with pytest.raises(ValueError, match=r"'test'.*train.*held_out"):
-        load_configurations("kitchen_2x2", "test")
 
 
 def test_footprint_gap_by_hand():
@@ -96,17 +65,39 @@ def test_footprint_gap_by_hand():
 
 @pytest.mark.parametrize("split", SPLITS)
 @pytest.mark.parametrize("scene", SCENES)
-def test_no_two_bodies_touch_and_all_stay_where_they_are(scene, split):
-    poses = load_configurations(scene, split)
-    bodies = get_scene(scene).bodies
+def test_doing_nothing_moves_nothing_and_completes_nothing(scene, split):
+    poses, bodies = load_configurations(scene, split), get_scene(scene).bodies
     for configuration in poses:
         yaws = 2 * np.arctan2(configuration[:, 6], configuration[:, 3])
         corners = [footprint_corners(b, configuration[i, :2], yaws[i]) for i, b in enumerate(bodies)]
         assert min(footprint_gap(a, b) for a, b in itertools.combinations(corners, 2)) > CLEARANCE_M - 1e-4
-    env = CronosVectorEnv(64, scene, obs_type="environment_state_agent_pos")
+    env = make(64, scene)
     env.scene_reset(np.arange(64), np.arange(64), split)
-    still = np.tile([0, 0, 0, 0, 0, 0, 1.0], (64, 1))
-    for _ in range(10):
-        env.step(still)
+    keep_still(env, 20)
     assert np.abs(env.simulation.body_poses() - poses)[..., :3].max() < 2e-3
-    assert not env.is_success.any()
+    assert np.abs(env.simulation.qvel[:, 8:]).max() < 1e-6
+    assert not env.find_complete(env.scene.tasks).any()
+    assert not env.unsuitable_bodies().any()
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_every_body_is_in_the_picture_and_in_reach(scene):
+    poses = np.concatenate([load_configurations(scene, split) for split in SPLITS])
+    for i, name in enumerate(SCENES[scene].bodies):
+        yaws = 2 * np.arctan2(poses[:, i, 6], poses[:, i, 3])
+        corners = np.stack([footprint_corners(name, p[:2], yaw) for p, yaw in zip(poses[:, i], yaws)])
+        for height in (0.0, BODIES[name].size[2]):
+            assert is_in_view(np.concatenate([corners, np.full((*corners.shape[:2], 1), height)], -1)).all()
+    # A hand that points down and across the line to the robot, just above every body.
+    goal = poses[..., :3].reshape(-1, 3) + np.array([0, 0, 0.03])
+    bearing = np.arctan2(goal[:, 1], goal[:, 0])
+    closing = np.stack([-np.sin(bearing), np.cos(bearing), 0 * bearing], 1)
+    down = np.tile([0.0, 0.0, -1.0], (len(goal), 1))
+    R = np.stack([down, closing, np.cross(down, closing)], 2)
+    q = np.tile(HOME_QPOS, (len(goal), 1))
+    start, _, _ = forward_kinematics(q)
+    for way in np.linspace(0.05, 1.0, 20)[:, None]:
+        q = inverse_kinematics(q, start + way * (goal - start), R)
+    reached, R_reached, _ = forward_kinematics(q)
+    assert np.linalg.norm(reached - goal, axis=1).max() < 0.001
+    assert (R_reached[:, 2, 0] < -0.999).all()

@@ -1,15 +1,8 @@
 """The scripted expert in scenes that reset-free streams end up in: stacked, fallen and crowded objects."""
 
 import numpy as np
-import pytest
-from lerobot_env_cronos import SCENES, CronosVectorEnv, Task
-from lerobot_env_cronos.expert.body_boxes import SceneBoxes, WorldBoxes
-from lerobot_env_cronos.expert.ceiling import run_segment
-from lerobot_env_cronos.expert.expert import ScriptedExpert
-from lerobot_env_cronos.expert.grasping import choose_grasps, grasp_candidates
-from lerobot_env_cronos.scene.model import build_model
-from lerobot_env_cronos.scene.robot import HOME_QPOS
-from lerobot_env_cronos.simulation.kinematics import quaternion_to_matrix
+from env_rollouts import run_expert
+from lerobot_env_cronos import SCENES, CronosVectorEnv, ScriptedExpert, Task
 
 SCENE = SCENES["kitchen_3x3"]
 BEAR, SHOVEL, BOTTLE, PLATE, CLOTH, CARPET = range(6)
@@ -55,7 +48,7 @@ def test_what_lies_on_top_is_put_on_the_table_first():
     env = make(poses, Task("ketchup bottle", "cloth"))
     shovel_before = env.simulation.body_pose("kitchen shovel")[:, :2].copy()
     assert (env.simulation.body_pose("kitchen shovel")[:, 2] > 0.013).all()
-    success = run_segment(env, ScriptedExpert(env).act)
+    success = run_expert(env)
     moved = np.linalg.norm(env.simulation.body_pose("kitchen shovel")[:, :2] - shovel_before, axis=1)
     assert success.all()
     assert (moved > 0.02).all()
@@ -72,8 +65,7 @@ def test_room_is_made_on_a_full_receptacle():
     poses[1] = tidy()
     env = make(poses, Task("kitchen shovel", "carpet"))
     before = env.simulation.body_poses()[:, [BEAR, BOTTLE], :2].copy()
-    expert = ScriptedExpert(env)
-    success = run_segment(env, expert.act)
+    success = run_expert(env)
     moved = np.linalg.norm(env.simulation.body_poses()[:, [BEAR, BOTTLE], :2] - before, axis=-1).max(1)
     assert success.all()
     assert moved[0] > 0.05
@@ -96,7 +88,7 @@ def test_a_fallen_bear_is_picked_up():
     poses[5, BEAR] = [0.33, 0.10, 0.024, 0.653, 0.653, 0.271, 0.271]
     env = make(poses, Task("toy bear", "yellow plate"))
     assert (env.simulation.body_rotations()[:, BEAR, 2, 2] < 0.3).all()
-    assert run_segment(env, ScriptedExpert(env).act).all()
+    assert run_expert(env).all()
 
 
 def test_the_hand_goes_round_a_standing_bear():
@@ -115,31 +107,3 @@ def test_the_hand_goes_round_a_standing_bear():
         held = env.simulation.is_grasped("toy bear")
         upright &= held | (env.simulation.body_rotations()[:, BEAR, 2, 2] > 0.98)
     assert upright.all()
-
-
-@pytest.mark.parametrize("obj", [BEAR, SHOVEL, BOTTLE])
-def test_a_lone_object_is_as_easy_to_grasp_at_any_yaw(obj):
-    yaws = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    poses = np.stack([tidy()] * len(yaws))
-    for pose, yaw in zip(poses, yaws):
-        pose[obj, 3:] = yawed(0, 0, 0, yaw)[3:]
-    boxes = SceneBoxes.from_model(build_model(SCENE), SCENE)
-    grasps = choose_grasps(
-        grasp_candidates(boxes, obj), obj, WorldBoxes.at(boxes, poses),
-        (poses[:, obj, :3], quaternion_to_matrix(poses[:, obj, 3:])), np.tile(HOME_QPOS, (len(yaws), 1)),
-        np.full((len(yaws), 1, 3), np.inf), np.array([i > BOTTLE for i in range(6)]),
-    )  # fmt: skip
-    # Nothing in the way, nothing too wide: what is left is how far the wrist turns.
-    assert (grasps.blocker == -1).all()
-    assert grasps.cost.max() < 2.5
-
-
-def test_points_on_a_surface_leave_no_gap():
-    boxes = SceneBoxes.from_model(build_model(SCENE), SCENE)
-    points = boxes.surface(SHOVEL, 0.016)
-    assert np.ptp(points, axis=0) == pytest.approx([0.0571, 0.1488, 0.0212])
-    blade = points[(points[:, 1] < -0.0118) & np.isclose(points[:, 2], -0.0106)]
-    # Any spot of the blade's underside has a point within half a cell's diagonal.
-    spots = np.random.default_rng(0).uniform([-0.0285, -0.0744], [0.0285, -0.013], (200, 2))
-    nearest = np.linalg.norm(spots[:, None] - blade[None, :, :2], axis=-1).min(1)
-    assert nearest.max() <= 0.016 / np.sqrt(2)

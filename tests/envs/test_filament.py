@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from forked_commands import run_forked
 from lerobot_env_cronos import CronosVectorEnv
-from lerobot_env_cronos.config import CronosEnvConfig
 from lerobot_env_cronos.simulation import filament
 
 needs_vulkan = pytest.mark.skipif(
@@ -70,10 +69,3 @@ def test_without_a_driver_there_are_no_devices():
     nothing = {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json"}
     code = "from lerobot_env_cronos.simulation.filament import count_vulkan_devices; print(count_vulkan_devices())"
     assert run_forked([sys.executable, "-c", code], env=os.environ | nothing).stdout == "0\n"
-
-
-def test_the_flag():
-    assert CronosEnvConfig().renderer == "classic"
-    assert CronosEnvConfig(renderer="filament").gym_kwargs["renderer"] == "filament"
-    with pytest.raises(ValueError, match=r"unknown env.renderer 'ray'.*classic.*filament"):
-        CronosEnvConfig(renderer="ray")

@@ -3,10 +3,10 @@
 import mujoco
 import numpy as np
 import pytest
-from lerobot_env_cronos import CronosVectorEnv, get_scene
+from env_rollouts import make
+from lerobot_env_cronos import SCENES, get_scene
 from lerobot_env_cronos.scene.model import build_model
 from lerobot_env_cronos.scene.scenes import BODIES
-from lerobot_env_cronos.simulation.simulation import Simulation
 
 SCENE, GRAVITY = "kitchen_2x2", 9.81
 FLAT = get_scene(SCENE).receptacles
@@ -54,19 +54,33 @@ def test_a_body_let_go_at_speed_stops_where_coulomb_says(body):
     assert np.abs(data.joint(body).qvel[3:]).max() < 1e-2
 
 
-def test_a_negative_number_of_threads_is_refused():
-    with pytest.raises(ValueError, match=r"num_threads .* got -3"):
-        Simulation(get_scene(SCENE), 1, -3)
-
-
-def test_all_cores_are_those_that_the_process_may_use(monkeypatch):
-    monkeypatch.setattr("os.sched_getaffinity", lambda pid: {5}, raising=False)
-    simulation = Simulation(get_scene(SCENE), 2)
-    assert simulation.num_threads == simulation._batch.nthread == 1
+def test_tasks_sizes_and_masses_are_the_papers():
+    assert [task.instruction for task in get_scene(SCENE).tasks] == [
+        "put the ketchup bottle on the yellow plate",
+        "put the ketchup bottle on the cloth",
+        "put the kitchen shovel on the yellow plate",
+        "put the kitchen shovel on the cloth",
+    ]
+    masses = {}
+    for scene in SCENES:
+        model = build_model(get_scene(scene))
+        masses |= {body: model.body(body).mass[0] for body in get_scene(scene).bodies}
+    # Volumes by hand, times the published densities.
+    assert masses["yellow plate"] == pytest.approx(np.pi * 0.055**2 * 0.006 * 1003)
+    assert masses["cloth"] == pytest.approx(0.110 * 0.110 * 0.0094 * 6975)
+    assert masses["carpet"] == pytest.approx(0.110 * 0.0943 * 0.0037 * 2815)
+    assert masses["newspaper"] == pytest.approx(0.0815 * 0.1161 * 0.0041 * 2278)
+    # A body of 55 % of the height, and a head that is 0.75 as deep and 0.85 as wide.
+    assert masses["toy bear"] == pytest.approx((0.55 + 0.45 * 0.75 * 0.85) * 0.0426 * 0.0386 * 0.0564 * 667)
+    # A belly of 72 % of the length and a neck 0.55 as thick.
+    assert masses["plastic bottle"] == pytest.approx((0.72 + 0.28 * 0.55**2) * 0.0361 * 0.1216 * 0.0390 * 1916)
+    arm = [0.480879, 0.430811, 0.234589, 0.220991, 0.084957, 0.110084]
+    names = ["shoulder", "upper_arm", "upper_forearm", "lower_forearm", "wrist", "gripper"]
+    assert [model.body(f"{name}_link").mass[0] for name in names] == pytest.approx(arm)
 
 
 def test_a_body_that_spins_fast_slows_down_and_one_pressed_down_stays_on_the_table():
-    env = CronosVectorEnv(2, "kitchen_2x2", obs_type="environment_state_agent_pos")
+    env = make(2)
     env.reset(seed=0)
     sim, everyone = env.simulation, np.arange(2)
     # Out of a pinch: without a limit a spin of 140 rad/s grows beyond 10,000 within a second.

@@ -4,15 +4,14 @@ import itertools
 
 import numpy as np
 import pytest
-from lerobot_env_cronos import SCENES, CronosVectorEnv, get_scene
+from env_rollouts import keep_still, make, run_expert
+from lerobot_env_cronos import SCENES, get_scene
 from lerobot_env_cronos.benchmark.configurations import (
     CLEARANCE_M,
     footprint_corners,
     footprint_gap,
     load_configurations,
 )
-from lerobot_env_cronos.expert.ceiling import run_segment
-from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.expert.reach import find_reach, sample_reach_configuration
 
 N = 32
@@ -30,26 +29,12 @@ def test_bodies_lie_free_within_reach_and_in_view(scene):
         yaws = 2 * np.arctan2(layout[:, 6], layout[:, 3])
         corners = [footprint_corners(b, layout[i, :2], yaws[i]) for i, b in enumerate(bodies)]
         assert min(footprint_gap(a, b) for a, b in itertools.combinations(corners, 2)) > CLEARANCE_M - 1e-9
-    env = CronosVectorEnv(N, scene, obs_type="environment_state_agent_pos", num_threads=1)
+    env = make(N, scene)
     env.place_bodies(np.arange(N), poses)
-    still = np.tile([0, 0, 0, 0, 0, 0, 1.0], (N, 1))
-    for _ in range(5):
-        env.step(still)
+    keep_still(env, 5)
     # Nothing rolls off, and the detector of lost bodies, which looks at the simulation, finds none.
     assert np.abs(env.simulation.body_poses() - poses)[..., :3].max() < 2e-3
     assert not env.unsuitable_bodies().any()
-
-
-@pytest.mark.parametrize("scene", SCENES)
-def test_most_bodies_lie_outside_the_spawn_area_on_every_side_of_it(scene):
-    low, high = np.array(get_scene(scene).spawn_low), np.array(get_scene(scene).spawn_high)
-    xy = draw(scene, n=200)[..., :2].reshape(-1, 2)
-    outside = ((xy < low) | (xy > high)).any(1)
-    # The spawn area has 0.06 or 0.075 of about 0.17 m2.
-    assert 0.45 < outside.mean() < 0.75
-    for side in (xy[:, 0] < low[0], xy[:, 0] > high[0], xy[:, 1] < low[1], xy[:, 1] > high[1]):
-        assert side.mean() > 0.02
-    assert (np.abs(xy[:, 1]) > 0.20).mean() > 0.05
 
 
 @pytest.mark.parametrize(
@@ -86,7 +71,7 @@ def test_same_seed_same_layouts_and_none_of_the_held_out_ones():
 
 
 def test_the_expert_does_the_tasks_there():
-    env = CronosVectorEnv(N, "kitchen_2x2", obs_type="environment_state_agent_pos", num_threads=1)
+    env = make(N)
     env.place_bodies(np.arange(N), draw("kitchen_2x2", seed=3))
     env.set_task(np.arange(N), [env.scene.tasks[i % 4] for i in range(N)])
-    assert run_segment(env, ScriptedExpert(env).act, stop_early=True).mean() >= 0.9
+    assert run_expert(env).mean() >= 0.9

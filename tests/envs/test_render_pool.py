@@ -5,7 +5,6 @@ import errno
 import os
 import signal
 import tempfile
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -49,21 +48,6 @@ def test_frames_are_those_of_one_process(simulation, pool):
     assert len(np.unique(alone.reshape(-1, 3), axis=0)) > 50  # A picture, not an empty canvas.
     assert np.array_equal(pool.render(simulation.qpos), alone)
     assert np.array_equal(pool.render(simulation.qpos[3:]), alone[3:])
-
-
-def test_a_renderer_hands_over_what_is_worth_it(simulation):
-    renderer = ClassicRenderer(simulation.render_model, *SIZE, "front", processes=2)
-    if renderer._processes == 1:
-        pytest.skip("drawn by a GPU, which needs no processes")
-    before = children()
-    few = renderer.render(simulation.qpos[:5])
-    assert children() == before
-    many = np.tile(simulation.qpos[:5], (2 * MIN_FRAMES, 1))
-    frames = renderer.render(many)
-    assert len(children() - before) == 2
-    assert np.array_equal(frames, np.tile(few, (2 * MIN_FRAMES, 1, 1, 1)))
-    renderer.close()
-    assert children() == before
 
 
 @pytest.mark.parametrize(("frames", "drawing"), [(16, 2), (23, 2), (24, 3), (64, 3)])
@@ -126,19 +110,6 @@ def test_frames_that_find_no_room_in_memory_lie_on_disk(simulation, pool, monkey
     assert not list(full.iterdir())
 
 
-def test_two_threads_that_ask_get_their_own_frames(simulation):
-    renderer = ClassicRenderer(simulation.render_model, *SIZE, "front", processes=2)
-    if renderer._processes == 1:
-        pytest.skip("drawn by a GPU, which needs no processes")
-    states = [np.tile(simulation.qpos[i], (2 * MIN_FRAMES, 1)) for i in (0, 1)]
-    expected = [renderer.render(qpos) for qpos in states]
-    assert not np.array_equal(*expected)
-    with ThreadPoolExecutor(2) as threads:
-        drawn = list(threads.map(renderer.render, states * 20))
-    assert all(np.array_equal(frames, expected[i % 2]) for i, frames in enumerate(drawn))
-    renderer.close()
-
-
 def test_a_picture_larger_than_the_models_buffer_is_whole(simulation):
     model = simulation.render_model
     model.vis.global_.offwidth, model.vis.global_.offheight = 64, 48
@@ -155,25 +126,8 @@ def test_a_killed_process_is_an_error_and_not_a_wait(simulation, pool):
         pool.render(simulation.qpos)
 
 
-def test_it_closes_over_a_request_that_a_killed_process_never_read(pool):
-    process = pool._processes[1]
-    process.kill()
-    process.wait()
-    process.stdin.write(b"a request")
-    pool.close()
-    assert process.stdin.closed
-    assert all(other.returncode is not None for other in pool._processes)
-
-
 def test_a_process_that_cannot_draw_says_why(simulation, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "no such platform")
     model = simulation.render_model
     with pytest.raises(RuntimeError, match="no such platform"):
         RenderPool(model, *SIZE, model.camera("front").id, processes=1, capacity=5)
-
-
-def test_they_end_with_the_process_that_asked(pool):
-    """However it dies, its end of the pipes is closed."""
-    for process in pool._processes:
-        process.stdin.close()
-        assert process.wait(timeout=20) == 0

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lerobot_env_cronos import SCENES, CronosVectorEnv
+from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.benchmark import configurations
 from lerobot_env_cronos.scene.scenes import BODIES
-from lerobot_env_cronos.scene.view import is_in_view, is_spawn_area_in_view
+from lerobot_env_cronos.scene.view import is_in_view
 from lerobot_env_cronos.simulation.workspace import Unsuitable, find_free_pose, find_unsuitable
 
 UPRIGHT = [1.0, 0.0, 0.0, 0.0]
@@ -92,12 +92,6 @@ def test_put_back_keeps_clear_of_a_low_hand(env):
         assert np.abs(pose[:2] - hand[:2]).max() > 0.06
 
 
-@pytest.mark.parametrize("scene", SCENES)
-def test_the_camera_sees_the_spawn_areas_of_the_benchmark(scene):
-    """So that places to put bodies back at are drawn from them as they are, without another look."""
-    assert all(is_spawn_area_in_view(SCENES[scene], BODIES[name]) for name in SCENES[scene].bodies)
-
-
 @pytest.mark.parametrize("has_room", [True, False])
 def test_bodies_are_put_back_where_the_camera_sees_them(env, monkeypatch, has_room):
     """In a spawn area as wide as the workspace, of whose width the camera sees less than nine tenths."""
@@ -113,10 +107,3 @@ def test_bodies_are_put_back_where_the_camera_sees_them(env, monkeypatch, has_ro
     assert np.abs(poses[:, 1]).max() > 0.2
     poses[:, 2] = BODIES["ketchup bottle"].size[2] / 2
     assert is_in_view(poses[:, :3]).all()
-
-
-def test_a_spawn_area_out_of_view_does_not_end_in_an_endless_search(env, monkeypatch):
-    env.reset(seed=0)
-    aside = replace(env.scene, spawn_low=(0.3, 0.28), spawn_high=(0.5, 0.3))
-    monkeypatch.setattr(env.simulation, "scene", aside)
-    assert find_free_pose(env.simulation, 0, "ketchup bottle", np.random.default_rng(0))[1] >= 0.28

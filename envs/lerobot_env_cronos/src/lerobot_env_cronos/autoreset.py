@@ -11,13 +11,15 @@ from gymnasium.vector import AutoresetMode
 
 from lerobot_env_cronos.episodic import IndependentVectorEnv, draw_start, find_task
 from lerobot_env_cronos.scene.scenes import get_scene
-from lerobot_env_cronos.vector_env import LEROBOT_OPTIONS, check_options
+from lerobot_env_cronos.simulation.simulation import check_state
+from lerobot_env_cronos.vector_env import LEROBOT_OPTIONS, as_one_seed, check_options
 
 
 class CronosGymVectorEnv(IndependentVectorEnv):
     """`num_envs` episodes at a time, each the same as `CronosEnv`'s of its seed, reset by Gymnasium's rules.
 
-    An episode is `terminated` when its task is complete and `truncated` after 80 steps.
+    An episode is `terminated` when its task is complete and `truncated` after `max_episode_steps`, by default 80.
+    `info["task"]` (n,) has the numbers of the tasks in the scene's `tasks`; `instructions` says what they mean.
 
     Args:
         num_envs: episodes at a time.
@@ -60,19 +62,20 @@ class CronosGymVectorEnv(IndependentVectorEnv):
         self._generators = [np_random()[0] for _ in range(num_envs)]
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """See `IndependentVectorEnv.get_state`; with the generators that draw the next episodes, as JSON."""
+        """See `CronosVectorEnv.get_state`; with the generators that draw the next episodes, as JSON."""
         drawn = [json.dumps(generator.bit_generator.state) for generator in self._generators]
         return super().get_state() | {"generators": np.array(drawn)}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """See `CronosVectorEnv.set_state`."""
+        check_state(state, {"generators": self._all})
         super().set_state(state)
         for generator, text in zip(self._generators, state["generators"], strict=True):
             generator.bit_generator.state = json.loads(str(text))
 
     def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None):
         """Start an episode in every environment; environment i is seeded with `seed + i` or `seeds[i]`."""
-        gym.vector.VectorEnv.reset(self, seed=seed if isinstance(seed, int) else None)
+        gym.vector.VectorEnv.reset(self, seed=as_one_seed(seed))
         options = check_options(options, ("configuration", "reset_mask", *LEROBOT_OPTIONS))
         mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
@@ -106,7 +109,7 @@ class CronosGymVectorEnv(IndependentVectorEnv):
             ids = self._all[starting]
             self._begin(ids)
             observation = self.observe_running(ids)
-            new = {"is_success": self.is_success, "is_grasped": self.is_grasped, "task": self._instructions()}
+            new = {"is_success": self.is_success, "is_grasped": self.is_grasped, "task": self._task_numbers()}
             for name, value in new.items():
                 info[name][ids] = value[ids]
             info["diverged"][ids] = False
@@ -126,12 +129,12 @@ class CronosGymVectorEnv(IndependentVectorEnv):
         self._elapsed[ids] = 0
 
     def _mark(self, info: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
-        """Add the instructions, and Gymnasium's masks of who has what."""
-        info = info | {"task": self._instructions()}
+        """Add the numbers of the tasks, and Gymnasium's masks of who has what."""
+        info = info | {"task": self._task_numbers()}
         return info | {f"_{name}": mask.copy() for name in info}
 
-    def _instructions(self) -> np.ndarray:
-        return np.array(self.instructions, dtype=object)
+    def _task_numbers(self) -> np.ndarray:
+        return np.array([self.scene.tasks.index(task) for task in self.tasks])
 
 
 def _row(batch: dict[str, Any], i: int) -> dict[str, Any]:

@@ -1,23 +1,22 @@
-"""`--env.type=cronos`: the LeRobot configuration of the CRONOS scenes."""
+"""`--env.type=cronos` and `cronos_hub`: the LeRobot configurations of the CRONOS scenes."""
 
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, TypeGuard
 
 import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.envs.configs import EnvConfig
-from lerobot.envs.utils import parse_camera_names
+from lerobot.envs.configs import EnvConfig, HubEnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from lerobot_env_cronos.benchmark.benchmark import SUITES, EpisodeGroup
 from lerobot_env_cronos.benchmark.configurations import SPLITS
+from lerobot_env_cronos.benchmark.files import check_tag, fetch_benchmark
 from lerobot_env_cronos.benchmark.load import benchmark_scene, load_benchmark
 from lerobot_env_cronos.benchmark.version import gymnasium_id
 from lerobot_env_cronos.episodic import EpisodicVectorEnv, IndependentVectorEnv, LazyVectorEnv
-from lerobot_env_cronos.scene.model import CAMERAS
 from lerobot_env_cronos.scene.scenes import CONTROL_HZ, get_scene
 from lerobot_env_cronos.sequential import ADVANCES, SequentialVectorEnv
 from lerobot_env_cronos.simulation.observations import (
@@ -25,11 +24,21 @@ from lerobot_env_cronos.simulation.observations import (
     TASK_OBSERVATIONS,
     agent_pos_names,
     environment_state_names,
+    parse_cameras,
 )
 from lerobot_env_cronos.simulation.rendering import RENDERERS
 from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
+from lerobot_env_cronos.vector_env import CronosVectorEnv
 
 DEFAULT_SCENE = "kitchen_2x2"
+CHOICES = {
+    "suite": SUITES,
+    "split": SPLITS,
+    "advance": ADVANCES,
+    "obs_type": OBS_TYPES,
+    "renderer": RENDERERS,
+    "task_observation": TASK_OBSERVATIONS,
+}
 
 
 @EnvConfig.register_subclass("cronos")
@@ -93,25 +102,16 @@ class CronosEnvConfig(EnvConfig):
         """Check the fields and derive the features from them."""
         self.scene = self.scene or (benchmark_scene(self.benchmark) if self.benchmark else DEFAULT_SCENE)
         scene = get_scene(self.scene)
-        _check("suite", self.suite, SUITES)
-        _check("split", self.split, SPLITS)
-        _check("advance", self.advance, ADVANCES)
-        _check("obs_type", self.obs_type, OBS_TYPES)
-        _check("renderer", self.renderer, RENDERERS)
-        _check("task_observation", self.task_observation, TASK_OBSERVATIONS)
-        cameras = parse_camera_names(self.camera_name)
-        for camera in cameras:
-            _check("camera_name", camera, tuple(CAMERAS))
+        for name, valid in CHOICES.items():
+            if getattr(self, name) not in valid:
+                raise ValueError(f"unknown env.{name} {getattr(self, name)!r}; valid values: {list(valid)}")
+        cameras = parse_cameras(self.camera_name)
         if self.fps != CONTROL_HZ:
             raise ValueError(f"env.fps is fixed at {CONTROL_HZ} Hz by the protocol, got {self.fps}")
-        if self.num_threads < 0:
-            raise ValueError(f"env.num_threads must be at least 0 (all cores), got {self.num_threads}")
-        if len(self.render_size) != 2:
-            raise ValueError(f"env.render_size must be two numbers, height and width, got {self.render_size}")
-        if min(self.observation_height, self.observation_width, *self.render_size) < 1:
-            sizes = f"{self.observation_height} x {self.observation_width} and {tuple(self.render_size)}"
+        if self.max_parallel_tasks != 1:
             raise ValueError(
-                f"env.observation_height, observation_width and render_size must be positive, got {sizes}"
+                f"env.max_parallel_tasks must be 1, got {self.max_parallel_tasks}: parallel threads would share "
+                "the one policy and its memory. --eval.batch_size runs episodes in parallel"
             )
         self._chosen()
         pixels = self.obs_type == "pixels_agent_pos"
@@ -150,13 +150,12 @@ class CronosEnvConfig(EnvConfig):
         )  # fmt: skip
         return {name: getattr(self, name) for name in names}
 
+    def create_streams(self, num_envs: int, **options: Any) -> CronosVectorEnv:
+        """Streams to train on, which never reset themselves; `options` are those of `CronosVectorEnv`."""
+        return CronosVectorEnv(num_envs, self.scene, **(self.gym_kwargs | options))
+
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """One native vector env per task or ordering, built lazily; `use_async_envs` is not needed and ignored."""
-        if self.suite == "independent" and (self.advance != "window" or self.end_effector_reset):
-            logging.getLogger(__name__).warning(
-                "--env.advance and --env.end_effector_reset are of chains, --env.suite=sequential: "
-                "--env.suite=independent does not follow them"
-            )
         makers = {i: self._maker(n_envs, chosen) for i, chosen in self._chosen().items()}
         envs: dict[int, gym.vector.VectorEnv] = {i: LazyVectorEnv(make, n_envs) for i, make in makers.items()}
         return {f"{self.suite}_{self.split}": envs}
@@ -184,6 +183,31 @@ class CronosEnvConfig(EnvConfig):
         )  # fmt: skip
 
 
-def _check(name: str, value: str, valid: tuple[str, ...]) -> None:
-    if value not in valid:
-        raise ValueError(f"unknown env.{name} {value!r}; valid values: {list(valid)}")
+@EnvConfig.register_subclass("cronos_hub")
+@dataclass
+class CronosHubEnvConfig(CronosEnvConfig, HubEnvConfig):
+    """The environments that a benchmark's repository makes itself, by LeRobot's EnvHub.
+
+    The fields of `--env.type=cronos`, but LeRobot runs the `env.py` of `--env.hub_path`.
+
+    `--trust_remote_code=true` allows its code to run. What a policy sees follows from the data beside it.
+    """
+
+    hub_path: str | None = None
+    """<owner>/<repository>[@<revision>] of a model repository that `cronos-publish benchmark` has made."""
+
+    def _build(self) -> None:
+        if not self.hub_path:
+            raise ValueError("env.type=cronos_hub needs env.hub_path: <owner>/<repository>[@<revision>]")
+        name = self.hub_path.partition(":")[0]
+        folder, _ = fetch_benchmark(name, repo_type="model")
+        if self.benchmark not in (None, str(folder)):
+            raise ValueError(f"env.benchmark is that of env.hub_path={self.hub_path}; got {self.benchmark!r}")
+        self.benchmark = str(folder)
+        super()._build()
+        check_tag(load_benchmark(self.benchmark, self.scene), name)
+
+
+def is_of_this_package(env: Any) -> TypeGuard[CronosEnvConfig]:
+    """Whether an environment config is of environments that this package makes, not a repository's own code."""
+    return isinstance(env, CronosEnvConfig) and not isinstance(env, HubEnvConfig)

@@ -11,7 +11,7 @@ import numpy as np
 
 from lerobot_env_cronos.benchmark.configurations import check_split
 from lerobot_env_cronos.scene.scenes import STEPS_PER_TASK, Task, get_scene
-from lerobot_env_cronos.vector_env import LEROBOT_OPTIONS, CronosVectorEnv, check_options
+from lerobot_env_cronos.vector_env import LEROBOT_OPTIONS, CronosVectorEnv, as_one_seed, check_options
 
 
 class EpisodicVectorEnv(CronosVectorEnv):
@@ -45,14 +45,12 @@ class EpisodicVectorEnv(CronosVectorEnv):
         self.done = np.zeros(num_envs, dtype=bool)
         self._last: dict[str, Any] | None = None
 
-    def get_state(self) -> dict[str, np.ndarray]:
-        """See `CronosVectorEnv.get_state`; with who is done."""
-        return super().get_state() | {"done": self.done.copy()}
+    def _state_arrays(self) -> dict[str, np.ndarray]:
+        return super()._state_arrays() | {"done": self.done}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """See `CronosVectorEnv.set_state`."""
         super().set_state(state)
-        self.done[:] = state["done"]
         self._last = None
 
     def observe_running(self, running: np.ndarray) -> dict[str, Any]:
@@ -68,33 +66,38 @@ class IndependentVectorEnv(EpisodicVectorEnv):
     """`num_envs` independent episodes of one task (paper, Section 4, "Independent-task evaluation").
 
     An episode starts from configuration `starts[seed % len(starts)]` of `split`, by default `seed % 64`, with the
-    arm at home. It is `terminated` when the task is complete and `truncated` after 80 steps; from then on it is
-    frozen, pays no reward and reports no success until the next `reset`, as LeRobot's rollout expects.
+    arm at home. It is `terminated` when the task is complete and `truncated` after `max_episode_steps`; from then
+    on it is frozen, pays no reward and reports no success until the next `reset`, as LeRobot's rollout expects.
 
     Args:
         task: the task of every episode.
+        max_episode_steps: None for no limit.
         **kwargs: see `EpisodicVectorEnv`.
     """
 
-    def __init__(self, num_envs: int, scene: str = "kitchen_2x2", *, task: Task, **kwargs):
+    def __init__(
+        self,
+        num_envs: int,
+        scene: str = "kitchen_2x2",
+        *,
+        task: Task,
+        max_episode_steps: int | None = STEPS_PER_TASK,
+        **kwargs,
+    ):
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps}")
         self.task = task
-        self._max_episode_steps = STEPS_PER_TASK
+        self._max_episode_steps = np.inf if max_episode_steps is None else max_episode_steps
         super().__init__(num_envs, scene, **kwargs)
         self._elapsed = np.zeros(num_envs, dtype=int)
 
-    def get_state(self) -> dict[str, np.ndarray]:
-        """See `EpisodicVectorEnv.get_state`; with the steps of each episode so far."""
-        return super().get_state() | {"elapsed": self._elapsed.copy()}
-
-    def set_state(self, state: dict[str, np.ndarray]) -> None:
-        """See `CronosVectorEnv.set_state`."""
-        super().set_state(state)
-        self._elapsed[:] = state["elapsed"]
+    def _state_arrays(self) -> dict[str, np.ndarray]:
+        return super()._state_arrays() | {"elapsed": self._elapsed}
 
     def reset(self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None):
         """Start new episodes everywhere, at starts number `seed + i` or `seeds[i]`, modulo their count."""
         check_options(options, LEROBOT_OPTIONS)
-        gym.vector.VectorEnv.reset(self, seed=seed if isinstance(seed, int) else None)
+        gym.vector.VectorEnv.reset(self, seed=as_one_seed(seed))
         self.scene_reset(self._all, self._choose_starts(seed, self.starts), self.split)
         self.set_task(self._all, [self.task] * self.num_envs)
         self.done[:] = False
@@ -172,8 +175,10 @@ class CronosEnv(gym.Env):
         **kwargs: see `CronosVectorEnv`.
 
     `reset(options={"configuration": i})` picks the i-th of `configurations`; otherwise the seeded generator draws.
-    An episode is terminated when its task is complete and truncated after 80 steps. It stays so until the next
-    `reset`: further steps change nothing, pay nothing, and return the same observation and flags.
+    An episode is terminated when its task is complete. `gymnasium.make` truncates it after `max_episode_steps`, by
+    default 80; this class alone has no limit. What is terminated stays so until the next `reset`: further steps
+    change nothing, pay nothing, and return the same observation. `info["task"]` is the number of the task in the
+    scene's `tasks`; `task_description` is its instruction.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": CronosVectorEnv.metadata["render_fps"]}  # noqa: RUF012
@@ -192,8 +197,9 @@ class CronosEnv(gym.Env):
         self.render_mode = render_mode
         chosen = find_task(scene, task)
         self._tasks = get_scene(scene).tasks if chosen is None else (chosen,)
-        self._max_episode_steps = STEPS_PER_TASK
-        self._env = IndependentVectorEnv(1, scene, task=self._tasks[0], split=split, **kwargs)
+        self._env = IndependentVectorEnv(
+            1, scene, task=self._tasks[0], split=split, max_episode_steps=None, **kwargs
+        )
         self.observation_space = self._env.single_observation_space
         self.action_space = self._env.single_action_space
         self._over = (False, False)
@@ -208,20 +214,24 @@ class CronosEnv(gym.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Start an episode; see the class."""
-        super().reset(seed=seed)
+        super().reset(seed=None if seed is None else int(seed))
         chosen = check_options(options, ("configuration", *LEROBOT_OPTIONS)).get("configuration")
         start, self._env.task = draw_start(self.np_random, len(self._env.starts), self._tasks, chosen)
         observation, info = self._env.reset(seed=[start])
         self._over = (False, False)
-        return _first(observation), _first(info) | {"task": self.task_description}
+        return _first(observation), self._describe(info)
 
     def step(self, action: np.ndarray):
         """Apply an action (7,) in physical units."""
+        if np.shape(action) != self.action_space.shape:
+            raise ValueError(f"the action must have shape {self.action_space.shape}, got {np.shape(action)}")
         observation, reward, terminated, truncated, info = self._env.step(np.asarray(action)[None])
-        info = _first(info) | {"task": self.task_description}
         if not any(self._over):
             self._over = (bool(terminated[0]), bool(truncated[0]))
-        return _first(observation), float(reward[0]), *self._over, info
+        return _first(observation), float(reward[0]), *self._over, self._describe(info)
+
+    def _describe(self, info: dict[str, Any]) -> dict[str, Any]:
+        return _first(info) | {"task": self._env.scene.tasks.index(self._env.task)}
 
     def render(self) -> np.ndarray | None:
         """Frame (height, width, 3) uint8 at `render_size`, or None without a render mode."""

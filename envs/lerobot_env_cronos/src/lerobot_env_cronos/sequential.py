@@ -13,7 +13,7 @@ import numpy as np
 
 from lerobot_env_cronos.episodic import EpisodicVectorEnv
 from lerobot_env_cronos.scene.scenes import STEPS_PER_TASK, Task
-from lerobot_env_cronos.vector_env import LEROBOT_OPTIONS, check_options
+from lerobot_env_cronos.vector_env import LEROBOT_OPTIONS, as_one_seed, check_options
 
 ADVANCES = ("window", "on_success")
 
@@ -86,30 +86,31 @@ class SequentialVectorEnv(EpisodicVectorEnv):
         # Nothing runs before it is started.
         self.done[:] = True
 
+    def _state_arrays(self) -> dict[str, np.ndarray]:
+        return super()._state_arrays() | {
+            "elapsed": self._elapsed,
+            "chain_length": self.chain_length,
+            "position": self.position,
+            "is_complete": self._is_complete,
+        }
+
     def get_state(self) -> dict[str, np.ndarray]:
-        """See `EpisodicVectorEnv.get_state`; with the chains, and how far each has come."""
+        """See `CronosVectorEnv.get_state`; with the orderings (n, longest), padded with -1."""
         valid, longest = self.scene.tasks + self.scene.reset_tasks, max(map(len, self._orderings))
         numbers = [[valid.index(task) for task in ordering] for ordering in self._orderings]
-        return super().get_state() | {
-            "orderings": np.array([row + [-1] * (longest - len(row)) for row in numbers]),
-            "elapsed": self._elapsed.copy(),
-            "chain_length": self.chain_length.copy(),
-            "position": self.position.copy(),
-            "is_complete": self._is_complete.copy(),
-        }
+        orderings = np.array([row + [-1] * (longest - len(row)) for row in numbers])
+        return super().get_state() | {"orderings": orderings}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """See `CronosVectorEnv.set_state`."""
         super().set_state(state)
         valid = self.scene.tasks + self.scene.reset_tasks
         self._orderings = [tuple(valid[i] for i in row if i >= 0) for row in state["orderings"]]
-        self._elapsed[:], self._is_complete[:] = state["elapsed"], state["is_complete"]
-        self.chain_length[:], self.position[:] = state["chain_length"], state["position"]
 
     def reset(self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None):
         """Start `ordering` everywhere, at starts number `seed + i` or `seeds[i]`, modulo their count."""
         check_options(options, LEROBOT_OPTIONS)
-        gym.vector.VectorEnv.reset(self, seed=seed if isinstance(seed, int) else None)
+        gym.vector.VectorEnv.reset(self, seed=as_one_seed(seed))
         self.start(self._all, [self.ordering] * self.num_envs, self._choose_starts(seed, self.starts))
         nothing = np.zeros(self.num_envs, dtype=bool)
         return self.observe_running(self._all), self._chain_info(nothing, nothing, self.position)

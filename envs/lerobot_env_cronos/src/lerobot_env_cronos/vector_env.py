@@ -13,10 +13,16 @@ import numpy as np
 
 from lerobot_env_cronos.benchmark.configurations import check_split
 from lerobot_env_cronos.benchmark.load import load_benchmark
-from lerobot_env_cronos.scene.physics import PHYSICS
 from lerobot_env_cronos.scene.scenes import CONTROL_HZ, Task, get_scene
 from lerobot_env_cronos.simulation.observations import ObservationBuilder
-from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW, Simulation
+from lerobot_env_cronos.simulation.simulation import (
+    ACTION_HIGH,
+    ACTION_HIGH_F32,
+    ACTION_LOW,
+    ACTION_LOW_F32,
+    Simulation,
+    check_state,
+)
 from lerobot_env_cronos.simulation.workspace import find_free_pose, find_unsuitable
 
 GRASP_REWARD, SUCCESS_REWARD = 0.1, 1.0
@@ -45,15 +51,14 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             or a folder; None for this package's.
         task_observation: `one_hot` appends which object and which receptacle is meant to `agent_pos`, for policies
             that read no instructions; `none` does not.
+        flat_observation: put images beside the other observations, as `pixels_<camera>`, for libraries that take
+            no nested observation space (Stable-Baselines3).
 
     Attributes:
         agent_pos_names: one for each number of `agent_pos`.
         timer: called with `physics`, `observe` or `reset`, returns the context in which that work is done; a
             training run hangs its stopwatch here.
     """
-
-    physics = PHYSICS
-    """Another one is for studies that compare."""
 
     metadata = {  # noqa: RUF012 - Gymnasium declares it this way
         "render_modes": ["rgb_array"],
@@ -78,11 +83,10 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         renderer: str = "classic",
         benchmark: str | None = None,
         task_observation: str = "none",
+        flat_observation: bool = False,
     ):
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        if num_threads < 0:
-            raise ValueError(f"num_threads must be at least 0 (all cores), got {num_threads}")
+        if not isinstance(num_envs, int | np.integer) or num_envs < 1:
+            raise ValueError(f"num_envs must be a whole number of at least 1, got {num_envs!r}")
         if reward not in REWARDS:
             raise ValueError(f"unknown reward {reward!r}; valid rewards: {list(REWARDS)}")
         self.scene = get_scene(scene)
@@ -91,16 +95,14 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         self.timer: Callable[[str], AbstractContextManager] = nullcontext
         self.reward = reward
         self._num_threads = num_threads
-        self.simulation = Simulation(self.scene, num_envs, num_threads, self.physics)
+        self.simulation = Simulation(self.scene, num_envs, num_threads)
         self._observations = ObservationBuilder(
             self.simulation, obs_type, privileged_state, observation_height, observation_width, camera_name,
-            render_size, renderer, task_observation,
+            render_size, renderer, task_observation, flat_observation,
         )  # fmt: skip
         self.agent_pos_names = self._observations.agent_pos_names
         self.single_observation_space = self._observations.space
-        self.single_action_space = gym.spaces.Box(
-            ACTION_LOW.astype(np.float32), ACTION_HIGH.astype(np.float32), dtype=np.float32
-        )
+        self.single_action_space = gym.spaces.Box(ACTION_LOW_F32, ACTION_HIGH_F32, dtype=np.float32)
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
         self.tasks: list[Task] = [self.scene.tasks[0]] * num_envs
@@ -115,7 +117,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
     def reset(self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None):
         """Scene-reset every stream to a training configuration, of n: `(seed + i) % n`, or `seeds[i] % n`."""
         check_options(options, LEROBOT_OPTIONS)
-        super().reset(seed=seed if isinstance(seed, int) else None)
+        super().reset(seed=as_one_seed(seed))
         starts = np.arange(len(self.benchmark.configurations["train"]))
         self.scene_reset(self._all, self._choose_starts(seed, starts))
         return self.observe(), self._info()
@@ -135,14 +137,17 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         """Apply actions (n, 7) in physical units; out-of-bounds values are clipped.
 
         Returns the observation under the task that was acted on, the reward (n,), all-False `terminated` and
-        `truncated`, and `info` with (n,) arrays `is_success`, `is_grasped`, `diverged`.
+        `truncated`, and `info` with (n,) arrays `is_success`, `is_grasped`, `diverged`, and `executed_action`
+        (n, 7) float32: what was applied after clipping. Applied to the same state it does the same again.
 
         Raises:
             ValueError: wrong shape, or an action that is not finite.
         """
         reward, diverged = self.step_streams(actions, self._all)
         never = np.zeros(self.num_envs, dtype=bool)
-        return self.observe(), reward, never, never.copy(), self._info() | {"diverged": diverged}
+        executed = np.clip(np.asarray(actions, dtype=np.float32), ACTION_LOW_F32, ACTION_HIGH_F32)
+        info = self._info() | {"diverged": diverged, "executed_action": executed}
+        return self.observe(), reward, never, never.copy(), info
 
     def step_streams(self, actions: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`step` for streams `ids` (k,) alone, without an observation; the others stay as they are.
@@ -278,27 +283,32 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             self.tasks[i] = task
         self._judge(ids)
 
+    def _state_arrays(self) -> dict[str, np.ndarray]:
+        """What decides what steps do, besides the simulation and the tasks: live arrays (n, ...)."""
+        return {"level": self._level, "is_success": self.is_success, "is_grasped": self.is_grasped}
+
     def get_state(self) -> dict[str, np.ndarray]:
         """Everything that decides what steps do, as numpy arrays; see `Simulation.get_state`.
 
         Not what a `reset()` without a seed will draw.
         """
-        state = self.simulation.get_state()
         valid = self.scene.tasks + self.scene.reset_tasks
-        return state | {
-            "task": np.array([valid.index(task) for task in self.tasks]),
-            "level": self._level.copy(),
-            "is_success": self.is_success.copy(),
-            "is_grasped": self.is_grasped.copy(),
-        }
+        own = {name: array.copy() for name, array in self._state_arrays().items()}
+        return self.simulation.get_state() | {"task": np.array([valid.index(task) for task in self.tasks])} | own
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
-        """Continue, bit for bit, from a state taken by `get_state`."""
+        """Continue, bit for bit, from a state taken by `get_state`.
+
+        Raises:
+            ValueError: it is of another scene, number of streams or kind of environment; nothing changes.
+        """
+        arrays = self._state_arrays()
+        check_state(state, arrays | {"task": self._all})
         self.simulation.set_state(state)
         valid = self.scene.tasks + self.scene.reset_tasks
         self.tasks = [valid[i] for i in state["task"]]
-        for name in ("level", "is_success", "is_grasped"):
-            getattr(self, "_level" if name == "level" else name)[:] = state[name]
+        for name, array in arrays.items():
+            array[:] = state[name]
 
     def __getstate__(self) -> dict[str, Any]:
         """For pickle and `copy.deepcopy`: a copy goes on bit for bit, without the renderers and the timer."""
@@ -308,7 +318,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self.timer = nullcontext
-        self.simulation = Simulation(self.scene, self.num_envs, self._num_threads, self.physics)
+        self.simulation = Simulation(self.scene, self.num_envs, self._num_threads)
         self.simulation.set_state(state["simulation"])
         self._observations.simulation = self.simulation
 
@@ -352,8 +362,18 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         self._observations.close()
 
 
+def as_one_seed(seed: int | Sequence[int | None] | None) -> int | None:
+    """The seed of what an environment draws for all of its streams, from that of `reset`."""
+    if seed is None or isinstance(seed, int | np.integer):
+        return None if seed is None else int(seed)
+    given = [0 if one is None else int(one) for one in seed]
+    return int(np.random.SeedSequence(given).generate_state(1)[0])
+
+
 def check_options(options: dict[str, Any] | None, valid: Sequence[str]) -> dict[str, Any]:
     """The options of a `reset`; a ValueError names what is unknown and what is valid."""
+    if not isinstance(options, dict | None):
+        raise ValueError(f"options of reset must be a dict, got {options!r}")
     unknown = sorted(set(options or {}) - set(valid))
     if unknown:
         raise ValueError(f"unknown options {unknown} of reset; valid options: {list(valid)}")

@@ -55,21 +55,17 @@ def set_configurations_file(scene: Scene, path: Path) -> None:
     """Read the configurations of `scene`, whose bodies are registered, from `path` from now on.
 
     Raises:
-        ValueError: the scene is the package's or registered, with other configurations; the file is of other
-            bodies, a split has not 64 configurations, or one of these cannot be used.
+        ValueError: the scene has other configurations already; the file is of other bodies, a split has not 64
+            configurations, or one of these cannot be used.
     """
-    advice = (
-        "write a benchmark of others (lerobot_env_cronos.benchmark.files.write_benchmark) and give --env.benchmark"
-    )
-    if _packaged_file(scene).is_file():
-        raise ValueError(f"the configurations of {scene.name} come with the package, not from {path}: {advice}")
     splits = _load_splits(scene, path)
-    if scene.name not in SCENES:
-        _files[scene.name] = path
-    elif any((splits[split] != load_configurations(scene.name, split)).any() for split in SPLITS):
+    is_known = scene.name in SCENES or _packaged_file(scene).is_file()
+    if is_known and any((splits[split] != load_configurations(scene.name, split)).any() for split in SPLITS):
         raise ValueError(
-            f"{scene.name} is registered already, with other configurations than {path} has: {advice}"
+            f"{scene.name} has other configurations than {path}: write a benchmark for --env.benchmark"
         )
+    if not is_known:
+        _files[scene.name] = path
 
 
 def _packaged_file(scene: Scene) -> Traversable:
@@ -271,7 +267,3 @@ def write_configurations(scene_name: str, folder: Path, seed: int = SEED) -> Pat
     path = folder / f"{scene.name}.json"
     path.write_text(json.dumps(_generate(scene, seed)) + "\n")
     return path
-
-
-if __name__ == "__main__":
-    raise SystemExit("`python -m lerobot_env_cronos.benchmark.freeze configurations SCENE` writes a file of them")

@@ -48,6 +48,11 @@ COLUMNS = {
 """Columns of each config; `configurations` has `pose_columns` besides."""
 
 
+MAX_ROWS, MAX_BYTES, MAX_TEXT = 100_000, 2**26, 300
+"""The largest file that is read: rows, bytes before and after decompression, and characters of a text."""
+_POSE_ENDS = tuple(f"_{suffix}" for suffix in POSE)
+
+
 class BenchmarkError(ValueError):
     """A benchmark that cannot be used."""
 
@@ -123,41 +128,29 @@ def fetch_benchmark(name: str, repo_type: str = "dataset") -> tuple[Path, str]:
         BenchmarkError: no such folder, repository or revision, or the Hub cannot be reached.
     """
     import httpx
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import (
-        HfHubHTTPError,
-        HFValidationError,
-        LocalEntryNotFoundError,
-        RepositoryNotFoundError,
-        RevisionNotFoundError,
-    )
+    from huggingface_hub import errors, snapshot_download
 
     repo_id, _, revision = name.partition("@")
-    hint = f"expected <owner>/<repository>[@<revision>] of a {repo_type} on the Hub, or a folder"
+    files = [f"{config}/{split}{end}.parquet" for config in CONFIGS for split in SPLITS for end in ("", "-*")]
     try:
-        patterns = [f"{config}/*.parquet" for config in CONFIGS]
-        folder = Path(
-            snapshot_download(repo_id, repo_type=repo_type, revision=revision or None, allow_patterns=patterns)
-        )
-    except HFValidationError as error:
-        raise BenchmarkError(f"no benchmark {name!r}: {hint}") from error
-    except RevisionNotFoundError as error:
+        folder = snapshot_download(repo_id, repo_type=repo_type, revision=revision or None, allow_patterns=files)
+    except errors.RevisionNotFoundError as error:
         raise BenchmarkError(f"benchmark {repo_id} has no revision {revision or 'main'!r}") from error
-    except RepositoryNotFoundError as error:
-        reason = f"no such {repo_type} on the Hub, or it is private and HF_TOKEN gives no access to it"
-        raise BenchmarkError(f"no benchmark {name!r}: {reason}; {hint}") from error
-    except LocalEntryNotFoundError as error:
+    except (errors.HFValidationError, errors.RepositoryNotFoundError) as error:
+        raise BenchmarkError(
+            f"no benchmark {name!r}: expected <owner>/<repository>[@<revision>] of a {repo_type} on the Hub that "
+            "is public or that HF_TOKEN gives access to, or a folder"
+        ) from error
+    except errors.LocalEntryNotFoundError as error:
         raise BenchmarkError(f"cannot reach the Hub for benchmark {name!r}, and it is not in the cache") from error
-    except HfHubHTTPError as error:
-        raise BenchmarkError(f"the Hub refused to give out benchmark {name!r}: {error}") from error
-    except httpx.TransportError as error:
-        why = f"lost the connection to the Hub ({type(error).__name__})"
-        raise BenchmarkError(f"{why} while loading benchmark {name!r}: try again") from error
-    return folder, f"{repo_id}@{folder.name}"
+    except (errors.HfHubHTTPError, httpx.TransportError) as error:
+        why = f"{type(error).__name__}: {error}"[:MAX_TEXT]
+        raise BenchmarkError(f"cannot load benchmark {name!r} from the Hub: {why}") from error
+    return Path(folder), f"{repo_id}@{Path(folder).name}"
 
 
 def read_benchmark(folder: Path, source: str) -> Benchmark:
-    """Read and check a benchmark.
+    """Read and check a benchmark. It may be a stranger's: nothing in it is executed, and large files are refused.
 
     Args:
         folder: with the files.
@@ -168,19 +161,22 @@ def read_benchmark(folder: Path, source: str) -> Benchmark:
             scene does not have; the message says which row and why. Or the scene has other bodies here.
     """
     tables = {(config, split): _read(folder, config, split, source) for config in CONFIGS for split in SPLITS}
-    scene = _find_scene(tables)
+    scene = _find_scene(tables.values())
     placed = {split: tables[CONFIGURATIONS, split] for split in SPLITS}
     poses = {split: _read_poses(table, scene) for split, table in placed.items()}
     groups = {
         suite: {split: _read_groups(tables[suite, split], scene, suite, len(poses[split])) for split in SPLITS}
         for suite in SUITES
     }
-    _check_alike(groups, {suite: tables[suite, "held_out"] for suite in SUITES})
     benchmark = Benchmark(scene, poses, groups["independent"], groups["sequential"], source)
     # Before the poses: those of other bodies stand in the table or in the air.
     for table in placed.values():
         _check_same_bodies(table, benchmark)
-    _check_poses(placed, benchmark)
+    for split, table in placed.items():
+        if bad := find_bad_row(scene, poses[split]):
+            raise table.fail(*bad)
+    if shared := find_shared_row(poses["held_out"], poses["train"]):
+        raise placed["held_out"].fail(*shared)
     return benchmark
 
 
@@ -208,14 +204,18 @@ class _Table:
     def fail(self, row: int | None, why: str) -> BenchmarkError:
         return BenchmarkError(f"{self.where}{'' if row is None else f', row {row}'}: {why}")
 
-    def column(self, name: str, kind: type) -> list[Any]:
-        """Values of a column, each of `kind`; a whole number will do for a float."""
-        values = self.table.column(name).to_pylist()
-        for i, value in enumerate(values):
-            fits = isinstance(value, kind) or (kind is float and isinstance(value, int))
-            if not fits or isinstance(value, bool):
-                raise self.fail(i, f"{name} must be of type {kind.__name__}, got {value!r}")
-        return values
+    def column(self, name: str) -> list[Any]:
+        """Values of a column, of the type that `make_tables` gives it."""
+        if name not in self.table.column_names:
+            raise self.fail(None, f"there is no column {name}")
+        kind, column = _TYPES.get(name, pa.float64()), self.table.column(name)
+        try:
+            values = column.cast(kind)
+        except pa.ArrowException as error:
+            raise self.fail(None, f"{name} must be of type {kind}: {_short(error)}") from None
+        if values.null_count or (pa.types.is_list(kind) and values.combine_chunks().flatten().null_count):
+            raise self.fail(None, f"{name} must have a value in every row")
+        return values.to_pylist()
 
 
 def _read(folder: Path, config: str, split: str, source: str) -> _Table:
@@ -225,64 +225,87 @@ def _read(folder: Path, config: str, split: str, source: str) -> _Table:
     if not paths:
         raise BenchmarkError(f"{where}: there is no {config}/{split}.parquet")
     try:
-        table = pa.concat_tables([pq.read_table(path, partitioning=None) for path in paths])
-    except pa.ArrowException as error:
-        raise BenchmarkError(f"{where}: not a parquet file: {error}") from error
-    found = _Table(table, where)
-    missing = [name for name in COLUMNS[config] if name not in table.column_names]
-    if missing:
-        raise found.fail(None, f"columns {missing} are missing; it has {table.column_names}")
-    if not table.num_rows:
-        raise found.fail(None, "there is no row")
-    return found
+        table = _Table(pa.concat_tables([_read_part(path, config) for path in paths]), where)
+    except (pa.ArrowException, OSError, BenchmarkError) as error:
+        raise BenchmarkError(f"{where}: {_short(error)}") from error
+    if not 0 < table.table.num_rows <= MAX_ROWS:
+        raise table.fail(None, f"it must have 1 to {MAX_ROWS} rows, got {table.table.num_rows}")
+    return table
 
 
-def _find_scene(tables: dict[tuple[str, str], _Table]) -> Scene:
+def _read_part(path: Path, config: str) -> pa.Table:
+    """The columns that are needed, after a look at how large they are: a small file may hold gigabytes."""
+    if path.stat().st_size > MAX_BYTES:
+        raise BenchmarkError(f"{path.name} has more than {MAX_BYTES} bytes")
+    limits = {"thrift_string_size_limit": 2**20, "thrift_container_size_limit": 10_000}
+    metadata = pq.ParquetFile(path, **limits).metadata
+
+    def is_needed(name: str) -> bool:
+        return name in COLUMNS[config] or (config == CONFIGURATIONS and name.endswith(_POSE_ENDS))
+
+    paths = [metadata.schema.column(i).path for i in range(metadata.num_columns)]
+    needed = [i for i, column in enumerate(paths) if is_needed(column.partition(".")[0])]
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    size = sum(group.column(i).total_uncompressed_size for group in groups for i in needed)
+    values = max((sum(group.column(i).num_values for group in groups) for i in needed), default=0)
+    if metadata.num_rows > MAX_ROWS or values > 10 * MAX_ROWS or not 0 <= size <= MAX_BYTES:
+        raise BenchmarkError(
+            f"{path.name} is too large: {metadata.num_rows} rows, {values} values in a column, {size} bytes"
+        )
+    texts = [paths[i] for i in needed if metadata.schema.column(i).physical_type == "BYTE_ARRAY"]
+    # As a dictionary, what is said in many rows is in memory once.
+    file = pq.ParquetFile(path, read_dictionary=texts, **limits)
+    table = file.read(columns=sorted({paths[i].partition(".")[0] for i in needed}))
+    for column in table.columns:
+        _check_texts(column, path)
+    return table
+
+
+def _check_texts(column: pa.ChunkedArray, path: Path) -> None:
+    for chunk in column.chunks:
+        while pa.types.is_list(chunk.type) or pa.types.is_large_list(chunk.type):
+            chunk = chunk.flatten()
+        texts = chunk.dictionary if pa.types.is_dictionary(chunk.type) else chunk
+        is_text = pa.types.is_string(texts.type) or pa.types.is_large_string(texts.type)
+        if is_text and any(text is not None and len(text) > MAX_TEXT for text in texts.to_pylist()):
+            raise BenchmarkError(f"{path.name} has a text of more than {MAX_TEXT} characters")
+
+
+def _short(value: object) -> str:
+    """A stranger's value in a message."""
+    text = str(value) if isinstance(value, Exception) else repr(value)
+    return text if len(text) <= MAX_TEXT else text[:MAX_TEXT] + "..."
+
+
+def _find_scene(tables: Iterable[_Table]) -> Scene:
     """The scene that every row is of."""
-    first: str | None = None
-    for table in tables.values():
-        for i, environment in enumerate(table.column("environment", str)):
-            try:
-                scene = check_environment_id(environment, f"{table.where}, row {i},", "publish it anew")
-            except ValueError as error:
-                raise BenchmarkError(str(error)) from None
-            try:
-                get_scene(scene)
-            except ValueError as error:
-                raise table.fail(i, str(error)) from None
-            first = first or environment
-            if environment != first:
-                raise table.fail(i, f"environment is {environment}, other rows have {first}")
-    return get_scene(scene)
+    named: dict[str, str] = {}
+    for table in tables:
+        for environment in dict.fromkeys(table.column("environment")):
+            named.setdefault(environment, table.where)
+    if len(named) > 1:
+        raise BenchmarkError(
+            f"{list(named.values())[1]}: environment must be one in all rows, got {_short(named)}"
+        )
+    ((environment, where),) = named.items()
+    try:
+        return get_scene(check_environment_id(environment, "it", "publish it anew"))
+    except ValueError as error:
+        raise BenchmarkError(f"{where}: {error}") from None
 
 
 def _read_poses(table: _Table, scene: Scene) -> np.ndarray:
-    names = table.table.column_names
     known = [name for body in scene.bodies for name in pose_columns(body)]
-    missing = [name for name in known if name not in names]
-    if missing:
-        raise table.fail(None, f"columns {missing} are missing")
-    for name in names:
-        if name.endswith(tuple(f"_{suffix}" for suffix in POSE)) and name not in known:
-            valid = list(scene.bodies)
-            raise table.fail(None, f"column {name!r} is of no body of {scene.name}; its bodies: {valid}")
-    for i, number in enumerate(table.column("configuration", int)):
+    for name in table.table.column_names:
+        if name.endswith(_POSE_ENDS) and name not in known:
+            raise table.fail(None, f"column {_short(name)} is of no body of {scene.name}: {list(scene.bodies)}")
+    for i, number in enumerate(table.column("configuration")):
         if number != i:
             raise table.fail(i, f"configuration must be {i}, the number of the row, got {number}")
-    values = np.array([table.column(name, float) for name in known]).T
+    values = np.array([table.column(name) for name in known]).T
     poses = values.reshape(-1, len(scene.bodies), len(POSE))
     poses.flags.writeable = False
     return poses
-
-
-def _check_poses(tables: dict[str, _Table], benchmark: Benchmark) -> None:
-    """Every configuration can be used, and none is in both splits."""
-    poses = benchmark.configurations
-    for split, table in tables.items():
-        if bad := find_bad_row(benchmark.scene, poses[split]):
-            raise table.fail(*bad)
-    if shared := find_shared_row(poses["held_out"], poses["train"]):
-        raise tables["held_out"].fail(*shared)
 
 
 def _check_same_bodies(table: _Table, benchmark: Benchmark) -> None:
@@ -292,17 +315,19 @@ def _check_same_bodies(table: _Table, benchmark: Benchmark) -> None:
         return
     try:
         there = {body["name"]: body for body in json.loads(text)}
-    except (ValueError, TypeError, KeyError):
-        raise table.fail(None, f"{BODIES_KEY.decode()} must be a JSON list of bodies, got {text!r}") from None
+    except (ValueError, TypeError, KeyError, RecursionError):
+        raise table.fail(
+            None, f"{BODIES_KEY.decode()} must be a JSON list of bodies, got {_short(text)}"
+        ) from None
     here = {body["name"]: body for body in describe_bodies(benchmark.scene)}
     if list(there.items()) == list(here.items()):
         return
     differing = [
-        f"{key} of the {name} is {body.get(key)} here and {there.get(name, {}).get(key)} there"
+        f"{key} of the {name} is {_short(body.get(key))} here and {_short(there.get(name, {}).get(key))} there"
         for name, body in here.items()
-        for key in sorted(body.keys() | there.get(name, {}).keys())
-        if body.get(key) != there.get(name, {}).get(key)
-    ] or [f"they are {list(here)} here and {list(there)} there"]
+        for key in body
+        if body[key] != there.get(name, {}).get(key)
+    ] or [f"they are {list(here)} here and {_short(list(there))} there"]
     published = benchmark.fingerprint_with(list(there.values()))
     raise table.fail(
         None,
@@ -312,37 +337,26 @@ def _check_same_bodies(table: _Table, benchmark: Benchmark) -> None:
 
 
 def _read_groups(table: _Table, scene: Scene, suite: str, num_configurations: int) -> tuple[EpisodeGroup, ...]:
+    key, texts = ("task", "instruction") if suite == "independent" else ("ordering", "instructions")
     tasks: dict[int, tuple[Task, ...]] = {}
     starts: dict[int, list[int]] = {}
-    key = "task" if suite == "independent" else "ordering"
-    rows = zip(
-        table.column(key, int),
-        table.column("configuration", int),
-        table.column("window_steps", int),
-        _instructions(table, suite),
-        strict=True,
-    )
-    for i, (number, configuration, window, instructions) in enumerate(rows):
+    valid = {task.instruction: task for task in scene.tasks + scene.reset_tasks}
+    rows = zip(*map(table.column, (key, "configuration", "window_steps", texts)), strict=True)
+    for i, (number, configuration, window, said) in enumerate(rows):
+        instructions = [said] if suite == "independent" else said
         if window != STEPS_PER_TASK:
             raise table.fail(i, f"window_steps must be {STEPS_PER_TASK}, got {window}")
         if not 0 <= configuration < num_configurations:
             raise table.fail(i, f"configuration must be 0 to {num_configurations - 1}, got {configuration}")
-        named = tuple(_find_task(table, i, scene, instruction) for instruction in instructions)
-        if not named:
-            raise table.fail(i, "a chain needs a task")
+        if unknown := [text for text in instructions if text not in valid]:
+            raise table.fail(i, f"unknown task {_short(unknown[0])} of {scene.name}; valid tasks: {list(valid)}")
+        named = tuple(valid[text] for text in instructions)
         if tasks.setdefault(number, named) != named:
-            before = [task.instruction for task in tasks[number]]
-            raise table.fail(i, f"{key} {number} is {list(instructions)} here and {before} in an earlier row")
-        length = len(next(iter(tasks.values())))
-        if len(named) != length:
-            raise table.fail(i, f"a chain of {len(named)} tasks; in earlier rows they have {length}, as all must")
+            raise table.fail(i, f"{key} {number} has other tasks in an earlier row")
         if configuration in starts.setdefault(number, []):
             raise table.fail(i, f"{key} {number} starts from configuration {configuration} a second time")
         starts[number].append(configuration)
-    if sorted(tasks) != list(range(len(tasks))):
-        raise table.fail(None, f"{key} must be numbered 0 to {len(tasks) - 1}, got {sorted(tasks)}")
-    if suite == "independent":
-        _check_bodies(table, scene)
+    _check_tasks(table, tasks, suite)
     return tuple(
         EpisodeGroup(
             number, tasks[number], tuple(starts[number]),
@@ -352,40 +366,10 @@ def _read_groups(table: _Table, scene: Scene, suite: str, num_configurations: in
     )  # fmt: skip
 
 
-def _check_alike(groups: dict[str, dict[str, tuple[EpisodeGroup, ...]]], held_out: dict[str, _Table]) -> None:
-    """Both splits are of the same tasks, each of them once, and their chains are as long."""
-    train, other = ([group.instructions for group in groups["independent"][split]] for split in SPLITS)
-    if train != other or len({text for (text,) in train}) < len(train):
-        raise held_out["independent"].fail(None, f"tasks {other}; those of the training split are {train}")
-    train, other = (sorted({len(group.tasks) for group in groups["sequential"][split]}) for split in SPLITS)
-    if train != other:
-        raise held_out["sequential"].fail(
-            None, f"chains of {other} tasks; those of the training split have {train}"
-        )
-
-
-def _instructions(table: _Table, suite: str) -> Iterable[tuple[str, ...]]:
-    if suite == "independent":
-        return [(instruction,) for instruction in table.column("instruction", str)]
-    return [tuple(instructions) for instructions in table.column("instructions", list)]
-
-
-def _find_task(table: _Table, row: int, scene: Scene, instruction: str) -> Task:
-    valid = {task.instruction: task for task in scene.tasks + scene.reset_tasks}
-    if instruction not in valid:
-        raise table.fail(row, f"unknown task {instruction!r} of {scene.name}; valid tasks: {list(valid)}")
-    return valid[instruction]
-
-
-def _check_bodies(table: _Table, scene: Scene) -> None:
-    """`object` and `receptacle` say what the instruction says."""
-    columns = [table.table.column(name).to_pylist() for name in ("instruction", "object", "receptacle")]
-    for i, (instruction, obj, receptacle) in enumerate(zip(*columns, strict=True)):
-        for name, body, valid in (
-            ("object", obj, scene.objects),
-            ("receptacle", receptacle, (*scene.receptacles, None)),
-        ):
-            if body not in valid:
-                raise table.fail(i, f"unknown {name} {body!r}; valid ones: {list(valid)}")
-        if Task(obj, receptacle).instruction != instruction:
-            raise table.fail(i, f"instruction is {instruction!r}, but the bodies are {obj!r} and {receptacle!r}")
+def _check_tasks(table: _Table, tasks: dict[int, tuple[Task, ...]], suite: str) -> None:
+    if sorted(tasks) != list(range(len(tasks))):
+        raise table.fail(None, f"tasks or orderings must be numbered from 0, got {_short(sorted(tasks))}")
+    if len(lengths := {len(chain) for chain in tasks.values()}) > 1 or 0 in lengths:
+        raise table.fail(None, f"chains must be of one length, at least 1, got {sorted(lengths)}")
+    if suite == "independent" and len(set(tasks.values())) < len(tasks):
+        raise table.fail(None, "every task must have one number")

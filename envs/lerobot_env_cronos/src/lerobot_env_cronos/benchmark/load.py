@@ -4,7 +4,6 @@ from functools import cache
 from pathlib import Path
 
 from lerobot_env_cronos.benchmark.benchmark import Benchmark, packaged_benchmark
-from lerobot_env_cronos.benchmark.files import check_tag, fetch_benchmark, read_benchmark
 from lerobot_env_cronos.scene.scenes import get_scene
 
 
@@ -36,6 +35,9 @@ def benchmark_scene(name: str) -> str:
 
 @cache
 def _load(name: str) -> Benchmark:
+    # Brings pyarrow, which the packaged benchmarks do not need.
+    from lerobot_env_cronos.benchmark.files import check_tag, fetch_benchmark, read_benchmark
+
     if Path(name).is_dir():
         return read_benchmark(Path(name), source=name)
     return check_tag(read_benchmark(*fetch_benchmark(name)), name)

@@ -156,7 +156,3 @@ def write_orderings(scene_name: str, folder: Path) -> Path:
     path = folder / f"{scene.name}.json"
     path.write_text(json.dumps(_generate(scene)) + "\n")
     return path
-
-
-if __name__ == "__main__":
-    raise SystemExit("`python -m lerobot_env_cronos.benchmark.freeze orderings SCENE` writes a file of them")

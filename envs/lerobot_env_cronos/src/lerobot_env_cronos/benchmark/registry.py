@@ -5,18 +5,17 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
-import gymnasium as gym
 import mujoco
 import numpy as np
 
 from lerobot_env_cronos.benchmark.configurations import set_configurations_file
-from lerobot_env_cronos.benchmark.version import gymnasium_id
+from lerobot_env_cronos.benchmark.version import register_gymnasium
 from lerobot_env_cronos.scene.bodies import SHAPES, narrowest_width
 from lerobot_env_cronos.scene.model import TABLE
 from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, add_robot
 from lerobot_env_cronos.scene.scenes import BODIES, SCENES, Body, Scene
 from lerobot_env_cronos.scene.view import is_spawn_area_in_view
-from lerobot_env_cronos.scene.visuals.objects import FIXED_LOOKS, LOOKS
+from lerobot_env_cronos.scene.visuals.objects import LOOKS
 
 # Part of Gymnasium's environment ids and of file names.
 NAME_PATTERN = re.compile(r"[a-z0-9_]+")
@@ -38,10 +37,8 @@ def register_scene(scene: Scene, bodies: Sequence[Body] = (), configurations: Pa
             A scene that is there keeps those it has: others are a benchmark, `files.write_benchmark`.
 
     Raises:
-        ValueError: a name is taken by something else or malformed, a shape or a body is unknown, a size, density
-            or colour is none, the gripper cannot take an object, the spawn area is not within the workspace and
-            the front camera's view, the file is of another scene or has a configuration that cannot be used, or
-            the scene is there with other configurations. Nothing is registered then.
+        ValueError: a name is in use, a shape or body is unknown, the gripper cannot take an object, the spawn area
+            is out of reach or view, or the file cannot be used. Nothing is registered then.
     """
     new_bodies = {body.name: body for body in bodies}
     _check(scene, new_bodies)
@@ -58,88 +55,62 @@ def register_scene(scene: Scene, bodies: Sequence[Body] = (), configurations: Pa
         raise
     SCENES[scene.name] = scene
     if not known:
-        _register_gymnasium(scene.name)
+        register_gymnasium(scene.name)
 
 
 def _check(scene: Scene, new_bodies: dict[str, Body]) -> None:
-    if not NAME_PATTERN.fullmatch(scene.name):
-        raise ValueError(f"scene name {scene.name!r} must consist of a-z, 0-9 and _")
-    if SCENES.get(scene.name, scene) != scene:
-        raise ValueError(f"there is another scene {scene.name!r}; names in use: {sorted(SCENES)}")
-    for body in new_bodies.values():
-        _check_body(body)
+    if not NAME_PATTERN.fullmatch(scene.name) or SCENES.get(scene.name, scene) != scene:
+        raise ValueError(f"scene {scene.name!r} needs a name of a-z, 0-9 and _ that is not in {sorted(SCENES)}")
     if not scene.objects or not scene.receptacles or len(set(scene.bodies)) < len(scene.bodies):
         raise ValueError(f"a scene needs objects and receptacles, each once; {scene.name} has {scene.bodies}")
+    for body in new_bodies.values():
+        _check_body(body)
     bodies = BODIES | new_bodies
-    for name in scene.bodies:
-        if name not in bodies:
-            raise ValueError(f"unknown body {name!r}; valid bodies: {sorted(bodies)}")
-    columns: dict[str, str] = {}
-    for name in scene.bodies:
-        if (other := columns.setdefault(name.replace(" ", "_"), name)) != name:
-            raise ValueError(
-                f"the bodies {other!r} and {name!r} of {scene.name} differ only by a space or underscore, and the "
-                "columns of datasets would have one name: rename one of them"
-            )
+    if unknown := set(scene.bodies) - bodies.keys():
+        raise ValueError(f"unknown bodies {sorted(unknown)}; valid bodies: {sorted(bodies)}")
+    # Datasets name their columns so.
+    if len({name.replace(" ", "_") for name in scene.bodies}) < len(scene.bodies):
+        raise ValueError(f"names that differ only by a space or underscore: {scene.bodies}")
     _check_spawn_area(scene, bodies)
     for name in scene.objects:
-        width = narrowest_width(bodies[name])
-        if width >= MAX_WIDTH_M:
+        if (width := narrowest_width(bodies[name])) >= MAX_WIDTH_M:
             raise ValueError(
-                f"the {name} is an object, {1000 * width:.0f} mm wide where it is narrowest; the gripper takes "
-                f"less than {1000 * MAX_WIDTH_M:.0f} mm"
+                f"the {name} is {1000 * width:.0f} mm wide where it is narrowest; the gripper takes less than "
+                f"{1000 * MAX_WIDTH_M:.0f} mm"
             )
 
 
 def _check_body(body: Body) -> None:
     name, reserved, valid_shapes = body.name, _reserved_names(), sorted(SHAPES.keys() & LOOKS.keys())
-    if BODIES.get(name, body) != body:
-        raise ValueError(f"there is another body {name!r}; names in use: {sorted(BODIES)}")
-    if not name.strip() or "/" in name:
-        raise ValueError(
-            f"a body needs a name, without a slash, which parts of bodies have in theirs; got {name!r}"
-        )
-    if name in reserved:
-        raise ValueError(f"a body cannot be named {name!r}: reserved are {sorted(reserved)}")
+    if BODIES.get(name, body) != body or name in reserved or not name.strip() or "/" in name:
+        taken = sorted({*BODIES, *reserved})
+        raise ValueError(f"a body needs a name without a slash that is not in use, got {name!r}; in use: {taken}")
     if body.shape not in valid_shapes:
         raise ValueError(f"unknown shape {body.shape!r} of the {name}; valid shapes: {valid_shapes}")
-    sizes = body.size if isinstance(body.size, tuple | list) else ()
-    if len(sizes) != 3 or not all(map(_is_positive, (*sizes, body.density))):
+    numbers = np.array([*body.size, body.density], dtype=float)
+    if len(body.size) != 3 or not (np.isfinite(numbers) & (numbers > 0)).all():
         raise ValueError(
-            f"size and density of the {name} must be positive and finite, three numbers [m] and one [kg/m^3], got "
-            f"{body.size}, {body.density}"
+            f"size of the {name} must be three positive lengths [m], density positive [kg/m^3], got {body.size}, "
+            f"{body.density}"
         )
     if body.shape in ROUND_SHAPES and body.size[0] != body.size[1]:
         raise ValueError(f"a {body.shape} is round: the {name} needs two equal sides, got {body.size[:2]}")
-    if body.colour is None:
-        return
-    if LOOKS[body.shape] in FIXED_LOOKS:
-        coloured = [shape for shape in valid_shapes if LOOKS[shape] not in FIXED_LOOKS]
-        raise ValueError(
-            f"the {name} is a {body.shape}, which has colours of its own: leave colour={body.colour} out; shapes "
-            f"that take one: {coloured}"
-        )
-    if len(body.colour) != 3 or not all(0 <= channel <= 1 for channel in body.colour):
+    if body.colour is not None and (len(body.colour) != 3 or not all(0 <= c <= 1 for c in body.colour)):
         raise ValueError(f"colour of the {name} must be (R, G, B) in 0 to 1, got {body.colour}")
-
-
-def _is_positive(value: object) -> bool:
-    return isinstance(value, int | float | np.number) and bool(0 < value < np.inf)
 
 
 def _check_spawn_area(scene: Scene, bodies: dict[str, Body]) -> None:
     low, high = np.array(scene.spawn_low), np.array(scene.spawn_high)
     if not ((EE_LOW[:2] <= low) & (low < high) & (high <= EE_HIGH[:2])).all():
         raise ValueError(
-            f"spawn area of {scene.name}: spawn_low={scene.spawn_low} must be below spawn_high="
-            f"{scene.spawn_high}, and both in the workspace, {EE_LOW[:2].tolist()} to "
-            f"{EE_HIGH[:2].tolist()} m"
+            f"spawn_low={scene.spawn_low} of {scene.name} must be below spawn_high={scene.spawn_high}, both in "
+            f"{EE_LOW[:2].tolist()} to {EE_HIGH[:2].tolist()} m"
         )
     for name in scene.bodies:
         if not is_spawn_area_in_view(scene, bodies[name]):
             raise ValueError(
                 f"spawn area of {scene.name}: in a corner of {scene.spawn_low} to {scene.spawn_high} the front "
-                f"camera would not see the middle of the {name}, which counts as lost; x 0.17 to 0.42 and y -0.15 "
+                f"camera does not see the middle of the {name}, which counts as lost; x 0.17 to 0.42 and y -0.15 "
                 "to 0.15 m are in view with room for large bodies"
             )
 
@@ -150,15 +121,3 @@ def _reserved_names() -> frozenset[str]:
     robot = mujoco.MjSpec()
     add_robot(robot)
     return frozenset({TABLE, *(part.name for part in (*robot.bodies, *robot.joints))})
-
-
-def register_gymnasium() -> None:
-    """Register every scene of `SCENES` with Gymnasium."""
-    for scene in SCENES:
-        _register_gymnasium(scene)
-
-
-def _register_gymnasium(scene: str) -> None:
-    entry_point = "lerobot_env_cronos.episodic:CronosEnv"
-    vector_entry_point = "lerobot_env_cronos.autoreset:CronosGymVectorEnv"
-    gym.register(gymnasium_id(scene), entry_point, vector_entry_point=vector_entry_point, kwargs={"scene": scene})

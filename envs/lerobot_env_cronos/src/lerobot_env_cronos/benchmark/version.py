@@ -1,18 +1,19 @@
-"""The version of the environments, and the refusal of what another version made.
+"""The version of the environments, their Gymnasium ids, and the check of what another version made.
 
 Physics, grasp and success test, rewards, configurations and orderings together are one version: a change of any
-of them changes every result. It is the end of the Gymnasium ids, and datasets, runs, results and benchmarks say
-which one made them.
+of them changes every result. It ends the Gymnasium ids. Datasets, runs, results and benchmarks record the id.
 """
 
 import re
 
+import gymnasium as gym
+
+from lerobot_env_cronos.scene.scenes import SCENES, STEPS_PER_TASK
+
 VERSION = 1
 """Of all environments."""
 
-ENVIRONMENT_PATTERN = re.compile(r"(lerobot_env_cronos/)?(?P<scene>[a-z0-9_]+?)(-v(?P<version>\d+))?")
-EARLIER = {0: "0.1"}
-"""The release of the packages that has an earlier version of the environments."""
+ENVIRONMENT_PATTERN = re.compile(r"lerobot_env_cronos/(?P<scene>[a-z0-9_]+)-v(?P<version>\d{1,9})")
 
 
 def gymnasium_id(scene: str) -> str:
@@ -20,32 +21,31 @@ def gymnasium_id(scene: str) -> str:
     return f"lerobot_env_cronos/{scene}-v{VERSION}"
 
 
+def register_gymnasium(*scenes: str) -> None:
+    """Register scenes with Gymnasium, by default all of `SCENES`."""
+    for scene in scenes or SCENES:
+        gym.register(
+            gymnasium_id(scene),
+            "lerobot_env_cronos.episodic:CronosEnv",
+            vector_entry_point="lerobot_env_cronos.autoreset:CronosGymVectorEnv",
+            max_episode_steps=STEPS_PER_TASK,
+            kwargs={"scene": scene},
+        )
+
+
 def check_environment_id(text: str | None, what: str, remedy: str = "make it anew") -> str:
-    """Refuse what was not made with this version of the environments.
+    """The scene of an environment id that was recorded, such as `lerobot_env_cronos/kitchen_2x2-v1`.
 
     Args:
-        text: the environment id that was recorded, such as `lerobot_env_cronos/kitchen_2x2-v1`, or None where
-            nothing was: version 0 did not record it everywhere.
-        what: that it is of, as the sentence's subject: "dataset me/streams", "run outputs/train".
+        text: the id, or None where nothing was recorded.
+        what: has the id, as the message's subject: "dataset me/streams", "run outputs/train".
         remedy: what to do instead, such as "record it anew".
 
-    Returns:
-        The scene's name.
-
     Raises:
-        ValueError: it is of another version or none, or no environment id.
+        ValueError: it is of another version, or no environment id.
     """
     match = ENVIRONMENT_PATTERN.fullmatch(text or "")
-    if text and match is None:
-        raise ValueError(f"{what} was made with {text!r}; expected an id such as {gymnasium_id('kitchen_2x2')}")
-    version = None if match is None or match["version"] is None else int(match["version"])
-    if match is not None and version == VERSION:
-        return match["scene"]
-    if version is not None and version > VERSION:
-        raise ValueError(f"{what} was made with {text}; this is version {VERSION}: install newer packages")
-    release, old = EARLIER.get(version or 0), version or 0
-    made = "does not say which version of the environment made it" if version is None else f"was made with {text}"
-    raise ValueError(
-        f"{what} {made}; this is version {VERSION}, whose physics and success test differ: {remedy}, or use it "
-        f"with cronos-lerobot {release}, which has version {old}"
-    )
+    if match is None or int(match["version"]) != VERSION:
+        made = f"was made with {text[:100]}" if text else "does not say which version of the environment made it"
+        raise ValueError(f"{what} {made}; this is version {VERSION}: {remedy}")
+    return match["scene"]

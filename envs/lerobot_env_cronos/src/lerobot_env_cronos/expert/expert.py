@@ -75,15 +75,15 @@ class Command(NamedTuple):
 class ScriptedExpert:
     """Expert actions for the current tasks of a `CronosVectorEnv`.
 
+    It is deterministic.
+
     Args:
         env: whose state is read; it is never changed.
-        seed: kept for interfaces that pass one; the expert is deterministic and draws nothing.
         streams: act in these alone (k,); n is k then, and streams are numbered by their place in here.
     """
 
-    def __init__(self, env: CronosVectorEnv, seed: int = 0, streams: np.ndarray | None = None):
-        self.env, self.seed = env, seed
-        self.sim, self.scene = env.simulation, env.scene
+    def __init__(self, env: CronosVectorEnv, streams: np.ndarray | None = None):
+        self.env, self.sim, self.scene = env, env.simulation, env.scene
         n, bodies = env.num_envs if streams is None else len(streams), self.scene.bodies
         self._mine = slice(None) if streams is None else streams
         self._boxes = SceneBoxes.from_model(self.sim.model, self.scene)

@@ -7,7 +7,7 @@ import numpy as np
 
 from lerobot_env_cronos.scene import visuals
 from lerobot_env_cronos.scene.bodies import add_body
-from lerobot_env_cronos.scene.physics import PHYSICS, Physics
+from lerobot_env_cronos.scene.physics import INTEGRATOR, SOLREF, TIMESTEP_S
 from lerobot_env_cronos.scene.robot import CONTACT_SOLIMP, add_robot
 from lerobot_env_cronos.scene.scenes import BODIES, Scene
 
@@ -49,13 +49,13 @@ def support_sensor(obj: str, support: str) -> str:
     return f"{obj}/{support}"
 
 
-def build_spec(scene: Scene, looks: bool = True, physics: Physics = PHYSICS) -> mujoco.MjSpec:
+def build_spec(scene: Scene, looks: bool = True) -> mujoco.MjSpec:
     """Build the scene's MjSpec: table, floor, WX250S, free bodies, cameras, contact sensors, and their looks."""
     spec = mujoco.MjSpec()
     spec.modelname = scene.name
     spec.compiler.degree = False
     spec.compiler.autolimits = True
-    _set_options(spec, physics)
+    _set_options(spec)
     _add_furniture(spec)
     add_robot(spec)
     bodies = {name: add_body(spec, BODIES[name]) for name in scene.bodies}
@@ -69,9 +69,9 @@ def build_spec(scene: Scene, looks: bool = True, physics: Physics = PHYSICS) -> 
     return spec
 
 
-def build_model(scene: Scene, looks: bool = True, physics: Physics = PHYSICS) -> mujoco.MjModel:
+def build_model(scene: Scene, looks: bool = True) -> mujoco.MjModel:
     """Compile the scene's model; what it looks like has no mass, touches nothing, and costs physics time."""
-    return build_spec(scene, looks, physics).compile()
+    return build_spec(scene, looks).compile()
 
 
 def camera_axes(name: str) -> tuple[np.ndarray, np.ndarray, float]:
@@ -97,11 +97,11 @@ def _camera_quat(xyaxes: list[float]) -> np.ndarray:
     return quat
 
 
-def _set_options(spec: mujoco.MjSpec, physics: Physics) -> None:
-    spec.default.geom.solref = spec.default.equality.solref = physics.solref
+def _set_options(spec: mujoco.MjSpec) -> None:
+    spec.default.geom.solref = spec.default.equality.solref = SOLREF
     option = spec.option
-    option.timestep = physics.timestep_s
-    option.integrator = physics.integrator
+    option.timestep = TIMESTEP_S
+    option.integrator = INTEGRATOR
     # Elliptic cones and a high friction-to-normal impedance ratio: grasped objects do not creep.
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = 10.0

@@ -4,13 +4,11 @@ import ctypes.util
 import os
 import sys
 
-HELP = (
-    "cannot open an OpenGL context (MUJOCO_GL={platform!r}). Headless rendering on Debian or Ubuntu needs "
-    "`apt-get install libegl1 libgl1 libgl1-mesa-dri` and MUJOCO_GL=egl; `--env.obs_type="
+NO_CONTEXT = (
+    "cannot open an OpenGL context (MUJOCO_GL={platform!r}): {cause}. If packages are missing, install on Debian "
+    "or Ubuntu `apt-get install libegl1 libgl1 libgl1-mesa-dri` and set MUJOCO_GL=egl; `--env.obs_type="
     "environment_state_agent_pos` needs no OpenGL"
 )
-
-
 FORKED = (
     "this process was forked from one that had drawn, and OpenGL does not survive a fork: start it by spawn or "
     "forkserver (gymnasium.vector.AsyncVectorEnv(..., context='spawn')), or before the first frame is drawn; "

@@ -201,11 +201,6 @@ class Judge:
         i = self.scene.objects.index(obj)
         return (self.rests[:, i] == ON_TABLE) & ~self.grasped[:, i]
 
-    def get_state(self) -> dict[str, np.ndarray]:
-        """What the next reading depends on, as arrays with a leading dimension n."""
-        return {name: getattr(self, name).copy() for name in self.STATE_FIELDS}
-
-    def set_state(self, state: dict[str, np.ndarray]) -> None:
-        """Continue from a state taken by `get_state`."""
-        for name in self.STATE_FIELDS:
-            getattr(self, name)[:] = state[name]
+    def state_arrays(self) -> dict[str, np.ndarray]:
+        """What the next reading depends on: live arrays with a leading dimension n."""
+        return {name: getattr(self, name) for name in self.STATE_FIELDS}

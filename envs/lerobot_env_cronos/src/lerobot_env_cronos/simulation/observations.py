@@ -1,11 +1,10 @@
 """Observations: pixels, proprioception and the privileged state, in Gymnasium's and LeRobot's raw format."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from lerobot.envs.utils import parse_camera_names
 
 from lerobot_env_cronos.scene.model import CAMERAS
 from lerobot_env_cronos.scene.scenes import Scene, Task
@@ -29,6 +28,14 @@ TASK_OBSERVATIONS = ("none", "one_hot")
 
 STATE_LIMIT = 10.0
 """Bound of every state observation; a body further away than this has left the room [m]."""
+
+
+def parse_cameras(camera_name: str) -> list[str]:
+    """Cameras of a comma-separated list; a ValueError names the valid ones."""
+    cameras = [name.strip() for name in camera_name.split(",") if name.strip()]
+    if not cameras or set(cameras) - CAMERAS.keys():
+        raise ValueError(f"unknown camera_name {camera_name!r}; valid, comma-separated: {sorted(CAMERAS)}")
+    return cameras
 
 
 def environment_state_names(scene: Scene) -> tuple[str, ...]:
@@ -69,21 +76,20 @@ class ObservationBuilder:
         render_size: tuple[int, int],
         renderer: str = "classic",
         task_observation: str = "none",
+        flat_observation: bool = False,
     ):
         if obs_type not in OBS_TYPES:
             raise ValueError(f"unknown obs_type {obs_type!r}; valid obs_types: {list(OBS_TYPES)}")
         if renderer not in RENDERERS:
             raise ValueError(f"unknown renderer {renderer!r}; valid renderers: {list(RENDERERS)}")
-        if len(render_size) != 2 or min(height, width, *render_size) < 1:
+        if np.shape(render_size) != (2,) or min(height, width, *render_size) < 1:
             raise ValueError(
-                "observation_height, observation_width and render_size, height and width, must be at least 1, got "
-                f"{height}, {width} and {tuple(render_size)}"
+                "observation_height, observation_width and render_size=(height, width) must be at least 1, got "
+                f"{height}, {width} and {render_size}"
             )
         self.renderer = renderer
-        self.cameras = parse_camera_names(camera_name)
-        for camera in self.cameras:
-            if camera not in CAMERAS:
-                raise ValueError(f"unknown camera {camera!r}; valid cameras: {sorted(CAMERAS)}")
+        self.cameras = parse_cameras(camera_name)
+        self.flat = flat_observation
         self.simulation = simulation
         self.agent_pos_names = agent_pos_names(simulation.scene, task_observation)
         self.tells_task = task_observation == "one_hot"
@@ -102,8 +108,15 @@ class ObservationBuilder:
             spaces["environment_state"] = box(len(environment_state_names(self.simulation.scene)))
         if self.pixels:
             image = gym.spaces.Box(0, 255, (*self.size, 3), np.uint8)
-            spaces["pixels"] = gym.spaces.Dict(dict.fromkeys(self.cameras, image))
+            images: dict[str, gym.Space] = dict.fromkeys(self.cameras, image)
+            spaces |= self._place_images(images, gym.spaces.Dict)
         return gym.spaces.Dict(spaces)
+
+    def _place_images(self, images: dict[str, Any], group: Callable = dict) -> dict[str, Any]:
+        """Where an observation, or its space, has the images of the cameras."""
+        if self.flat:
+            return {f"pixels_{camera}": image for camera, image in images.items()}
+        return {"pixels": group(images)}
 
     def observe(self, ids: np.ndarray, tasks: Sequence[Task]) -> dict[str, Any]:
         """Observation of simulations `ids` (k,) under their `tasks`, (k, ...); every array is fresh."""
@@ -116,9 +129,8 @@ class ObservationBuilder:
             observation["environment_state"] = self._environment_state(p)[ids]
         if self.pixels:
             qpos = self.simulation.qpos[ids]
-            observation["pixels"] = {
-                camera: self._renderer(self.size, camera).render(qpos) for camera in self.cameras
-            }
+            images = {camera: self._renderer(self.size, camera).render(qpos) for camera in self.cameras}
+            observation |= self._place_images(images)
         return observation
 
     def tell(self, observation: dict[str, Any], tasks: Sequence[Task]) -> dict[str, Any]:

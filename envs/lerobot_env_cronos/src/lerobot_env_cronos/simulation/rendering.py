@@ -121,7 +121,8 @@ def _open(model: mujoco.MjModel, height: int, width: int, camera: int, shadows: 
     try:
         return Canvas(model, height, width, camera, shadows)
     except Exception as error:  # The platforms raise whatever their bindings do.
-        raise gl.RenderingError(gl.HELP.format(platform=os.environ.get("MUJOCO_GL"))) from error
+        cause = f"{type(error).__name__}: {error}"
+        raise gl.RenderingError(gl.NO_CONTEXT.format(platform=os.environ.get("MUJOCO_GL"), cause=cause)) from error
 
 
 def _close(canvas: Canvas, opened_by: int) -> None:

@@ -6,16 +6,18 @@ kinematics and are ramped over most of the control step.
 """
 
 import os
+import zlib
 from functools import cached_property
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
+from lerobot_env_cronos.benchmark.version import VERSION
 from lerobot_env_cronos.scene.model import build_model
-from lerobot_env_cronos.scene.physics import PHYSICS, RAMP_CHUNKS, Physics
+from lerobot_env_cronos.scene.physics import CHUNK_SUBSTEPS, RAMP_CHUNKS, SETTLE_SUBSTEPS, SUBSTEPS
 from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, FINGER_CLOSED, FINGER_OPEN, FINGERTIP_REACH, HOME_QPOS
-from lerobot_env_cronos.scene.scenes import Scene
+from lerobot_env_cronos.scene.scenes import BODIES, Scene
 from lerobot_env_cronos.simulation.judging import Judge
 from lerobot_env_cronos.simulation.kinematics import (
     LastPose,
@@ -26,8 +28,20 @@ from lerobot_env_cronos.simulation.kinematics import (
 
 ACTION_LOW = np.array([-0.028727253, -0.0417035, -0.026093859, -0.08092105, -0.092886995, -0.20718276, 0.0])
 ACTION_HIGH = np.array([0.028309678, 0.040855255, 0.040161587, 0.0819204776, 0.0779285, 0.203825745, 1.0])
-"""q01 and q99 of `bridge_orig`, the range that OpenVLA's action tokens span: m, rad, gripper (1 open)."""
+"""q01 and q99 of `bridge_orig`, the range that OpenVLA's action tokens span: m, rad, gripper (1 open).
+
+Rotations here are a rotation vector. Those of `bridge_orig` are Euler angles: up to .77 degrees apart a step."""
 ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
+
+
+def _round_outwards(bound: np.ndarray, towards: float) -> np.ndarray:
+    nearest = bound.astype(np.float32)
+    inside = nearest > bound if towards < 0 else nearest < bound
+    return np.where(inside, np.nextafter(nearest, np.float32(towards)), nearest)
+
+
+ACTION_LOW_F32, ACTION_HIGH_F32 = _round_outwards(ACTION_LOW, -np.inf), _round_outwards(ACTION_HIGH, np.inf)
+"""The bounds as float32, rounded outwards: an action that was clipped to them does exactly the same again."""
 
 NUM_ARM_JOINTS, NUM_ROBOT_JOINTS = 6, 8
 MAX_SPEED = 200.0
@@ -53,13 +67,12 @@ class Simulation:
     least 1, with all cores counted.
     """
 
-    def __init__(self, scene: Scene, num_sims: int, num_threads: int = 0, physics: Physics = PHYSICS):
+    def __init__(self, scene: Scene, num_sims: int, num_threads: int = 0):
         if num_threads < 0:
             raise ValueError(f"num_threads must be 0 (all cores) or more, got {num_threads}")
-        self.scene, self.physics = scene, physics
-        self.num_sims = num_sims
+        self.scene, self.num_sims = scene, num_sims
         self.num_threads = num_threads or num_cores()
-        self.model = build_model(scene, looks=False, physics=physics)
+        self.model = build_model(scene, looks=False)
         self._batch = Batch(self.model, num_sims, self.num_threads, persistent=True)
         self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl, self.sensordata = self._batch.bind("ctrl"), self._batch.bind("sensordata")
@@ -101,11 +114,10 @@ class Simulation:
         self.gripper_target[ids] = np.where(actions[:, 6] > 0.5, FINGER_OPEN, FINGER_CLOSED)
         self._ctrl[ids, NUM_ARM_JOINTS] = self.gripper_target[ids]
         broken = np.zeros(self.num_sims, dtype=bool)
-        physics, chunk = self.physics, self.physics.chunk_substeps
         for k in range(1, RAMP_CHUNKS + 1):
             self._ctrl[ids, :NUM_ARM_JOINTS] = start + (k / RAMP_CHUNKS) * (goal - start)
             last = k == RAMP_CHUNKS
-            broken |= self._advance(ids, physics.substeps - (RAMP_CHUNKS - 1) * chunk if last else chunk)
+            broken |= self._advance(ids, SUBSTEPS - (RAMP_CHUNKS - 1) * CHUNK_SUBSTEPS if last else CHUNK_SUBSTEPS)
             self.judge.look(ids)
         diverged = broken[ids] | self._is_diverged(ids)
         if diverged.any():
@@ -210,7 +222,7 @@ class Simulation:
         """
         before = self.qpos[ids].copy()
         for _ in range(SETTLE_MAX_CHUNKS):
-            broken = self._advance(ids, self.physics.settle_substeps)
+            broken = self._advance(ids, SETTLE_SUBSTEPS)
             diverged = broken[ids] | self._is_diverged(ids)
             if diverged.any():
                 self._restore(ids[diverged], before[diverged])
@@ -271,7 +283,17 @@ class Simulation:
 
     # State ------------------------------------------------------------------------------------------------
 
-    _STATE_FIELDS = ("qpos", "qvel", "ctrl", "qacc_warmstart", "time")
+    def _state_arrays(self) -> dict[str, np.ndarray]:
+        """The arrays, with a leading dimension n, that decide the future."""
+        bound = {name: self._batch.bind(name) for name in ("qpos", "qvel", "ctrl", "qacc_warmstart", "time")}
+        targets = {"arm_target": self.arm_target, "gripper_target": self.gripper_target}
+        return bound | targets | self.judge.state_arrays()
+
+    @cached_property
+    def _scene_number(self) -> np.ndarray:
+        """A hash of the scene, for each simulation."""
+        scene = (VERSION, self.scene, [BODIES[name] for name in self.scene.bodies])
+        return np.full(self.num_sims, zlib.crc32(repr(scene).encode()))
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Everything that decides the future, as arrays with a leading dimension n.
@@ -279,18 +301,30 @@ class Simulation:
         Bodies that MuJoCo put to sleep are woken by this call, exactly as `set_state` wakes them, so that a
         simulation that goes on and one that was loaded stay bit-identical.
         """
-        state = {name: self._batch.bind(name).copy() for name in self._STATE_FIELDS}
-        state |= {"arm_target": self.arm_target.copy(), "gripper_target": self.gripper_target.copy()}
-        state |= self.judge.get_state()
+        state = {name: array.copy() for name, array in self._state_arrays().items()}
+        state["scene"] = self._scene_number.copy()
         self.set_state(state)
         return state
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
-        """Continue from a state taken by `get_state`."""
+        """Continue from a state taken by `get_state`.
+
+        Raises:
+            ValueError: it is of another scene or number of simulations, or incomplete; nothing changes.
+        """
+        arrays = self._state_arrays()
+        check_state(state, arrays)
+        if (state["scene"] != self._scene_number).any():
+            raise ValueError(f"the state is of another scene than {self.scene.name}, or of other bodies")
         self._batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
-        for name in self._STATE_FIELDS:
-            self._batch.bind(name)[:] = state[name]
-        self.arm_target[:] = state["arm_target"]
-        self.gripper_target[:] = state["gripper_target"]
-        self.judge.set_state(state)
+        for name, array in arrays.items():
+            array[:] = state[name]
         self._batch.forward()
+
+
+def check_state(state: dict[str, np.ndarray], arrays: dict[str, np.ndarray]) -> None:
+    """Raise a ValueError unless `state` has all of `arrays`, in their shapes."""
+    for name, array in arrays.items():
+        found = np.shape(state[name]) if name in state else "nothing"
+        if found != array.shape:
+            raise ValueError(f"{name} of the state must be of shape {array.shape}, got {found}")

@@ -176,6 +176,3 @@ LOOKS: dict[str, Callable[[mujoco.MjSpec, mujoco.MjsBody, Body], None]] = {
     "disc": _dress_disc,
 }
 """How to draw a body, by `Body.shape`."""
-
-FIXED_LOOKS = frozenset(LOOKS.values()) - {_dress_box, _dress_disc}
-"""Those of this package that have colours of their own, whatever `Body.colour`."""
