@@ -4,19 +4,19 @@ from enum import IntEnum
 
 
 class Intervention(IntEnum):
-    """What happened to a stream right before a frame (column `cronos.intervention`).
+    """What happened to a stream right before a frame (column `cronos.event`).
 
-    Ordered by strength, up to INITIAL. Where several happen at one task switch, the frame carries the strongest:
-    `max(kinds)`. Every value but NONE stands on the first frame of a segment, and only there.
+    Ordered by strength, up to INITIAL. Where several happen at one task switch, the frame carries the strongest.
+    Every value but NONE stands on the first frame of a segment, and only there.
 
-    TAKEOVER stands on none: it is no change of the scene but who acts after it, and a frame has to say both. It is
-    counted here; the frames of a takeover are marked in a column of their own, `intervention`.
+    HELP stands on no frame: it may begin anywhere, and changes who acts, not the scene. It is counted here; the
+    frames with help are marked in a column of their own, `intervention`.
     """
 
     NONE = 0
     """The frame follows its predecessor by one control step."""
     TASK_SWITCH = 1
-    """Only the instruction changed; the scene and the arm are as the segment before left them."""
+    """Only the instruction changed; the scene and the arm are as the segment before left them. Free."""
     END_EFFECTOR_RESET = 2
     """The arm went home with the gripper open; the bodies stayed. Free."""
     HEURISTIC_RESET = 3
@@ -24,12 +24,19 @@ class Intervention(IntEnum):
     SCENE_RESET = 4
     """Every body went to a benchmark configuration, the arm home. Counts towards the budget."""
     DIVERGENCE = 5
-    """A scene reset that the simulation forced, because its state was no longer finite."""
+    """A scene reset that the simulation forced: its state was no longer finite. Counts towards the budget."""
     INITIAL = 6
     """The stream's very first placement. Free."""
-    TAKEOVER = 7
-    """An expert does the segment that begins. Counts towards the budget, at a price of its own."""
+    HELP = 7
+    """A person or a script begins to act in the policy's place. Counts towards the budget."""
 
 
-BEFORE_SEGMENTS = tuple(kind for kind in Intervention if kind not in (Intervention.NONE, Intervention.TAKEOVER))
+COUNTED_INTERVENTIONS = (
+    Intervention.SCENE_RESET,
+    Intervention.HEURISTIC_RESET,
+    Intervention.DIVERGENCE,
+    Intervention.HELP,
+)
+"""Each of these spends 1 of the budget B."""
+BEFORE_SEGMENTS = tuple(kind for kind in Intervention if kind not in (Intervention.NONE, Intervention.HELP))
 """What the first frame of a segment may carry."""

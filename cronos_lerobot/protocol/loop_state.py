@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cronos_lerobot.protocol.config import COUNTED_INTERVENTIONS
-from cronos_lerobot.protocol.interventions import Intervention
+from cronos_lerobot.protocol.interventions import COUNTED_INTERVENTIONS, Intervention
 
 if TYPE_CHECKING:
     from cronos_lerobot.agents.base import ActionSample
@@ -54,33 +53,20 @@ class LoopState:
     """(N,) whether the simulation broke down in the last step and waits to be put back."""
     preceded_by: np.ndarray = field(init=False)
     """(N,) Intervention between the last step and the next one."""
-    taken_over: np.ndarray = field(init=False)
-    """(N,) whether an expert does the current segment."""
+    intervened: np.ndarray = field(init=False)
+    """(N,) whether a person or a script acted in the last step."""
+    helped: np.ndarray = field(init=False)
+    """(N,) whether one acted at any step of the current segment."""
     attempts: np.ndarray = field(init=False)
-    """(N, tasks) finished segments of each task of the task set, reset tasks included, takeovers not."""
+    """(N, tasks) finished segments of each task of the task set, reset tasks included, without those with help."""
     successes: np.ndarray = field(init=False)
     """(N, tasks) of these, those with a success."""
-    failures: np.ndarray = field(init=False)
-    """(N, tasks) failures in a row at each task, since its last success or takeover; segments that found it
-    complete do not count."""
     recent_task: np.ndarray = field(init=False)
     """(N, HISTORY) tasks of the latest segments, the last one at the end; -1 where there was none yet."""
     recent_success: np.ndarray = field(init=False)
-    """(N, HISTORY) whether they were a success, the policy's or an expert's: 1 or 0; -1 where there was none."""
+    """(N, HISTORY) whether they were a success, with or without help: 1 or 0; -1 where there was none."""
     interventions: np.ndarray = field(init=False)
     """(N, len(Intervention)) events of each kind."""
-    task_value: np.ndarray = field(init=False)
-    """(N,) the agent's value of the current task when it was given, where the task order asked for it; else 0."""
-    first_task: np.ndarray = field(init=False)
-    """(N,) the task that the last scene reset of a stream was for, until it is given; -1 is none."""
-    reset_value: np.ndarray = field(init=False)
-    """(N,) its best value over the tasks when the stream's last scene reset was asked for, if by value; else 0."""
-    scene_resets_before: np.ndarray = field(init=False)
-    """(N,) scene resets that had been counted when the last segment ended."""
-    asked_resets: np.ndarray = field(init=False)
-    """(N,) scene resets that were asked for by value, of all that are counted in `interventions`."""
-    takeover_cost: np.ndarray = field(init=False)
-    """(N,) what takeovers have counted as, each at the price of its time."""
 
     def __post_init__(self) -> None:
         n = self.num_streams
@@ -92,19 +78,13 @@ class LoopState:
         self.found_complete = np.zeros(n, np.bool_)
         self.diverged = np.zeros(n, np.bool_)
         self.preceded_by = np.full(n, Intervention.NONE, np.int64)
-        self.taken_over = np.zeros(n, np.bool_)
+        self.intervened = np.zeros(n, np.bool_)
+        self.helped = np.zeros(n, np.bool_)
         self.attempts = np.zeros((n, self.num_tasks + self.num_reset_tasks), np.int64)
         self.successes = np.zeros_like(self.attempts)
-        self.failures = np.zeros_like(self.attempts)
         self.recent_task = np.full((n, HISTORY), -1, np.int64)
         self.recent_success = np.full((n, HISTORY), -1, np.int64)
         self.interventions = np.zeros((n, len(Intervention)), np.int64)
-        self.task_value = np.zeros(n)
-        self.first_task = np.full(n, -1, np.int64)
-        self.reset_value = np.zeros(n)
-        self.scene_resets_before = np.zeros(n, np.int64)
-        self.asked_resets = np.zeros(n, np.int64)
-        self.takeover_cost = np.zeros(n, np.int64)
 
     @property
     def n(self) -> int:
@@ -124,7 +104,7 @@ class LoopState:
     @property
     def stream_interventions(self) -> np.ndarray:
         """(N,) interventions of each stream that count against the budget."""
-        return self.interventions[:, COUNTED_INTERVENTIONS].sum(axis=1) + self.takeover_cost
+        return self.interventions[:, COUNTED_INTERVENTIONS].sum(axis=1)
 
     def interventions_by_kind(self) -> dict[str, int]:
         """Events of each kind summed over the streams, by lower-case name."""
@@ -138,16 +118,34 @@ class LoopState:
         """Begin a segment of every stream.
 
         Args:
-            task: (N,) indices into the task set, for all but those whose scene reset was for another one.
+            task: (N,) int, indices into the task set.
+
+        Raises:
+            ValueError: it is anything else.
         """
-        was_for_one = self.first_task >= 0
-        self.task = np.where(was_for_one, self.first_task, np.asarray(task, np.int64))
-        self.first_task = np.full(self.num_streams, -1, np.int64)
-        self.taken_over = np.zeros(self.num_streams, np.bool_)
+        task = np.asarray(task)
+        is_int = task.shape == (self.num_streams,) and task.dtype.kind in "iu"
+        if not (is_int and ((task >= 0) & (task < self.num_tasks + self.num_reset_tasks)).all()):
+            raise ValueError(
+                f"--protocol.task_order must draw ({self.num_streams},) ints from 0 to {self.num_tasks - 1}, "
+                f"got {task!r}."
+            )
+        self.task = task.astype(np.int64)
         self.begins_segment = True
         self.switches += 1
         self.interventions[:, Intervention.TASK_SWITCH] += 1
         self.preceded_by = np.maximum(self.preceded_by, Intervention.TASK_SWITCH)
+
+    def count_help(self, intervened: np.ndarray | None) -> None:
+        """Count one HELP for each stream where help begins.
+
+        Args:
+            intervened: (N,) bool, a person or a script acted in this step; None where nobody can.
+        """
+        acted = np.zeros(self.num_streams, np.bool_) if intervened is None else intervened
+        self.interventions[:, Intervention.HELP] += acted & ~self.intervened
+        self.intervened = acted.copy()
+        self.helped |= acted
 
     def count_step(self, info: dict[str, Any], cut: np.ndarray) -> None:
         """Count one control step of every stream.
@@ -176,12 +174,6 @@ class LoopState:
         if kind is Intervention.DIVERGENCE:
             self.diverged[ids] = False
 
-    def begin_takeover(self, ids: np.ndarray, price: int) -> None:
-        """Let an expert do the segment that begins in each stream of `ids`, for `price` interventions."""
-        self.interventions[ids, Intervention.TAKEOVER] += 1
-        self.takeover_cost[ids] += price
-        self.taken_over[ids] = True
-
     def end_segment(self) -> SegmentEnd:
         """Close the segment of every stream and return what it came to."""
         end = SegmentEnd(
@@ -190,20 +182,17 @@ class LoopState:
             success=self.succeeded,
             found_complete=self.found_complete,
             never_grasped=self.succeeded & ~self.found_complete & ~self.grasped,
-            taken_over=self.taken_over,
+            helped=self.helped,
         )
-        streams, own = np.arange(self.num_streams), ~self.taken_over
+        streams, own = np.arange(self.num_streams), ~self.helped
         self.attempts[streams, self.task] += own
         self.successes[streams, self.task] += self.succeeded & own
-        failures = self.failures[streams, self.task]
-        failures = np.where(self.succeeded & ~self.found_complete | self.taken_over, 0, failures)
-        self.failures[streams, self.task] = failures + (~self.succeeded & own)
         self.recent_task = np.column_stack([self.recent_task[:, 1:], self.task])
         self.recent_success = np.column_stack([self.recent_success[:, 1:], self.succeeded])
         self.succeeded = np.zeros(self.num_streams, np.bool_)
         self.grasped = np.zeros(self.num_streams, np.bool_)
+        self.helped = np.zeros(self.num_streams, np.bool_)
         self.segments_since_reset += 1
-        self.scene_resets_before = self.interventions[:, Intervention.SCENE_RESET].copy()
         return end
 
     def state_dict(self) -> dict[str, Any]:
@@ -216,15 +205,9 @@ class LoopState:
         loop = cls(state["num_streams"], state["num_tasks"], state["num_reset_tasks"])
         for name, value in state.items():
             template = getattr(loop, name)
-            if name == "interventions":
-                # Checkpoints from before there were takeovers have fewer kinds.
-                value = [[*kinds, *[0] * (len(Intervention) - len(kinds))] for kinds in value]
             if isinstance(template, np.ndarray):
                 value = np.asarray(value, template.dtype).reshape(template.shape)
             setattr(loop, name, value)
-        if "asked_resets" not in state:
-            # Older checkpoints told all scene resets of a run that asks for them as asked for.
-            loop.asked_resets = loop.interventions[:, Intervention.SCENE_RESET].copy()
         return loop
 
 
@@ -256,8 +239,8 @@ class Step:
     """(N,) counted interventions of the stream before this step."""
     policy_version: int
     """Number of updates of the policy that acted."""
-    taken_over: np.ndarray | None = None
-    """(N,) bool, an expert does this segment; None where there are no experts."""
+    intervened: np.ndarray
+    """(N,) bool, a person or a script acted in this step."""
 
 
 @dataclass(frozen=True)
@@ -281,8 +264,8 @@ class SegmentEnd:
     """(N,) bool, a success for which nothing had to be done: an earlier task had left it complete."""
     never_grasped: np.ndarray
     """(N,) bool, another success whose object was grasped at no step of the segment: pushed or dropped."""
-    taken_over: np.ndarray
-    """(N,) bool, an expert did it, not the policy."""
+    helped: np.ndarray
+    """(N,) bool, a person or a script acted at any step of it."""
 
 
 Event = Step | Update | SegmentEnd

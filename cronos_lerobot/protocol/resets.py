@@ -1,21 +1,62 @@
-"""Reset strategies: who is helped at a task switch, how, and what it counts as."""
+"""Reset strategies: which streams are reset at a task switch, how, and what it counts as."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
 
-from cronos_lerobot.protocol.config import COUNTED_INTERVENTIONS, ProtocolConfig
+from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.interventions import BEFORE_SEGMENTS, Intervention
-from cronos_lerobot.protocol.learnable_starts import LearnableStarts
 from cronos_lerobot.protocol.loop_state import LoopState
-from cronos_lerobot.protocol.reset_strategy import ResetStrategy
-from cronos_lerobot.protocol.task_values import RunContext, TaskValues
+from cronos_lerobot.protocol.run_context import RunContext
+from cronos_lerobot.registry import Registry
+
+
+class ResetStrategy(ABC):
+    """One kind of intervention: which streams need it now, and how it is applied to them.
+
+    What it has to remember of a stream is in `LoopState`. What it keeps besides that and its generator it tells in
+    `state_dict`, or a resumed run continues without it.
+    """
+
+    kind: Intervention
+    """What it is counted and recorded as; `COUNTED_INTERVENTIONS` are those that spend the budget."""
+
+    @abstractmethod
+    def due(self, env: Any, loop: LoopState) -> np.ndarray:
+        """Return the ids, a rising (k,) int array, of the streams to intervene on now."""
+
+    @abstractmethod
+    def apply(self, env: Any, ids: np.ndarray) -> None:
+        """Intervene on the streams `ids`."""
+
+    def bind(self, run: RunContext) -> None:
+        """Told once, before the run begins or resumes, what it is made of. A ValueError refuses the run."""
+        return
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint has to hold of it: nested dicts and lists of numbers, strings and NumPy arrays."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`, if that was not empty; called after `bind`."""
+        return
+
+    def apply_if_due(self, env: Any, loop: LoopState) -> bool:
+        """Intervene where it is due and count it; returns whether any stream was touched."""
+        ids = np.asarray(self.due(env, loop))
+        if ids.size == 0:
+            return False
+        is_rising = ids.ndim == 1 and ids.dtype.kind in "iu" and (np.diff(ids) > 0).all()
+        if not is_rising or ids[0] < 0 or ids[-1] >= loop.num_streams:
+            raise ValueError(f"{type(self).__name__}.due must return rising ids of streams, got {ids!r}.")
+        self.apply(env, ids)
+        loop.count_intervention(ids, self.kind)
+        return True
 
 
 class NoReset(ResetStrategy):
@@ -46,10 +87,10 @@ class EndEffectorReset(ResetStrategy):
 
 
 class HeuristicReset(ResetStrategy):
-    """Bodies that no task can reach any more are put back on the table, the others stay (HSR).
+    """Bodies that no task can reach any more are put back at a free place, the others stay (HSR).
 
-    A body is, if its centre is outside the end effector's workspace or the camera's picture, or if it fell; see
-    `lerobot_env_cronos.simulation.workspace`. One event for each stream, however many bodies it had to put back.
+    A body is, if its centre is outside the workspace or the camera's picture, or if it fell. It is one event for
+    each stream, however many bodies are put back.
 
     Args:
         rng: draws the free places.
@@ -73,14 +114,16 @@ class HeuristicReset(ResetStrategy):
 
 
 class SceneReset(ResetStrategy):
-    """Bodies go back to a random training configuration and the arm goes home. The base of three strategies.
+    """Bodies go to a random training configuration and the arm goes home. The base of all scene resets.
 
     Args:
         rng: draws the configuration of the train split, one for each stream.
-        num_configurations: draws only from the first so many of the split.
+        num_configurations: draws from the first N of the split only.
     """
 
-    def __init__(self, rng: np.random.Generator, num_configurations: int = NUM_CONFIGURATIONS) -> None:
+    kind = Intervention.SCENE_RESET
+
+    def __init__(self, rng: np.random.Generator, num_configurations: int) -> None:
         self.rng = rng
         self.num_configurations = num_configurations
 
@@ -93,13 +136,10 @@ class PeriodicSceneReset(SceneReset):
     """Every stream is reset every T steps (paper, Section 5), where T may follow a curriculum.
 
     Staggered, stream i of N is reset i/N of T, in whole segments, before the multiples of T. Of the streams that
-    are reset at the same moment each then goes on with another task of the heuristic order.
+    are reset at the same moment each then has another task of the heuristic order.
 
-    A stream that an extra strategy has reset at the same switch is as it should be, and is not reset and counted
-    again.
+    A stream that an extra strategy has reset at the same switch is not reset and counted again.
     """
-
-    kind = Intervention.SCENE_RESET
 
     def __init__(self, rng: np.random.Generator, protocol: ProtocolConfig) -> None:
         super().__init__(rng, protocol.num_configurations)
@@ -112,73 +152,10 @@ class PeriodicSceneReset(SceneReset):
         interval = self.interval_at(loop.n)
         if interval is None:
             return np.empty(0, np.int64)
-        streams = np.arange(loop.num_streams)
-        segments = interval // self.segment
+        streams, segments = np.arange(loop.num_streams), interval // self.segment
         phase = streams * segments // loop.num_streams if self.is_staggered else 0 * streams
         is_due = (loop.t // self.segment + phase) % segments == 0
-        # Not `preceded_by`: it says divergence of a stream that was put back and then reset.
-        was_reset = loop.interventions[:, Intervention.SCENE_RESET] > loop.scene_resets_before
-        return np.flatnonzero(is_due & ~was_reset)
-
-
-class CriticSceneReset(SceneReset):
-    """Streams in which nothing can be learned any more are reset, as far as a budget goes (not in the paper).
-
-    Of the streams that have failed their last tasks, those come first whose best task has the lowest value, of
-    equal ones (a critic that has learned nothing yet) those whose last reset is the longest ago. The budget is
-    paced: after a share of the run's steps no more than that share of it is spent. What other kinds of
-    interventions cost is taken from it, too. Nothing is reset before a learned reset task, which would then have
-    nothing to put back: what may be spent is kept for the next switch.
-
-    Raises:
-        ValueError: in `bind`, of an agent without values.
-    """
-
-    kind = Intervention.SCENE_RESET
-
-    def __init__(self, rng: np.random.Generator, protocol: ProtocolConfig) -> None:
-        super().__init__(rng, protocol.num_configurations)
-        assert protocol.reset_budget is not None
-        self.budget, self.failures = protocol.reset_budget, protocol.critic.failures
-        self._values: TaskValues | None = None
-
-    def bind(self, run: RunContext) -> None:
-        """Take the agent's values and the length of the run."""
-        self._values, self._total_steps = TaskValues(run, "protocol.scene_reset=critic"), run.total_steps
-
-    def due(self, env: Any, loop: LoopState) -> np.ndarray:
-        """Of the streams that are stuck those with the lowest best value, as many as may be spent by now."""
-        if loop.num_reset_tasks and loop.switches % 2:
-            return np.empty(0, np.int64)
-        allowance = math.floor(self.budget * loop.n / self._total_steps - loop.b) if self._is_running(loop) else 0
-        stuck = self.find_stuck(loop)
-        if allowance < 1 or not len(stuck):
-            return np.empty(0, np.int64)
-        assert self._values is not None
-        best = self._values.best(loop)
-        order = np.lexsort((-loop.segments_since_reset[stuck], best[stuck]))
-        chosen = np.sort(stuck[order[:allowance]])
-        loop.reset_value[chosen] = best[chosen]
-        return chosen
-
-    def count(self, loop: LoopState, ids: np.ndarray) -> None:
-        """Count them as scene resets, and apart from those of other strategies."""
-        super().count(loop, ids)
-        loop.asked_resets[ids] += 1
-
-    def find_stuck(self, loop: LoopState) -> np.ndarray:
-        """Ids (k,) of the streams that have failed their last tasks, all of them since their scene reset."""
-        # Learned reset tasks, every second segment of all streams alike, say nothing.
-        is_task = loop.recent_task[0] < loop.num_tasks
-        failed = (loop.recent_success[:, is_task][:, -self.failures :] == 0).all(axis=1)
-        num_segments = self.failures * (2 if loop.num_reset_tasks else 1)
-        return np.flatnonzero(failed & (loop.segments_since_reset >= num_segments))
-
-    def _is_running(self, loop: LoopState) -> bool:
-        """After the last segment a reset would be of no use."""
-        if self._values is None:
-            raise ValueError("protocol.scene_reset=critic works in cronos-train: here no agent tells its values.")
-        return loop.n < self._total_steps
+        return np.flatnonzero(is_due & (loop.preceded_by != Intervention.SCENE_RESET))
 
 
 class InitialPlacement(SceneReset):
@@ -211,56 +188,28 @@ class Resets:
     heuristic: ResetStrategy
     extra: tuple[ResetStrategy, ...]
     scene: ResetStrategy
-    takeover: ResetStrategy = field(default_factory=NoReset)
-    """Not in the paper: once the tasks are drawn, who is helped with them."""
+
+    @property
+    def all(self) -> tuple[ResetStrategy, ...]:
+        """Every one of them."""
+        first = (self.initial, self.divergence, self.end_effector, self.heuristic)
+        return (*first, *self.extra, self.scene)
 
     def bind(self, run: RunContext) -> None:
         """Tell every strategy what the run is made of; a ValueError refuses the run."""
         for strategy in self.all:
             strategy.bind(run)
 
-    @property
-    def all(self) -> tuple[ResetStrategy, ...]:
-        """Every one of them."""
-        first = (self.initial, self.divergence, self.end_effector, self.heuristic)
-        return (*first, *self.extra, self.scene, self.takeover)
-
 
 ResetFactory = Callable[[np.random.Generator, ProtocolConfig], ResetStrategy]
-
-EXTRA_RESETS: dict[str, ResetFactory] = {}
+EXTRA_RESETS: Registry[ResetFactory] = Registry(
+    "--protocol.extra_resets", "cronos_lerobot.protocol.register_reset"
+)
 """Strategies of users by name."""
+register_reset = EXTRA_RESETS.register
+"""Decorates a class whose constructor, or a function that, takes a generator of its own and the protocol."""
 EXTRA_KINDS = tuple(kind for kind in BEFORE_SEGMENTS if kind is not Intervention.INITIAL)
 """What they may be counted as: a first placement, which is free, is the run's own."""
-
-
-def register_reset(name: str) -> Callable[[ResetFactory], ResetFactory]:
-    """Make a strategy selectable as `--protocol.extra_resets='[name]'`.
-
-    It decorates a class whose constructor, or a function that, takes a generator of its own and the protocol.
-
-    Raises:
-        ValueError: the name is taken.
-    """
-
-    def register(factory: ResetFactory) -> ResetFactory:
-        if name in EXTRA_RESETS:
-            raise ValueError(f"there is a reset {name!r} already; taken names: {sorted(EXTRA_RESETS)}.")
-        EXTRA_RESETS[name] = factory
-        return factory
-
-    return register
-
-
-def check_extra_resets(names: Sequence[str]) -> None:
-    """Raise a ValueError that lists the valid names, unless all of `names` are registered."""
-    unknown = [name for name in names if name not in EXTRA_RESETS]
-    if unknown:
-        raise ValueError(
-            f"protocol.extra_resets has {unknown}; registered: {sorted(EXTRA_RESETS)}. Register your own "
-            "with cronos_lerobot.protocol.resets.register_reset, in a module named by "
-            "--protocol.discover_packages_path."
-        )
 
 
 def make_resets(protocol: ProtocolConfig, rng: Callable[[str], np.random.Generator]) -> Resets:
@@ -274,27 +223,20 @@ def make_resets(protocol: ProtocolConfig, rng: Callable[[str], np.random.Generat
     Raises:
         ValueError: an extra reset is not registered, or does not say what it is counted as.
     """
-    check_extra_resets(protocol.extra_resets)
-    extra = tuple(EXTRA_RESETS[name](rng(f"resets/extra/{name}"), protocol) for name in protocol.extra_resets)
-    for name, strategy in zip(protocol.extra_resets, extra, strict=True):
-        # A scene reset that is counted as something free would be a way around the budget.
-        valid = COUNTED_INTERVENTIONS if isinstance(strategy, SceneReset) else EXTRA_KINDS
-        if getattr(strategy, "kind", None) not in valid:
+    extra = []
+    for name in protocol.extra_resets:
+        EXTRA_RESETS.check(name)
+        extra.append(EXTRA_RESETS[name](rng(f"resets/extra/{name}"), protocol))
+        if (kind := getattr(extra[-1], "kind", None)) not in EXTRA_KINDS:
             raise ValueError(
-                f"{type(strategy).__name__}.kind, of --protocol.extra_resets={name}, must be an Intervention"
-                f" before a segment, one of {[kind.name for kind in valid]}, got "
-                f"{getattr(strategy, 'kind', None)!r}"
+                f"--protocol.extra_resets={name}: {type(extra[-1]).__name__}.kind must be one of "
+                f"{[kind.name for kind in EXTRA_KINDS]}, got {kind!r}."
             )
-    scene: ResetStrategy = (CriticSceneReset if protocol.scene_reset == "critic" else PeriodicSceneReset)(
-        rng("resets/scene"), protocol
-    )
-    if protocol.reset_starts == "learnable":
-        scene = LearnableStarts(scene, rng("resets/starts"), protocol.num_configurations)
     return Resets(
         initial=InitialPlacement(rng("resets/initial"), protocol.num_configurations),
         divergence=DivergenceReset(rng("resets/divergence"), protocol.num_configurations),
         end_effector=EndEffectorReset() if protocol.end_effector_reset else NoReset(),
         heuristic=HeuristicReset(rng("resets/heuristic")) if protocol.heuristic_reset else NoReset(),
-        extra=extra,
-        scene=scene,
+        extra=tuple(extra),
+        scene=PeriodicSceneReset(rng("resets/scene"), protocol),
     )

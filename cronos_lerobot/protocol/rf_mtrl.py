@@ -7,20 +7,22 @@ once, and its n and b are sums over them. Whoever logs, records, evaluates or sa
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from cronos_lerobot.agents.base import Agent
+from cronos_lerobot.agents.base import ActionSample, Agent
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.loop_state import Event, LoopState, Step, Update
 from cronos_lerobot.protocol.resets import Resets
+from cronos_lerobot.protocol.streams import Streams, Task
 from cronos_lerobot.protocol.task_orders import TaskOrder
 
 
 def rf_mtrl(
-    env: Any,
-    tasks: Sequence[Any],  # 1
+    env: Streams,
+    tasks: Sequence[Task],  # 1
     agent: Agent,  # 1
     task_order: TaskOrder,
     resets: Resets,  # 3, 4
@@ -42,11 +44,12 @@ def rf_mtrl(
         loop.switch_task(task_order.draw(loop))  # 8
         env.set_task(streams, [tasks[i] for i in loop.task])
         tau = [tasks[i].instruction for i in loop.task]
-        resets.takeover.apply_if_due(env, loop)
         o_t = env.observe()  # 10
         for k in range(1, K + 1):  # 9
             a_t = agent.act(o_t, tau)  # 11
             o_tp1, r_t, _, _, info = env.step(a_t.action)  # 12
+            a_t = _executed(a_t, info)
+            loop.count_help(a_t.intervened)
             # A trace ends where the next frame is not the outcome of this action under this instruction.
             cut_t = info["diverged"] | (k == K)
             agent.store(o_t, tau, a_t, r_t, o_tp1, cut_t, info["diverged"])  # 13
@@ -71,6 +74,11 @@ def rf_mtrl(
         yield segment
 
 
+def _executed(a_t: ActionSample, info: dict[str, Any]) -> ActionSample:
+    """What was done in place of what was chosen, and who was helped, as far as the environment says it."""
+    return replace(a_t, action=info.get("executed_action", a_t.action), intervened=info.get("intervened"))
+
+
 def _describe(
     loop: LoopState, o_t: Any, tau: list[str], a_t: Any, r_t: np.ndarray, cut_t: np.ndarray, info: dict
 ) -> Step:
@@ -88,5 +96,5 @@ def _describe(
         preceded_by=loop.preceded_by,
         interventions=loop.stream_interventions,
         policy_version=loop.updates,
-        taken_over=loop.taken_over,
+        intervened=loop.intervened,
     )

@@ -11,12 +11,10 @@ from cronos_lerobot.protocol.loop_state import SegmentEnd, Step
 from cronos_lerobot.protocol.resets import (
     EXTRA_RESETS,
     EndEffectorReset,
-    PeriodicSceneReset,
     ResetStrategy,
-    check_extra_resets,
     register_reset,
 )
-from cronos_lerobot.protocol.task_orders import TASK_ORDERS, make_task_order, register_task_order
+from cronos_lerobot.protocol.task_orders import TASK_ORDERS, register_task_order
 
 BOTH = [0, 1]
 SEGMENT = ["set_task", "observe", "act", "step", "store", "act", "step", "store"]
@@ -185,60 +183,23 @@ def test_papers_row_with_hsr_counts_scene_resets_like_the_curriculum():
     assert loop.b == 64 * (31 + 8) == 2496
 
 
-def test_a_scene_reset_of_an_extra_strategy_takes_the_place_of_the_periodic_one_and_a_divergence_does_not():
+def test_a_stream_that_was_put_back_after_a_divergence_gets_its_periodic_reset():
     """At T = 8; stream 1 diverges in the last step before it, and is put back there, which counts by itself."""
-
-    @register_reset("second")
-    class Second(ResetStrategy):
-        kind = Intervention.SCENE_RESET
-
-        def __init__(self, rng, protocol):
-            pass
-
-        def due(self, env, loop):
-            return np.array([1]) if loop.t == 8 else np.empty(0, np.int64)
-
-        def apply(self, env, ids):
-            env.scene_reset(ids, np.zeros(len(ids), int))
-
-    try:
-        for extra in ([], ["second"]):
-            config = protocol(extra_resets=extra, scene_reset_interval=8, end_effector_reset=False)
-            _, _, loop, _ = run(config, 24, env=DummyEnv(2, diverge_at={(7, 1)}))
-            assert loop.interventions[:, Intervention.DIVERGENCE].tolist() == [0, 1]
-            assert loop.interventions[:, Intervention.SCENE_RESET].tolist() == [1, 1]
-    finally:
-        del EXTRA_RESETS["second"]
+    config = protocol(scene_reset_interval=8, end_effector_reset=False)
+    _, _, loop, _ = run(config, 24, env=DummyEnv(2, diverge_at={(7, 1)}))
+    assert loop.interventions[:, Intervention.DIVERGENCE].tolist() == [0, 1]
+    assert loop.interventions[:, Intervention.SCENE_RESET].tolist() == [1, 1]
 
 
-def test_a_scene_reset_is_counted_whatever_a_strategy_calls_it():
-    """Called an end-effector reset it would be free, and a way around the budget."""
-
-    @register_reset("free")
-    class Free(PeriodicSceneReset):
-        kind = Intervention.END_EFFECTOR_RESET
-
-    try:
-        with pytest.raises(ValueError, match=r"Free\.kind, .*one of \['SCENE_RESET', 'HEURISTIC_RESET', 'DIVERG"):
-            run(protocol(extra_resets=["free"]), 8)
-    finally:
-        del EXTRA_RESETS["free"]
-
-
-@pytest.mark.parametrize("kind", [None, Intervention.NONE, Intervention.INITIAL, Intervention.TAKEOVER])
-def test_a_strategy_that_does_not_say_what_it_counts_as_is_refused_before_the_run(kind):
-    @register_reset("unnamed")
+@pytest.mark.parametrize("kind", [None, Intervention.NONE, Intervention.INITIAL, Intervention.HELP])
+def test_a_strategy_says_what_it_counts_as(kind, monkeypatch):
     class Unnamed(EndEffectorReset):
         def __init__(self, rng, protocol):
             self.kind = kind
 
-    try:
-        with pytest.raises(
-            ValueError, match=r"Unnamed\.kind, of --protocol\.extra_resets=unnamed, .*'SCENE_RESET'"
-        ):
-            run(protocol(extra_resets=["unnamed"]), 8)
-    finally:
-        del EXTRA_RESETS["unnamed"]
+    monkeypatch.setitem(EXTRA_RESETS, "unnamed", Unnamed)
+    with pytest.raises(ValueError, match="extra_resets=unnamed"):
+        run(protocol(extra_resets=["unnamed"]), 8)
 
 
 def test_own_strategy_and_own_order_by_name():
@@ -277,27 +238,15 @@ def test_own_strategy_and_own_order_by_name():
             register_task_order("last")(Last)
     finally:
         del EXTRA_RESETS["stuck"], TASK_ORDERS["last"]
-    with pytest.raises(ValueError, match="'stuck'"):
-        check_extra_resets(["stuck"])
-    with pytest.raises(ValueError, match="heuristic"):
-        make_task_order("last", np.random.default_rng(0))
+    for options, flag in (({"extra_resets": ["stuck"]}, "extra_resets"), ({"task_order": "last"}, "task_order")):
+        with pytest.raises(ValueError, match=f"--protocol.{flag}"):
+            run(protocol(**options), steps=8)
 
 
 @pytest.mark.parametrize(
-    ("drawn", "got"),
-    [
-        ([0, -1], r"\[-1\] among them"),
-        ([0, 4], r"\[4\] among them"),
-        ([0.0, 1.0], r"float64 of shape \(2,\)"),
-        ([True, False], r"bool of shape \(2,\)"),
-        ([0], r"int64 of shape \(1,\)"),
-        (0, r"int64 of shape \(\)"),
-        (None, r"object of shape \(\)"),
-        ([[0], [0, 1]], r"\[\[0\], \[0, 1\]\]"),
-    ],
+    "drawn", [[0, -1], [0, 6], [0.0, 1.0], [True, False], [0], 0, None], ids=lambda drawn: str(drawn)
 )
-@pytest.mark.parametrize("learned_reset", [False, True])
-def test_what_is_no_task_of_every_stream_is_refused_with_the_orders_name(drawn, got, learned_reset):
+def test_a_task_order_draws_a_task_for_every_stream(drawn, monkeypatch):
     class Wrong:
         def __init__(self, rng):
             pass
@@ -305,13 +254,9 @@ def test_what_is_no_task_of_every_stream_is_refused_with_the_orders_name(drawn, 
         def draw(self, loop):
             return drawn
 
-    message = rf"Wrong\.draw must return an array \(2,\) of ints in 0\.\.3, .* got {got}"
-    register_task_order("wrong")(Wrong)
-    try:
-        with pytest.raises(ValueError, match=message):
-            run(protocol(task_order="wrong", learned_reset=learned_reset), steps=8)
-    finally:
-        del TASK_ORDERS["wrong"]
+    monkeypatch.setitem(TASK_ORDERS, "wrong", Wrong)
+    with pytest.raises(ValueError, match="task_order"):
+        run(protocol(task_order="wrong", learned_reset=True), steps=8)
 
 
 def test_a_stream_that_an_own_strategy_has_reset_is_not_reset_and_counted_again(monkeypatch):
@@ -343,7 +288,7 @@ def test_streams_that_a_strategy_cannot_mean_are_told(due, monkeypatch):
             raise AssertionError(ids)
 
     monkeypatch.setitem(EXTRA_RESETS, "own", lambda rng, config: Own())
-    with pytest.raises(ValueError, match=r"Own\.due must return numbers of streams from 0 to 1, each once"):
+    with pytest.raises(ValueError, match=r"Own\.due"):
         run(protocol(extra_resets=["own"]), steps=8)
 
 

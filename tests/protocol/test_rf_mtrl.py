@@ -16,7 +16,7 @@ from cronos_lerobot.training.seeding import NamedGenerators
 
 class DummyAgent:
     def __init__(self, num_streams, calls):
-        self.num_streams, self.calls, self.stored = num_streams, calls, []
+        self.num_streams, self.calls, self.stored, self.samples = num_streams, calls, [], []
 
     def act(self, o_t, tau):
         self.calls.append("act")
@@ -26,6 +26,7 @@ class DummyAgent:
     def store(self, o_t, tau, a_t, r_t, o_tp1, cut_t, diverged_t):
         self.calls.append("store")
         self.stored.append((o_t, list(tau), o_tp1, cut_t.copy()))
+        self.samples.append(a_t)
 
     def update(self):
         self.calls.append("update")
@@ -61,8 +62,7 @@ def run(protocol, steps, num_streams=2, env=None, loop=None, seed=0):
 
 
 def protocol(**options):
-    interval = None if options.get("scene_reset") == "critic" else 4
-    defaults = {"task_switch_interval": 2, "update_interval": 4, "scene_reset_interval": interval}
+    defaults = {"task_switch_interval": 2, "update_interval": 4, "scene_reset_interval": 4}
     return ProtocolConfig(**(defaults | options))
 
 
@@ -253,27 +253,23 @@ def test_loop_state_survives_json():
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("flag", "value"),
     [
-        ({"update_interval": 3}, "update_interval must be a positive multiple"),
-        ({"scene_reset_interval": 5}, "scene_reset_interval must be a positive multiple"),
-        ({"curriculum": [(100, 3)]}, "curriculum"),
-        ({"curriculum": [(100, 4), (50, 8)]}, "increasing"),
-        ({"curriculum": [(None, 4)]}, "increasing"),
-        ({"reset_budget": 0}, "reset_budget"),
-        ({"reward": "dense"}, "difference"),
-        ({"num_configurations": 0}, "num_configurations must be >= 1, got 0"),
-        ({"extra_resets": ["stuck", "lost", "stuck"]}, r"must name each strategy once, got \['stuck'\] more"),
+        ("task_switch_interval", 0),
+        ("update_interval", 3),
+        ("scene_reset_interval", 5),
+        ("curriculum", [(100, 3)]),
+        ("curriculum", [(100, 4), (50, 8)]),
+        ("curriculum", [(None, 4)]),
+        ("reset_budget", 0),
+        ("reset_phase", "late"),
+        ("reward", "dense"),
+        ("num_configurations", 0),
     ],
 )
-def test_bad_protocols_are_named(options, message):
-    with pytest.raises(ValueError, match=message):
-        protocol(**options)
-
-
-def test_unknown_task_order_lists_the_known_ones():
-    with pytest.raises(ValueError, match="heuristic"):
-        make_task_order("alphabetical", np.random.default_rng(0))
+def test_bad_protocols_are_named(flag, value):
+    with pytest.raises(ValueError, match=f"--protocol.{flag}"):
+        protocol(**{flag: value})
 
 
 def test_a_divergence_in_a_segment_is_not_its_first_step():
@@ -297,3 +293,42 @@ def test_a_divergence_in_a_segment_is_not_its_first_step():
     loop.switch_task(np.zeros(2, np.int64))
     step(False, True)
     assert loop.end_segment().found_complete.tolist() == [False, True]
+
+
+class Helped(DummyEnv):
+    """A person holds stream 1 in steps 1 to 4 (K = 2: through a task switch) and 6; actions are clipped."""
+
+    def step(self, actions):
+        helped = np.array([False, self.t in (1, 2, 3, 4, 6)])
+        executed = np.where(helped[:, None], np.float32(0.5), actions.clip(-0.25, 0.25))
+        observation, reward, terminated, truncated, info = super().step(executed)
+        info |= {"executed_action": executed, "intervened": helped}
+        return observation, reward, terminated, truncated, info
+
+
+def test_help_is_marked_frame_by_frame_and_counted_where_it_begins():
+    _, agent, loop, events = run(protocol(scene_reset_interval=None), 16, env=Helped(2))
+    steps = [event for event in events if isinstance(event, Step)]
+    assert [step.intervened.tolist()[1] for step in steps] == [False, True, True, True, True, False, True, False]
+    assert not any(step.intervened[0] for step in steps)
+    assert [step.action.action[1, 0] for step in steps] == [0, 0.5, 0.5, 0.5, 0.5, 0, 0.5, 0]
+    assert [sample.action[1, 0] for sample in agent.samples] == [0, 0.5, 0.5, 0.5, 0.5, 0, 0.5, 0]
+    # Two beginnings, counted from the frame on that they are.
+    assert [step.interventions.tolist() for step in steps] == [[0, n] for n in (0, 1, 1, 1, 1, 1, 2, 2)]
+    assert loop.interventions[:, Intervention.HELP].tolist() == [0, 2]
+    assert loop.b == 2
+    # All four segments of stream 1 had help: they say nothing of the policy.
+    assert [event.helped.tolist() for event in events if isinstance(event, SegmentEnd)] == [[False, True]] * 4
+    assert loop.attempts.sum(axis=1).tolist() == [4, 0]
+
+
+def test_help_spends_the_budget():
+    _, _, loop, _ = run(protocol(scene_reset_interval=None, reset_budget=1), 1000, env=Helped(2))
+    assert (loop.b, loop.t) == (1, 2)
+
+
+def test_an_environment_that_does_not_say_what_it_executed_did_what_was_asked():
+    _, agent, _, events = run(protocol(), 8)
+    steps = [event for event in events if isinstance(event, Step)]
+    assert all(not step.intervened.any() for step in steps)
+    assert all(sample.intervened is None for sample in agent.samples)
