@@ -87,34 +87,14 @@ class TrainablePolicy(Protocol):
         ...
 
 
-def is_trainable(policy: Any) -> bool:
-    """Whether `policy` has what TrainablePolicy names, as its own or, of adapters around it, as what they are of.
-
-    `isinstance` would not see the latter.
-    """
-    return not _missing_methods(policy)
+def missing_methods(policy: Any) -> list[str]:
+    """What a policy lacks of TrainablePolicy. `isinstance` would not see methods of what PEFT wraps."""
+    return [name for name in POLICY_METHODS if not callable(getattr(policy, name, None))]
 
 
 def samples(policy: Any) -> bool:
     """Whether `policy` draws its actions at a temperature, by `sample_actions`."""
     return callable(getattr(policy, "sample_actions", None))
-
-
-def _missing_methods(policy: Any) -> list[str]:
-    return [name for name in POLICY_METHODS if not callable(getattr(policy, name, None))]
-
-
-def check_trainable(policy: Any) -> None:
-    """Check that `policy` has what TrainablePolicy names.
-
-    Raises:
-        TypeError: a method is missing.
-    """
-    if missing := _missing_methods(policy):
-        raise TypeError(
-            f"{type(policy).__name__} cannot be trained by reinforcement: it has no {', '.join(missing)}. "
-            f"A trainable policy has {', '.join(POLICY_METHODS)}; see cronos_lerobot.agents.base.TrainablePolicy."
-        )
 
 
 def decision_steps(policy: Any, task_switch_interval: int | None = None) -> int:
@@ -129,8 +109,7 @@ def decision_steps(policy: Any, task_switch_interval: int | None = None) -> int:
     """
     n = int(getattr(policy, "decision_steps", 1))
     if task_switch_interval is not None and task_switch_interval % n:
-        longest = min(_longest_decision(policy, n), task_switch_interval)
-        fitting = [m for m in range(1, longest + 1) if task_switch_interval % m == 0]
+        fitting = [m for m in range(1, n) if task_switch_interval % m == 0]
         raise ValueError(
             f"the policy plays {n} actions at once, which does not divide --protocol.task_switch_interval="
             f"{task_switch_interval}: it would act on the old task's decision after a switch. Choose --policy."
@@ -139,46 +118,19 @@ def decision_steps(policy: Any, task_switch_interval: int | None = None) -> int:
     return n
 
 
-def _longest_decision(policy: Any, n: int) -> int:
-    """Actions that `--policy.n_action_steps` may have a policy play at once; `n` where that is not known."""
-    config = getattr(policy, "config", None)
-    if horizon := getattr(config, "horizon", None):
-        return horizon - getattr(config, "n_obs_steps", 1) + 1
-    return getattr(config, "chunk_size", n)
-
-
 @dataclass(frozen=True)
 class ActionSample:
-    """Actions of N streams for one control step, and what a recording says of them."""
+    """Actions for one control step of this process's streams, and what a recording says of them."""
 
     action: np.ndarray
-    """(N, A) float32 in physical units, as the environment takes them."""
-    log_prob: np.ndarray
-    """(N,) float32 [nats], of the decision that the action is of, under the policy that drew it."""
-    value: np.ndarray
-    """(N,) float32, that policy's value of the observation that was decided on."""
-    expert: np.ndarray | None = None
-    """(N,) bool, whose action is an expert's (a takeover) and not the policy's; None where nobody's is."""
-
-
-@dataclass(frozen=True)
-class Decision:
-    """Decisions of k streams, as their policy made them."""
-
-    actions: np.ndarray
-    """(k, n, A) float32 in physical units."""
-    trace: np.ndarray
-    """(k, ...), in the policy's own type."""
-    log_prob: np.ndarray
-    """(k,) or (k, L) float32 [nats]."""
-    value: np.ndarray
-    """(k,) float32."""
-
-
-def plain_sample(action: np.ndarray) -> ActionSample:
-    """Actions (N, A) float32 in physical units, of an agent that knows no more of them: the rest is 0."""
-    nothing = np.zeros(len(action), np.float32)
-    return ActionSample(action, nothing, nothing)
+    """(N, A) float32 in physical units. `act` returns what the policy chose; `store` and recordings get what was
+    executed."""
+    log_prob: np.ndarray | None = None
+    """(N,) float32 [nats], of the decision that the action is of; None if unknown."""
+    value: np.ndarray | None = None
+    """(N,) float32, that policy's value of the observation that was decided on; None if unknown."""
+    intervened: np.ndarray | None = None
+    """(N,) bool, of all processes' streams: a person or a script chose the action. None where nobody can."""
 
 
 class Agent(Protocol):
@@ -200,7 +152,17 @@ class Agent(Protocol):
         cut_t: np.ndarray,
         diverged_t: np.ndarray,
     ) -> None:
-        """Keep one transition of every stream; `cut_t` is (N,) bool, where the trace ends with it."""
+        """Keep one transition of every stream.
+
+        Args:
+            o_t: the observation that was acted on.
+            tau: the instructions.
+            a_t: what `act` returned, with the executed action and, in `intervened`, who was helped.
+            r_t: (N,), the reward.
+            o_tp1: the observation after the step.
+            cut_t: (N,) bool, the trace ends with this step.
+            diverged_t: (N,) bool, the simulation broke down: the step has no outcome.
+        """
         ...
 
     @abstractmethod
@@ -209,32 +171,18 @@ class Agent(Protocol):
         ...
 
 
-@runtime_checkable
-class ValuingAgent(Agent, Protocol):
-    """An agent that also says how much it expects of a task: task orders and resets may go by it."""
-
-    def predict_values(self, o_t: dict[str, Any], tau: list[str]) -> np.ndarray:
-        """Values (N,) float32 of beginning the tasks `tau`, of all N streams, where `o_t` shows them to stand.
-
-        `o_t` is of this process's streams, as in `act`, and the first observation of a new trace; the answer is of
-        all N, and all processes call it. It changes nothing and draws nothing at random.
-        """
-        ...
-
-
 class LearningAgent(Agent):
     """An agent that `cronos-train` can run, save and resume; its defaults are those of one that only has a policy.
 
     `act` gets the observations of this process's streams and the instructions of all N; so do `store`'s arguments.
-    One that has values says them by `predict_values`, see `ValuingAgent`.
     """
 
     policy: Any
     """The LeRobot policy that acts: what is saved, and evaluated unless `acting` is another."""
     optimizer: Optimizer | dict[str, Optimizer] | None = None
     """Saved and loaded as LeRobot does it."""
-    learns_beside_expert: bool = True
-    """Whether it knows what to make of steps whose action is an expert's, `ActionSample.expert`."""
+    describes: tuple[str, ...] = ()
+    """What `act` says of its actions: some of "log_prob" and "value". Recordings have a column for each."""
 
     @property
     def acting(self) -> Any:

@@ -79,20 +79,6 @@ class PolicyProcessors:
                 batch[name] = tensor.float()
         return self.preprocessor(batch)
 
-    def rows(self, columns: Columns, instructions: list[str]) -> Callable[[list[int]], Batch]:
-        """Return what makes the policy's batch of some of these observations, by their numbers in ascending order.
-
-        For a `Player`, which asks for those that it plans for, when it does.
-        """
-
-        def make(rows: list[int]) -> Batch:
-            if len(rows) == len(instructions):
-                return self.batch(columns, instructions)
-            some = {name: column[rows] for name, column in columns.items()}
-            return self.batch(some, [instructions[row] for row in rows])
-
-        return make
-
     def encode(self, columns: Columns, instructions: list[str]) -> Columns:
         """Return the columns that a rollout keeps: the policy's encodings, or the raw observations."""
         if self._encoder is None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from operator import attrgetter
 from typing import Any, Self
 
 import numpy as np
@@ -54,12 +53,6 @@ class AgentContext:
 @dataclass
 class AgentConfig(RLAlgorithmConfig):
     """What `--algorithm.*` sets, to be derived from: a dataclass with a default for every flag."""
-
-    @property
-    def unread(self) -> dict[str, str]:
-        """Settings without effect beside the others, `name` or `group.name`, each with what it needs: cronos-train
-        refuses them."""
-        return {}
 
     def check_reward(self, reward: str) -> None:
         """Raise a ValueError, if the agent makes no sense of this `--protocol.reward`."""
@@ -111,25 +104,6 @@ def check_agent(name: str) -> None:
             f"--algorithm.type must be one of {agent_names()}, got {name!r}. Register your own with "
             "cronos_lerobot.agents.registry.register_agent, in a module named by --discover_packages_path."
         )
-
-
-def check_settings(config: RLAlgorithmConfig, given: Iterable[str], *, resume: bool) -> None:
-    """Raise a ValueError, if a setting of the command line has no effect beside the others, or no run begins so.
-
-    Args:
-        config: of the agent; an `unread` of its own names such settings, with what each needs.
-        given: names of the command line's settings, `name` or `group.name`. Defaults and null may be given
-            everywhere.
-        resume: whether the run goes on from a checkpoint.
-    """
-    check_start = getattr(config, "check_start", None)
-    if check_start is not None and not resume:
-        check_start()
-    unread = getattr(config, "unread", {})
-    for name in sorted(unread.keys() & set(given)):
-        value, default = map(attrgetter(name), (config, type(config)()))
-        if value is not None and value != default:
-            raise ValueError(f"--algorithm.{name}={value} has no effect here: it needs {unread[name]}.")
 
 
 def check_reward(config: Any, reward: str) -> None:

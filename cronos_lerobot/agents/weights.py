@@ -33,33 +33,15 @@ def wrap(policy: Any, config: PeftConfig | None) -> Any:
 
     Raises:
         ImportError: PEFT is not installed.
-        ValueError: the policy is from scratch, or does not say which layers get adapters; or PEFT has no such
-            method, or one that does not take what LeRobot gives it.
+        ValueError: the policy is from scratch, or does not say which layers get adapters.
     """
     if config is None or is_wrapped(policy):
         return policy
-    wrapped = policy.wrap_with_peft(_adapters_for(policy, config))
+    wrapped = policy.wrap_with_peft(policy._build_peft_config(vars(config).copy()))
     for adapters in wrapped.peft_config.values():
         # Of the Hub's policy that they go onto, which LeRobot's own wrapping leaves out.
         adapters.revision = policy.config.pretrained_revision
     return wrapped
-
-
-def _adapters_for(policy: Any, config: PeftConfig) -> Any:
-    """PEFT's own config, as LeRobot builds it, which looks the method up and fills it in without a check."""
-    method = config.method_type
-    try:
-        return policy._build_peft_config(vars(config).copy())
-    except KeyError as error:
-        from peft import PeftType
-
-        valid = ", ".join(PeftType.__members__)
-        raise ValueError(f"--peft.method_type={method} is no method of PEFT; valid ones: {valid}.") from error
-    except TypeError as error:
-        raise ValueError(
-            f"--peft.method_type={method} does not take all of --peft.* that LeRobot gives it ({error}); "
-            "LORA does."
-        ) from error
 
 
 def train_in_float32(policy: Any, path: str | Path | None = None, revision: str | None = None) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from dummies import TASKS, DummyPolicy, identity_processors
 
-from cronos_lerobot.agents.base import Decision
+from cronos_lerobot.agents.decisions import Decision
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
@@ -28,8 +28,8 @@ def rollout(ppo, reward, rows=16, streams=8):
             sample = ppo.policy.sample_actions(
                 ppo.processors.batch(columns, instructions), generator=torch.Generator().manual_seed(7)
             )
-        sample = Decision(*(sample[k].numpy() for k in ("actions", "trace", "log_prob", "value")))
-        buffer.add(columns, instructions, sample, reward(sample), np.full(streams, True), np.zeros(streams))
+        sample = Decision(*(sample[k].numpy() for k in ("actions", "trace", "log_prob", "value")), columns)
+        buffer.add(sample, instructions, reward(sample), np.full(streams, True), np.zeros(streams))
     return buffer
 
 

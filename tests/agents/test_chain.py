@@ -51,11 +51,11 @@ def make_batch(n):
 @torch.no_grad()
 @pytest.mark.parametrize("level", [0.5, 1.0])
 def test_the_stochastic_chain_ends_where_the_flow_does(level):
-    adapter = make_adapter(100, level, shape=(2, 2))
+    adapter = make_adapter(200, level, shape=(2, 2))
     sample = adapter.sample_actions(make_batch(4000), generator=torch.Generator().manual_seed(0))
     actions = sample["actions"]
     assert actions.shape == (4000, 2, 2)
-    assert sample["trace"].shape == (4000, 101, 2, 2)
+    assert sample["trace"].shape == (4000, 200, 2, 2)
     # 16,000 numbers: three standard errors of the mean and of the deviation, and the Euler steps' own error.
     assert float(actions.mean()) == pytest.approx(MEAN, abs=0.02)
     assert float(actions.std()) == pytest.approx(STD, abs=0.02)
@@ -65,16 +65,37 @@ def test_the_stochastic_chain_ends_where_the_flow_does(level):
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("steps", [2, 5, 10])
+def test_few_steps_add_no_noise_to_the_actions(steps, monkeypatch):
+    """Where one action is right, every denoising ends at it, whatever noise it had on its way."""
+    monkeypatch.setitem(globals(), "STD", 1e-6)
+    adapter = make_adapter(steps, 1.0, shape=(2, 2))
+    sample = adapter.sample_actions(make_batch(1000), generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(sample["actions"], torch.full((1000, 2, 2), MEAN), atol=1e-4, rtol=0)
+    # (1 - t') of the actions and t' of the noise at t' = (S - k) / S: three standard errors of 4000 numbers.
+    for k in range(1, steps):
+        noise = sample["trace"][:, k] - k / steps * MEAN
+        assert float(noise.std()) == pytest.approx(1 - k / steps, rel=0.04)
+
+
+def test_a_steps_noise_by_hand():
+    """Of five steps the second goes from t = .8 to .6: s = eta .6 sqrt(1 - (.6 .2 / (.8 .4))^2)."""
+    s = 0.5 * 0.6 * (1 - 0.375**2) ** 0.5
+    t, past, change, std = make_adapter(5, 0.5)._tables(0.5)[:, 1].tolist()
+    assert (t, past, std) == pytest.approx((0.8, 0.2, s))
+    assert change == pytest.approx((0.36 - s**2) ** 0.5 - 0.6)
+
+
+@torch.no_grad()
 @pytest.mark.parametrize("options", [{"temperature": 0.0}, {"level": 0.0}])
 def test_without_noise_it_is_lerobots_integration(options):
     adapter = make_adapter(10, options.get("level", 0.5))
     noise = torch.randn(5, 3, 4, generator=torch.Generator().manual_seed(1))
     sample = adapter.sample_actions(make_batch(5), temperature=options.get("temperature", 1.0), noise=noise)
     own = euler_integrate(adapter.policy.velocity, noise, 10)
-    assert torch.equal(sample["trace"][:, -1], own)
     # Two of three steps are played, two of four dimensions are the action's.
     assert torch.equal(sample["actions"], own[:, :2, :2])
-    assert torch.equal(sample["log_prob"], torch.zeros(5, 10))
+    assert torch.equal(sample["log_prob"], torch.zeros(5, 9))
     assert torch.equal(adapter.denoise(None, noise), own[:, :2, :2])
 
 
@@ -129,10 +150,10 @@ def test_noise_at_some_steps_alone():
     assert trace.shape == (1000, 2, 7, 4)
     before, after, numbers = trace[:, :, :3], trace[:, :, 3:6], trace[:, :, 6, 0].long()
     assert (numbers[:, 0] < numbers[:, 1]).all()
-    # Each pair of five steps is as likely as another: a tenth, within four standard errors.
+    # Each pair of the four steps that can have noise is as likely as another, within four standard errors.
     pairs = torch.bincount(5 * numbers[:, 0] + numbers[:, 1], minlength=25)
-    assert (pairs > 0).sum() == 10
-    assert all(abs(int(count) - 100) < 4 * 90**0.5 for count in pairs if count)
+    assert (pairs > 0).sum() == 6
+    assert all(abs(int(count) - 1000 / 6) < 4 * (1000 * 5 / 36) ** 0.5 for count in pairs if count)
     # From the noise to the first of them, between them, and to the actions: Euler steps of the velocity.
     x = noise.clone()
     for k in range(5):
@@ -151,14 +172,16 @@ def test_noise_at_some_steps_alone():
     assert log_prob.shape == (1000, 2)
     torch.testing.assert_close(log_prob, sample["log_prob"], atol=1e-5, rtol=0)
     whole = make_adapter(5, 0.5)
-    for k in range(5):
-        chain = torch.zeros(1000, 6, 3, 4)
+    for k in range(4):
+        chain = torch.zeros(1000, 5, 3, 4)
         chosen, j = (numbers == k).any(1), (numbers == k).int().argmax(1)
         chain[:, k], chain[:, k + 1] = before[rows, j], after[rows, j]
         of_step = whole.evaluate_actions(make_batch(1000), chain)["log_prob"][:, k]
         torch.testing.assert_close(of_step[chosen], log_prob[rows, j][chosen], atol=1e-5, rtol=0)
 
 
-def test_noise_at_more_steps_than_there_are_is_refused():
-    with pytest.raises(ValueError, match=r"noise_steps=6, but the policy denoises in 5 steps: give 5 or fewer"):
-        make_adapter(5, 0.5, noise_steps=6)
+def test_noise_at_more_steps_than_can_have_it_is_refused():
+    with pytest.raises(ValueError, match=r"--algorithm\.noise_steps"):
+        make_adapter(5, 0.5, noise_steps=5)
+    with pytest.raises(ValueError, match=r"--policy\.num_inference_steps"):
+        make_adapter(1, 0.5)

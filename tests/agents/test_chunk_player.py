@@ -5,27 +5,28 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from dummies import identity_processors
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.factory import get_policy_class, make_policy_config
 
-from cronos_lerobot.agents.chunk_player import ChunkPlayer, SharedPlayer, make_player, take_rows
+from cronos_lerobot.agents.chunk_player import ChunkPlayer, SharedPlayer, make_player
 from cronos_lerobot.agents.processing import PolicyProcessors
 
 
 def play(player, seen, ids=None):
     """Actions (k,) on observations (k,)."""
-    batch = {"observation.state": torch.tensor(seen, dtype=torch.float32)[:, None], "task": ["go"] * len(seen)}
-    return player.act(batch, range(len(seen)) if ids is None else ids)[:, 0].tolist()
+    columns = {"observation.state": np.array(seen, np.float32)[:, None]}
+    return player.act(columns, ["go"] * len(seen), range(len(seen)) if ids is None else ids)[:, 0].tolist()
 
 
 def test_a_stream_that_switches_tasks_plans_anew_and_the_other_goes_on():
     """A plan says what was seen when it was made, and how old it is: 5.1 is the second action on seeing 5."""
     planned = []
 
-    def plan(frames):
-        (frame,) = frames
-        planned.append(frame["observation.state"][:, 0].tolist())
-        return frame["observation.state"][:, None] + torch.tensor([0.0, 0.1, 0.2, 0.3])[:, None]
+    def plan(columns, instructions):
+        assert len(instructions) == len(columns["observation.state"])
+        planned.append(columns["observation.state"][:, 0].tolist())
+        return torch.from_numpy(columns["observation.state"])[:, None] + torch.tensor([0, 0.1, 0.2, 0.3])[:, None]
 
     player = ChunkPlayer(plan, num_steps=3)
     assert play(player, [5, 6]) == [5, 6]
@@ -40,8 +41,8 @@ def test_a_stream_that_switches_tasks_plans_anew_and_the_other_goes_on():
 
 
 def test_history_is_each_streams_own():
-    def plan(frames):
-        return sum(10**i * frame["observation.state"] for i, frame in enumerate(frames))[:, None]
+    def plan(columns, instructions):
+        return torch.from_numpy(columns["observation.state"][..., 0] @ [1, 10, 100])[:, None, None]
 
     player = ChunkPlayer(plan, history=3)
     # The newest counts hundreds; before the first observation it is the first one over and over.
@@ -87,29 +88,30 @@ def tiny(name):
 
 
 def observations(steps, streams):
-    generator = torch.Generator().manual_seed(1)
+    rng = np.random.default_rng(1)
     for _ in range(steps):
         yield {
-            "observation.state": torch.randn(streams, 4, generator=generator),
-            "observation.images.front": torch.rand(streams, 3, 32, 32, generator=generator),
-            # As LeRobot's preprocessors leave it.
-            "task": ["go"] * streams,
-            "action": None,
-            "next.reward": 0.0,
+            "observation.state": rng.normal(size=(streams, 4)).astype(np.float32),
+            "observation.images.front": rng.integers(256, size=(streams, 32, 32, 3), dtype=np.uint8),
         }
+
+
+def make_processors():
+    # As LeRobot's preprocessors leave it.
+    return PolicyProcessors(lambda batch: batch | {"action": None, "next.reward": 0.0}, lambda action: action)
 
 
 @pytest.mark.filterwarnings("ignore:To evaluate in the environment, your VQ-BeT:UserWarning")
 @pytest.mark.parametrize("name", TINY)
 @torch.no_grad()
 def test_streams_in_step_do_what_lerobots_select_action_does(name):
-    policy = tiny(name)
+    policy, processors = tiny(name), make_processors()
     policy.reset()
     torch.manual_seed(5)
-    expected = [policy.select_action(dict(batch)) for batch in observations(8, 2)]
-    player = make_player(policy)
+    expected = [policy.select_action(processors.batch(seen, ["go"] * 2)) for seen in observations(8, 2)]
+    player = make_player(policy, processors)
     torch.manual_seed(5)
-    found = [player.act(batch, [0, 1]) for batch in observations(8, 2)]
+    found = [player.act(seen, ["go"] * 2, [0, 1]) for seen in observations(8, 2)]
     torch.testing.assert_close(torch.stack(found), torch.stack(expected), rtol=0, atol=1e-6)
     assert (expected[0] - expected[1]).abs().max() > 1e-4
 
@@ -117,85 +119,20 @@ def test_streams_in_step_do_what_lerobots_select_action_does(name):
 @torch.no_grad()
 def test_a_late_stream_does_what_it_does_alone():
     """ACT: stream 1 begins anew at step 4, in the middle of a chunk."""
-    policy = tiny("act")
+    policy, processors = tiny("act"), make_processors()
     seen = list(observations(8, 2))
-    player = make_player(policy)
+    player = make_player(policy, processors)
     found = []
-    for step, batch in enumerate(seen):
+    for step, columns in enumerate(seen):
         if step == 4:
             player.begin([1])
-        found.append(player.act(batch, [0, 1]))
+        found.append(player.act(columns, ["go"] * 2, [0, 1]))
     for stream, begins in ((0, [0]), (1, [0, 4])):
-        for step, batch in enumerate(seen):
+        for step, columns in enumerate(seen):
             if step in begins:
                 policy.reset()
-            own = take_rows(batch, [stream])
+            own = processors.batch({name: col[[stream]] for name, col in columns.items()}, ["go"])
             torch.testing.assert_close(found[step][stream], policy.select_action(own)[0], rtol=0, atol=1e-5)
-
-
-def packing(columns, instructions):
-    """As Qwen's processors do it: the patches of all pictures one after the other, `count` of each."""
-    counts = columns["seen"].astype(int)
-    return {
-        "count": torch.from_numpy(counts),
-        "patches": torch.from_numpy(np.repeat(columns["seen"], counts)),
-        "task": instructions,
-    }
-
-
-def test_a_late_stream_gets_its_own_patches():
-    """Stream i sees i + 1 patches of the value i + 1, and is planned for alone from step 2 on."""
-    planned = []
-
-    def plan(frames):
-        (batch,) = frames
-        assert len(batch["patches"]) == batch["count"].sum()
-        planned.append(batch["patches"].tolist())
-        return torch.stack([part.sum() for part in batch["patches"].split(batch["count"].tolist())])[:, None, None]
-
-    processors = PolicyProcessors(lambda batch: packing({"seen": batch["seen"].numpy()}, batch["task"]), None)
-    asked = []
-
-    def rows(wanted):
-        asked.append(wanted)
-        return processors.rows({"seen": np.array([1.0, 2.0, 3.0])}, ["a", "b", "c"])(wanted)
-
-    player = ChunkPlayer(lambda frames: plan(frames).repeat(1, 2, 1))
-    assert player.act(rows, [0, 1, 2])[:, 0].tolist() == [1, 4, 9]
-    player.begin([1])
-    assert player.act(rows, [0, 1, 2])[:, 0].tolist() == [1, 4, 9]
-    assert planned == [[1, 2, 2, 3, 3, 3], [2, 2]]
-    asked.clear()
-    assert player.act(rows, [1])[:, 0].tolist() == [4]
-    assert asked == [], "who has actions left is not looked at"
-    whole = rows([0, 1, 2])
-    assert player.act(whole, [0, 1, 2])[:, 0].tolist() == [1, 4, 9]
-    player.begin([2])
-    with pytest.raises(ValueError, match=r"'patches' has the shape \(6,\) for 3 observations"):
-        player.act(whole, [0, 1, 2])
-
-
-def test_rows_are_those_of_the_whole_batch():
-    """A text is padded to the longest of all streams, whoever plans: a plan is what it was, bit for bit."""
-
-    def preprocess(batch):
-        width = max(map(len, batch["task"]))
-        return batch | {"tokens": torch.tensor([list(map(ord, text.ljust(width))) for text in batch["task"]])}
-
-    planned = []
-
-    def plan(frames):
-        planned.append(frames[0])
-        return torch.zeros(len(frames[0]["task"]), 2, 1)
-
-    state = np.arange(6, dtype=np.float32).reshape(3, 2)
-    rows = PolicyProcessors(preprocess, None).rows({"observation.state": state}, ["a", "bcd", "ef"])
-    player = ChunkPlayer(plan)
-    player.act(rows, [0, 1, 2])
-    player.begin([0, 2])
-    player.act(rows, [0, 1, 2])
-    assert planned[1]["tokens"].tolist() == [[97, 32, 32], [101, 102, 32]]
-    assert planned[1]["observation.state"].tolist() == [[0, 1], [4, 5]]
 
 
 def test_groot_plays_as_many_actions_as_it_queues():
@@ -203,24 +140,25 @@ def test_groot_plays_as_many_actions_as_it_queues():
     config = SimpleNamespace(type="groot", n_action_steps=4)
     policy = SimpleNamespace(config=config, _action_queue_steps=2, reset=lambda: None)
     policy.predict_action_chunk = lambda batch: batch["observation.state"][:, None] + torch.arange(4.0)[:, None]
-    player = make_player(policy)
+    player = make_player(policy, PolicyProcessors(*identity_processors()))
     assert [play(player, [seen]) for seen in (0, 10, 20, 30)] == [[0], [1], [20], [21]]
 
 
 def test_plans_that_depend_on_plans_are_left_to_the_policy():
     config = SimpleNamespace(type="act", temporal_ensemble_coeff=0.01)
-    policy = SimpleNamespace(config=config, select_action=lambda batch: batch["x"], resets=[])
+    policy = SimpleNamespace(config=config, select_action=lambda batch: batch["observation.state"], resets=[])
     policy.reset = lambda: policy.resets.append(1)
-    player = make_player(policy)
+    processors = PolicyProcessors(*identity_processors())
+    player = make_player(policy, processors)
     assert isinstance(player, SharedPlayer)
     assert not player.is_per_stream
-    assert player.act({"x": 3}, [0]) == 3
+    assert play(player, [3]) == [3]
     player.begin([])
-    assert player.act({"x": 4}, [0]) == 4
+    assert play(player, [4]) == [4]
     assert len(policy.resets) == 1
     player.begin([1])
-    assert player.act(lambda rows: {"x": 5 + len(rows)}, [0]) == 6
+    assert play(player, [5]) == [5]
     assert len(policy.resets) == 2
     # Its cache of what was seen and done reaches back to the first chunk.
     config.type, config.temporal_ensemble_coeff = "lingbot_va", None
-    assert isinstance(make_player(policy), SharedPlayer)
+    assert isinstance(make_player(policy, processors), SharedPlayer)

@@ -1,7 +1,5 @@
 """Decisions of several actions: what is played, what is summed, and what follows them, by hand. gamma = 0.5."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -133,18 +131,11 @@ def test_a_divergence_in_the_first_step_and_at_a_switch():
 
 def test_chunks_that_do_not_divide_the_interval_are_refused():
     assert decision_steps(Chunks(), 80) == 4
-    with pytest.raises(ValueError, match=r"4 actions at once.*task_switch_interval=82.*\[1, 2\]"):
+    with pytest.raises(ValueError, match=r"--protocol\.task_switch_interval=82.*\[1, 2\]"):
         decision_steps(Chunks(), 82)
-    # No more are named than the policy decides on: a chunk, or what is left of a horizon after its past.
-    for config, fitting in (
-        (SimpleNamespace(chunk_size=9), r"\[1, 2, 4, 5, 8\]"),
-        (SimpleNamespace(horizon=6, n_obs_steps=2), r"\[1, 2, 4, 5\]"),
-    ):
-        with pytest.raises(ValueError, match=rf"6 actions at once.*n_action_steps from {fitting}"):
-            decision_steps(SimpleNamespace(decision_steps=6, config=config), 80)
-    agent, policy = make_agent()
-    policy.decision_steps = agent.num_steps = 5
-    with pytest.raises(ValueError, match="decided on 4 actions; its decision_steps says 5"):
+    agent, _ = make_agent()
+    agent.clock.num_steps = 5
+    with pytest.raises(ValueError, match="decision_steps"):
         agent.act(at(1, 2), ["a", "b"])
 
 
@@ -170,6 +161,22 @@ def test_ratios_of_decisions_and_of_factors(ratio):
     assert "entropy" not in metrics
 
 
+def test_factors_weigh_as_much_as_decisions_beside_the_rest_of_the_loss():
+    """Where all ratios are 1 both clip nothing: the gradient is that of the decision's log-probability."""
+    norms = []
+    for ratio in ("decision", "factor"):
+        agent, policy = make_agent(
+            ratio=ratio, target_kl=None, lr_schedule="fixed", epochs=1, normalize_advantage=False
+        )
+        with torch.no_grad():
+            policy.actor.weight.fill_(0.0)
+            policy.actor.bias.fill_(0.0)
+        play(agent, 8, [[1, 1]] * 8, cut={(7, 0), (7, 1)})
+        norms.append(agent.update()["policy_grad_norm"])
+    assert norms[0] > 0
+    assert norms[1] == pytest.approx(norms[0])
+
+
 def test_the_first_steps_of_a_denoising_may_count_less():
     assert factor_weights(torch.zeros(5, 3), 0.5).tolist() == [0.25, 0.5, 1]
     assert factor_weights(torch.zeros(5, 1), 1.0).tolist() == [1]
@@ -185,14 +192,3 @@ def test_the_first_steps_of_a_denoising_may_count_less():
     # Both factors of a decision have the same ratio: (1/2 + 1) / 2 of the loss is left.
     assert losses[0] != 0
     assert losses[1] == pytest.approx(0.75 * losses[0])
-    with pytest.raises(ValueError, match=r"denoising_discount=0\.5 is between factors"):
-        PPOConfig(denoising_discount=0.5)
-    with pytest.raises(ValueError, match=r"noise_steps=2 leaves some out"):
-        PPOConfig(denoising_discount=0.5, ratio="factor", noise_steps=2)
-
-
-def test_an_entropy_bonus_needs_an_entropy():
-    agent, _ = make_agent(entropy_coef=0.1)
-    play(agent, 8, [[1, 1]] * 8, cut={(7, 0), (7, 1)})
-    with pytest.raises(ValueError, match=r"entropy_coef=0\.1, but the policy's entropy is not known"):
-        agent.update()

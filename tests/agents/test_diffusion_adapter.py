@@ -47,14 +47,6 @@ def adapter():
     return make_trainable(make_diffusion(), AdapterOptions(noise_std=0.2, noise_level=1.0))
 
 
-def test_no_more_actions_are_played_than_it_decides_on():
-    policy = make_diffusion(n_obs_steps=2)
-    policy.config.n_action_steps = HORIZON
-    message = rf"n_action_steps={HORIZON} is more than the {HORIZON - 1} actions that --policy\.type=diffusion"
-    with pytest.raises(ValueError, match=message):
-        make_trainable(policy, AdapterOptions())
-
-
 @torch.no_grad()
 @pytest.mark.parametrize(("n_obs_steps", "images"), [(1, False), (1, True), (2, False), (2, True)])
 def test_without_noise_it_acts_as_lerobots_select_action(n_obs_steps, images):
@@ -201,5 +193,3 @@ def test_a_privileged_critic_reads_the_latest_of_a_history():
 def test_what_cannot_be_trained_is_told_what_can():
     with pytest.raises(ValueError, match=r"=DDPM denoises in 100 steps: .*--policy\.noise_scheduler_type=DDIM"):
         make_trainable(make_diffusion(noise_scheduler_type="DDPM", num_inference_steps=None), AdapterOptions())
-    with pytest.raises(ValueError, match=r"noise_level=1\.5 is the eta of DDIM"):
-        make_trainable(make_diffusion(), AdapterOptions(noise_level=1.5))

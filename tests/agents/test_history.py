@@ -11,7 +11,6 @@ from cronos_lerobot.agents.adapters.diffusion import DiffusionAdapter
 from cronos_lerobot.agents.adapters.registry import AdapterOptions
 from cronos_lerobot.agents.history import ObservationHistory
 from cronos_lerobot.agents.processing import PolicyProcessors
-from cronos_lerobot.evaluation.actors import SamplingPolicy
 
 
 class LookingBack(Chunks):
@@ -99,13 +98,6 @@ def test_a_task_that_is_given_now_is_judged_by_its_first_observation(agent):
     assert agent.act(at(2, 102), ["a", "b"]).action[:, 0].tolist() == [11, 1011]
 
 
-def test_without_a_history_columns_are_as_they_were():
-    columns = {"observation.state": np.ones((2, 4))}
-    history = ObservationHistory(1)
-    assert history.see(columns, [0, 1]) is columns
-    assert history.followed_by(columns, [0, 1]) is columns
-
-
 @torch.no_grad()
 @pytest.mark.parametrize("images", [False, True])
 def test_diffusion_remembers_what_it_does_in_lerobot(images):
@@ -130,14 +122,3 @@ def test_diffusion_remembers_what_it_does_in_lerobot(images):
             known = processors.batch(seen, ["go"] * 3)
             decided = adapter.sample_actions(known, temperature=0, noise=noise)["actions"]
         torch.testing.assert_close(decided[:, t % STEPS], own, atol=1e-6, rtol=0)
-
-
-def test_an_evaluation_remembers_each_environment_by_itself():
-    policy = LookingBack()
-    policy.config = None
-    actor = SamplingPolicy(policy, PolicyProcessors(*identity_processors()), 1.0)
-    for t, x in enumerate((1, 2, 3, 4, 5)):
-        if t == 3:
-            actor.begin(np.array([1]))
-        actor.act(at(x, 100 + x), ["a", "b"], np.zeros((2, 7), np.float32), np.array([0, 1]))
-    assert policy.asked == [[[1, 1, 1], [101, 101, 101]], [[104, 104, 104]], [[3, 4, 5]]]

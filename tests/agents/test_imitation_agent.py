@@ -6,16 +6,13 @@ import numpy as np
 import pytest
 import torch
 from dummies import identity_processors
-from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.optim import AdamWConfig
 from lerobot.policies import make_pre_post_processors
-from test_chunk_player import FEATURES, TINY, tiny
 from test_decisions import play
 from test_history import LookingBack
-from test_self_imitation import make_pocketvla
-from tiny_vlas import KINDS, make_processors, make_vla
+from tiny_pocketvla import make_pocketvla
 
-from cronos_lerobot.agents.imitation.agent import ImitationAgent, with_history
+from cronos_lerobot.agents.imitation.agent import ImitationAgent
 from cronos_lerobot.agents.imitation.config import DemosConfig, ImitationConfig
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.agents.processing import make_processors as around
@@ -23,10 +20,6 @@ from cronos_lerobot.agents.registry import AgentContext
 
 STEPS = 12
 """Of a segment: more than VQ-BeT leaves out at the end of an episode."""
-TDMPC = {
-    "horizon": 2, "latent_dim": 8, "mlp_dim": 16, "state_encoder_hidden_dim": 8, "image_encoder_hidden_dim": 8,
-    "n_action_repeats": 1, "n_gaussian_samples": 8, "n_pi_samples": 2, "n_elites": 4, "cem_iterations": 2,
-}  # fmt: skip
 
 
 def make_imitating(policy, processors, **options):
@@ -115,61 +108,3 @@ def test_where_demonstrations_alone_are_cloned_nothing_is_remembered(share, kept
     agent = make_imitating(policy, processors, demos_share=share, demos=DemosConfig("me/demos"))
     learn(agent)
     assert len(agent.memory) == kept
-
-
-def test_a_history_is_a_batch_as_ppo_has_it():
-    frames = [
-        {
-            "observation.state": torch.full((2, 5), float(t)),
-            "observation.images.front": torch.full((2, 3, 4, 4), float(t)),
-            "observation.language.tokens": torch.full((2, t + 1), t),
-            "task": ["go"] * 2,
-            "action": None,
-        }
-        for t in range(3)
-    ]
-    batch = with_history(frames)
-    assert batch["observation.state"].shape == (2, 3, 5)
-    assert batch["observation.state"][1, :, 4].tolist() == [0, 1, 2]
-    assert batch["observation.images.front"].shape == (2, 3, 3, 4, 4)
-    assert batch["observation.language.tokens"].tolist() == [[2, 2, 2]] * 2
-    assert batch["task"] == ["go"] * 2
-    assert batch["action"] is None
-
-
-@pytest.mark.filterwarnings("ignore:To evaluate in the environment, your VQ-BeT:UserWarning")
-@pytest.mark.parametrize("kind", [*TINY, "tdmpc", *KINDS, "gaussian", "categorical", "flow"])
-def test_every_policy_learns_from_its_successes_and_acts(kind, tmp_path, monkeypatch):
-    """The last three are PocketVLA's heads. VQ-BeT's first step trains its codes, the next one what acts."""
-    monkeypatch.setitem(TINY, "tdmpc", TDMPC)
-    monkeypatch.setitem(TINY["vqbet"], "n_vqvae_training_steps", 1)
-    if kind == "tdmpc":
-        # LeRobot's acts on no picture but one that is called `observation.image`.
-        monkeypatch.setitem(FEATURES, "observation.environment_state", PolicyFeature(FeatureType.ENV, (6,)))
-        monkeypatch.delitem(FEATURES, "observation.images.front")
-    if kind in KINDS:
-        policy = make_vla(kind, tmp_path)
-        pair = make_processors(policy, tmp_path)
-    else:
-        policy = tiny(kind) if kind in TINY else make_pocketvla(kind)
-        pair = make_pre_post_processors(policy.config)
-    before = {name: param.detach().clone() for name, param in policy.named_parameters()}
-    frozen = {name for name, param in policy.named_parameters() if not param.requires_grad}
-    metrics = learn(make_imitating(policy, around(policy, *pair), steps_per_update=2, ema_decay=0.5))
-    drop_last = getattr(policy.config, "drop_n_last_frames", 0)
-    assert (metrics["segments"], metrics["frames"]) == (2, 2 * (STEPS - drop_last))
-    assert metrics["optimizer_steps"] == 2
-    assert np.isfinite(metrics["loss"])
-    assert metrics["grad_norm"] > 0
-    moved = {name for name, param in policy.named_parameters() if not torch.equal(param, before[name])}
-    # TD-MPC's target network follows the one that is trained.
-    assert {name for name in moved & frozen if "model_target" not in name} == set()
-    acting = {
-        "vqbet": "vqbet.policy.",
-        "tdmpc": "model._pi.",
-        "pi0": "expert.",
-        "pi05": "expert.",
-        "smolvla": "expert.",
-    }
-    assert [name for name in moved if acting.get(kind, "") in name]
-    assert not policy.training

@@ -1,10 +1,7 @@
 """What is remembered of streams, and that batches of it are those of a LeRobotDataset of the same frames."""
 
-import math
-from pathlib import Path
 from types import SimpleNamespace
 
-import httpx
 import numpy as np
 import pytest
 import torch
@@ -12,9 +9,8 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.factory import resolve_delta_timestamps
 
-from cronos_lerobot import dataset_metadata
 from cronos_lerobot.agents.imitation.batches import Demonstrations, join_batches, segment_batch
-from cronos_lerobot.agents.imitation.config import DemosConfig, ImitationConfig
+from cronos_lerobot.agents.imitation.config import DemosConfig
 from cronos_lerobot.agents.imitation.memory import OpenSegments, Segment, SegmentMemory
 
 TAPE = {
@@ -194,13 +190,6 @@ def test_vectors_are_drawn_from_memory_as_a_dataset_gives_them(name, drop_last, 
         assert torch.equal(column, theirs[key]), key
 
 
-def test_a_dataset_without_what_the_policy_reads_is_refused(dataset_root):
-    config = policy_config("act")
-    config.input_features["observation.environment_state"] = None
-    with pytest.raises(ValueError, match=r"me/demos has no observation\.environment_state, .* it has \['action'"):
-        Demonstrations(DemosConfig("me/demos", dataset_root), config)
-
-
 def test_a_dataset_of_another_shape_is_refused(dataset_root):
     """As where the demonstrations were not told their task, and the policy is."""
     config = policy_config("act")
@@ -212,73 +201,3 @@ def test_a_dataset_of_another_shape_is_refused(dataset_root):
         Demonstrations(DemosConfig("me/demos", dataset_root), config)
     config.input_features["observation.state"] = PolicyFeature(FeatureType.STATE, (4,))
     Demonstrations(DemosConfig("me/demos", dataset_root), config)
-
-
-def test_pictures_that_cannot_be_in_one_batch_with_the_runs_are_refused(dataset_root):
-    config, options = policy_config("act"), DemosConfig("me/demos", dataset_root)
-    height, width, _ = LeRobotDataset("me/demos", dataset_root).meta.shapes["observation.images.front"]
-    Demonstrations(options, config, {"observation.images.front": (height, width, 3)})
-    message = rf"front of {height} x {width} pixels, the run of 128 x 96, .*--env\.observation_height={height} "
-    with pytest.raises(ValueError, match=message):
-        Demonstrations(options, config, {"observation.images.front": (128, 96, 3)})
-
-
-def test_a_dataset_that_is_not_there_is_named(dataset_root, monkeypatch):
-    def unreachable(*args, **kwargs):
-        raise httpx.ConnectError("[Errno -2] Name or service not known")
-
-    monkeypatch.setattr(dataset_metadata, "LeRobotDatasetMetadata", unreachable)
-    # LeRobot downloads into a root what is not there, so the Hub is asked in either case.
-    root = dataset_root.with_name("datasset")
-    with pytest.raises(
-        FileNotFoundError, match=rf"no LeRobotDataset in --algorithm\.demos\.root={root} .*ConnectE"
-    ):
-        Demonstrations(DemosConfig("me/demos", root), policy_config("act"))
-    with pytest.raises(
-        FileNotFoundError, match=r"me/none: no LeRobotDataset on this machine, .* \(ConnectError\)"
-    ):
-        Demonstrations(DemosConfig("me/none"), policy_config("act"))
-    with pytest.raises(FileNotFoundError, match=rf"demos\.root={dataset_root} cannot be read: "):
-        Demonstrations(DemosConfig("me/demos", dataset_root), policy_config("act"))
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"steps_per_update": 0}, "algorithm.steps_per_update must be >= 1, got 0"),
-        ({"tail_steps": -1}, "algorithm.tail_steps must be >= 0, got -1"),
-        ({"lr": 0.0}, "algorithm.lr must be > 0 and finite, got 0.0"),
-        ({"lr": math.inf}, "algorithm.lr must be > 0 and finite, got inf"),
-        ({"memory_gib": math.nan}, "algorithm.memory_gib must be > 0 and finite, got nan"),
-        ({"memory_gib": math.inf}, "algorithm.memory_gib must be > 0 and finite, got inf"),
-        ({"temperature": math.inf}, "algorithm.temperature must be > 0 and finite, got inf"),
-        (
-            {"weighting": "loss"},
-            r"algorithm.weighting must be one of \('none', 'return', 'advantage'\), got 'loss'",
-        ),
-        ({"weighting_beta": 0.0}, "algorithm.weighting_beta must be > 0 and finite, got 0.0"),
-        ({"weighting_beta": math.inf}, "algorithm.weighting_beta must be > 0 and finite, got inf"),
-        ({"max_weight": 0.5}, "algorithm.max_weight must be >= 1, got 0.5"),
-        ({"gamma": 1.5}, "algorithm.gamma must be >= 0 and <= 1, got 1.5"),
-        ({"demos_share": 1.5}, "algorithm.demos_share must be >= 0 and <= 1, got 1.5"),
-        ({"demos_share": 0.5}, "algorithm.demos_share=0.5 needs --algorithm.demos.repo_id"),
-        ({"demos": DemosConfig("me/demos")}, "algorithm.demos.repo_id=me/demos is not learned from with --alg"),
-        ({"demos": DemosConfig(root=Path("d"))}, "algorithm.demos.root=d is not learned from with --algorithm.d"),
-    ],
-)
-def test_bad_values_are_named(options, message):
-    with pytest.raises(ValueError, match=message):
-        ImitationConfig(**options)
-
-
-def test_the_largest_weight_may_be_without_end():
-    assert ImitationConfig(weighting="advantage", max_weight=math.inf).max_weight == math.inf
-
-
-def test_a_camera_that_no_dataset_has_is_not_asked_for(dataset_root):
-    """LeRobot adds it to the features of a policy with `empty_cameras`, whose picture the policy makes itself."""
-    config = policy_config("act")
-    config.input_features["observation.images.empty_camera_0"] = PolicyFeature(FeatureType.VISUAL, (3, 480, 640))
-    batch = Demonstrations(DemosConfig("me/demos", dataset_root), config).batch(2, np.random.default_rng(0))
-    assert "observation.images.front" in batch
-    assert "observation.images.empty_camera_0" not in batch

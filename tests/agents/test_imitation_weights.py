@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from test_self_imitation import make_pocketvla
+from tiny_pocketvla import make_pocketvla
 
 from cronos_lerobot.agents.imitation.batches import draw_batch, segment_batch
 from cronos_lerobot.agents.imitation.memory import Segment, SegmentMemory

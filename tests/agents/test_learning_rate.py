@@ -5,9 +5,9 @@ import pytest
 from dummies import DummyPolicy
 from ppo_samples import make_ppo, reward_for_up, rollout
 
+from cronos_lerobot.agents.ppo.agent import set_optimizer
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.ppo.learning_rate import adapted_lr, target_kl
-from cronos_lerobot.agents.ppo.state import set_optimizer
 
 
 def test_adaptive_learning_rate():
@@ -23,22 +23,6 @@ def test_target_kl_halves_after_so_many_updates():
     config = PPOConfig(target_kl=0.08, kl_decay_updates=4)
     assert [target_kl(config, updates) for updates in (0, 1, 4, 12)] == pytest.approx([0.08, 0.064, 0.04, 0.02])
     assert target_kl(PPOConfig(target_kl=0.08), 12) == 0.08
-    with pytest.raises(ValueError, match=r"kl_decay_updates=4 needs algorithm.target_kl"):
-        PPOConfig(target_kl=None, lr_schedule="fixed", kl_decay_updates=4)
-    with pytest.raises(ValueError, match="kl_decay_updates=4 has no effect where neither"):
-        PPOConfig(target_kl=0.08, lr_schedule="fixed", kl_stop_factor=None, kl_decay_updates=4)
-
-
-def test_a_smaller_target_stops_an_update_sooner():
-    options = {"epochs": 20, "policy_lr": 1e-2, "policy_lr_max": 1.0, "kl_stop_factor": 1.0, "target_kl": 0.1}
-    epochs = []
-    for decay, second_target in (None, 0.1), (0.001, 0.1 / 1001):
-        ppo = make_ppo(kl_decay_updates=decay, **options)
-        first, second = (ppo.update(rollout(ppo, reward_for_up)) for _ in range(2))
-        assert [first["target_kl"], second["target_kl"]] == pytest.approx([0.1, second_target])
-        epochs.append((first["policy_epochs"], second["policy_epochs"]))
-    assert epochs[0][0] == epochs[1][0]
-    assert epochs[0][1] > epochs[1][1]
 
 
 def test_the_learning_rate_follows_the_falling_target():
@@ -53,12 +37,6 @@ def test_the_learning_rate_follows_the_falling_target():
             ppo.update(rollout(ppo, reward_for_up))
         ends.append(ppo.policy_lr / before)
     assert ends[0] > 1 > ends[1]
-
-
-def test_lr_rises_while_the_policy_hardly_moves():
-    ppo = make_ppo(epochs=1, policy_lr=1e-6)
-    ppo.update(rollout(ppo, reward_for_up))
-    assert ppo.policy_lr == pytest.approx(1.5e-6)
 
 
 def test_lr_holds_where_there_is_no_gradient_and_a_warning_says_so_once(caplog):
@@ -79,12 +57,6 @@ def test_lr_holds_where_there_is_no_gradient_and_a_warning_says_so_once(caplog):
     assert ppo.policy_lr != 5e-5
 
 
-def test_lr_holds_where_an_update_has_one_step_and_no_divergence_was_seen():
-    ppo = make_ppo(epochs=1, minibatch_size=16 * 8, policy_lr=5e-5)
-    ppo.update(rollout(ppo, reward_for_up))
-    assert ppo.policy_lr == 5e-5
-
-
 def test_an_early_stop_lowers_the_lr_below_twice_the_target_too():
     options = {"epochs": 1, "policy_lr": 1e-3, "value_epochs": 0}
     free = make_ppo(**options, lr_schedule="fixed", target_kl=None)
@@ -94,12 +66,6 @@ def test_an_early_stop_lowers_the_lr_below_twice_the_target_too():
     metrics = ppo.update(rollout(ppo, reward_for_up))
     assert metrics["policy_epochs"] == 0.5
     assert ppo.policy_lr == pytest.approx(1e-3 / 1.5)
-
-
-def test_a_fixed_lr_survives_an_early_stop():
-    ppo = make_ppo(epochs=10, policy_lr=0.5, target_kl=0.01, lr_schedule="fixed")
-    assert ppo.update(rollout(ppo, reward_for_up))["policy_epochs"] < 2
-    assert ppo.policy_lr == 0.5
 
 
 @pytest.mark.parametrize(
@@ -113,17 +79,6 @@ def test_a_loaded_lr_lies_between_the_ends_that_are_given_now(became, schedule, 
     set_optimizer(ppo.optimizer, now, {"policy_lr": 5e-5, "value_lr": 1e-3}, ppo.optimizer_settings)
     assert ppo.policy_lr == expected
     assert [group["lr"] for group in ppo.optimizer.param_groups if group["name"] == "value"] == [1e-3]
-
-
-def test_a_loaded_lr_may_be_held_beyond_the_one_that_the_run_began_with():
-    ppo = make_ppo()
-    ppo.lr.value, saved = 3e-4, {"policy_lr": 5e-5, "value_lr": 1e-3}
-    set_optimizer(ppo.optimizer, PPOConfig(policy_lr_min=1e-4), saved, ppo.optimizer_settings)
-    assert ppo.policy_lr == 3e-4
-    set_optimizer(ppo.optimizer, PPOConfig(policy_lr_max=4e-5), saved, ppo.optimizer_settings)
-    assert ppo.policy_lr == 4e-5
-    with pytest.raises(ValueError, match=r"policy_lr must be .* to policy_lr_max=0\.001, got 0\.01"):
-        set_optimizer(ppo.optimizer, PPOConfig(policy_lr=0.01), saved, ppo.optimizer_settings)
 
 
 def test_a_loaded_optimizer_keeps_the_policys_own_settings():

@@ -8,7 +8,6 @@ from tiny_vlas import STATE, make_batch, make_processors, make_vla
 from cronos_lerobot.agents.adapters import builtin  # noqa: F401 -- registers the adapters
 from cronos_lerobot.agents.adapters.privileged import FEATURES, PrivilegedCritic, text_vector
 from cronos_lerobot.agents.adapters.registry import AdapterOptions, make_trainable
-from cronos_lerobot.agents.ppo.base_policy import BasePolicy
 from cronos_lerobot.agents.processing import make_processors as around
 
 SHAPES = {"observation.environment_state": (12,), "observation.state": (STATE,), "action": (3,)}
@@ -60,22 +59,6 @@ def test_only_its_own_critic_learns(adapter):
     assert not [name for name in own if "policy" in name]
 
 
-def test_the_policy_that_training_began_with_is_asked_beside_it(adapter):
-    """The policy stands twice within: by itself, and in what decides."""
-    trained = [p for p in adapter.policy.parameters() if p.requires_grad]
-    base, batch = BasePolicy(adapter, trained), privileged_batch()
-    with torch.no_grad():
-        trace = adapter.sample_actions(batch, generator=torch.Generator().manual_seed(1))["trace"]
-        before = adapter.evaluate_actions(batch, trace)["log_prob"]
-        torch.testing.assert_close(base.log_prob(batch, trace, 1.0), before)
-        left = [p for p in adapter.policy.parameters() if p.requires_grad]
-        assert [id(p) for p in left] == [id(p) for p in trained]
-        for p in trained:
-            p.add_(0.01)
-        assert (adapter.evaluate_actions(batch, trace)["log_prob"] - before).abs().max() > 1e-3
-        torch.testing.assert_close(base.log_prob(batch, trace, 1.0), before)
-
-
 def test_instructions_are_told_apart_by_words_and_their_order():
     a, b, c = map(text_vector, TEXTS)
     assert a.dtype == np.float32
@@ -102,10 +85,3 @@ def test_state_and_instruction_survive_lerobots_preprocessors(kind, tmp_path):
     texts = adapter.value_inputs(batch)[FEATURES][:, -32:]
     # pi0.5's prompt has the state in it, which differs.
     np.testing.assert_array_equal(texts, np.stack([text_vector(TEXTS[0])] * 2))
-
-
-def test_it_says_which_flag_shows_the_state(adapter):
-    with pytest.raises(ValueError, match=r"reads observation\.environment_state.*--env\.privileged_state=true"):
-        PrivilegedCritic(adapter.adapter, {"observation.state": (4,)})
-    with pytest.raises(ValueError, match=r"reads observation\.environment_state.*It shows .*observation\.images"):
-        adapter.predict_values(make_batch())

@@ -99,14 +99,6 @@ def test_a_history_is_preprocessed_observation_by_observation():
             assert torch.equal(batch[name][:, step], alone[name])
 
 
-def test_bfloat16_is_refused_by_the_name_of_what_it_is():
-    processors = PolicyProcessors(
-        *identity_processors(), encoder=lambda batch: {"features": batch["observation.state"].bfloat16()}
-    )
-    with pytest.raises(TypeError, match=r"the policy's 'features' is bfloat16.*view\(torch.int16\)"):
-        processors.encode({"observation.state": np.zeros((1, 2), np.float32)}, ["a"])
-
-
 def test_relative_actions_are_refused():
     """By the flag, and by what a checkpoint's preprocessor does."""
     config = DummyPolicyConfig()

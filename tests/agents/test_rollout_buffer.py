@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from cronos_lerobot.agents.base import Decision
+from cronos_lerobot.agents.decisions import Decision
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
 
 U, N = 5, 3
@@ -16,10 +16,10 @@ def filled(rows=U):
             "observation.state": ids[:, None].astype(np.float32),
         }
         sample = Decision(
-            np.zeros((N, 7), np.float32), np.tile(ids[:, None], 7), ids.astype(np.float32), 2.0 * ids
+            np.zeros((N, 7), np.float32), np.tile(ids[:, None], 7), ids.astype(np.float32), 2.0 * ids, columns
         )
         boundary = np.full(N, t == rows - 1)
-        buffer.add(columns, [f"task {i}" for i in ids], sample, ids / 2, boundary, ids + 100.0)
+        buffer.add(sample, [f"task {i}" for i in ids], ids / 2, boundary, ids + 100.0)
     return buffer
 
 
@@ -63,28 +63,6 @@ def test_normalised_advantages():
     np.testing.assert_array_equal(buffer.returns, returns)
 
 
-def test_full_and_cleared():
-    buffer = filled()
-    assert len(buffer) == U * N
-    one = Decision(*(np.zeros((N, 7), np.float32),) * 2, np.zeros(N), np.zeros(N))
-    with pytest.raises(RuntimeError, match="5 rows"):
-        buffer.add({}, [""] * N, one, np.zeros(N), np.zeros(N, bool), np.zeros(N))
-    buffer.clear()
-    assert len(buffer) == 0
-    assert list(buffer.minibatches(4, np.random.default_rng(0))) == []
-
-
-def test_actions_keep_their_type_and_shape():
-    buffer = RolloutBuffer(2, N)
-    drawn = np.linspace(-1, 1, 2 * N * 8, dtype=np.float32).reshape(2, N, 4, 2)
-    for t in range(2):
-        sample = Decision(np.zeros((N, 7), np.float32), drawn[t], np.zeros(N), np.zeros(N))
-        buffer.add({}, ["a"] * N, sample, np.zeros(N), np.full(N, True), np.zeros(N))
-    (minibatch,) = buffer.minibatches(100, np.random.default_rng(0))
-    assert minibatch.trace.dtype == np.float32
-    np.testing.assert_array_equal(minibatch.trace, drawn.reshape(2 * N, 4, 2)[minibatch.indices])
-
-
 @pytest.mark.parametrize(("max_bytes", "pieces"), [(10**6, 1), (1, 2 * N), (16 * 2 * N, 1), (16 * 2 * N - 1, 2)])
 def test_a_minibatch_is_split_by_the_size_of_its_observations(max_bytes, pieces):
     """2 N observations of a number, four bytes, and a picture of 2 x 2 x 3."""
@@ -119,12 +97,3 @@ def test_observations_are_mapped_once_and_may_stand_in_for_the_stored_ones(batch
     for minibatch in buffer.minibatches(5, np.random.default_rng(1), mapped):
         assert list(minibatch.observation) == ["negative"]
         np.testing.assert_array_equal(minibatch.observation["negative"], -np.array(expected)[minibatch.indices])
-
-
-def test_a_rollout_that_goes_on_in_another_format_is_refused():
-    """NumPy would write fractions into whole numbers without a word."""
-    buffer = filled(2)
-    images, sample = np.full((N, 2, 2, 3), 0.5, np.float32), Decision(*np.zeros((4, N, 7), np.float32))
-    columns = {"observation.images.front": images, "observation.state": np.zeros((N, 1), np.float32)}
-    with pytest.raises(TypeError, match=r"float32.* to .*uint8"):
-        buffer.add(columns, ["task"] * N, sample, np.zeros(N), np.full(N, False), np.zeros(N))

@@ -1,6 +1,7 @@
 """Steering, by hand and on problems whose best noise is known."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from test_chain import STD, GaussianFlow, GaussianFlowAdapter
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 
-from cronos_lerobot.agents.adapters.registry import AdapterOptions, Steerable, make_steerable
+from cronos_lerobot.agents.adapters.registry import AdapterOptions
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.agents.registry import AgentContext
 from cronos_lerobot.agents.steering.agent import SteeringAgent
@@ -69,8 +70,11 @@ def at(*x):
     return {"agent_pos": np.array(x, np.float32)[:, None]}
 
 
-def play(agent, rewards, cut=(), diverged=()):
-    """Stream 0 is at 1, 2, 3 ..., stream 1 at 101, 102 ...; returns the actions (steps, 2, 2)."""
+def play(agent, rewards, cut=(), diverged=(), helped=()):
+    """Stream 0 is at 1, 2, 3 ..., stream 1 at 101, 102 ...; returns the actions (steps, 2, 2).
+
+    `cut`, `diverged` and `helped` are (step, stream).
+    """
     actions = []
     for t, reward in enumerate(rewards):
         now, after = at(1 + t, 101 + t), at(2 + t, 102 + t)
@@ -78,6 +82,7 @@ def play(agent, rewards, cut=(), diverged=()):
         actions.append(sample.action)
         broken = np.array([(t, i) in diverged for i in range(2)])
         ends = broken | np.array([(t, i) in cut for i in range(2)])
+        sample = replace(sample, intervened=np.array([(t, i) in helped for i in range(2)]))
         agent.store(now, ["a", "b"], sample, np.array(reward, np.float32), after, ends, broken)
     return np.stack(actions)
 
@@ -102,6 +107,17 @@ def test_what_is_remembered_of_decisions():
     np.testing.assert_allclose(played, 15 * chosen[:, :, :4], atol=0.01)
 
 
+def test_a_decision_with_help_is_not_remembered():
+    """Help in the last step of the first decision of stream 1, and all through the second one of stream 0."""
+    agent = make_agent()
+    helped = {(3, 1), (4, 0), (5, 0), (6, 0), (7, 0)}
+    play(agent, [[1, 2]] * 8, cut={(7, 0), (7, 1)}, helped=helped)
+    kept = agent.memory.state_dict()
+    assert kept["features"].tolist() == [[1], [105]]
+    assert kept["reward"].tolist() == [1.875, 3.75]
+    assert agent.update()["decisions"] == 2
+
+
 def test_a_divergence_is_followed_by_what_came_before_it():
     agent = make_agent()
     agent.policy.asked.clear()
@@ -120,46 +136,6 @@ def test_a_divergence_is_followed_by_what_came_before_it():
     kept = agent.memory.state_dict()
     assert kept["discount"].tolist()[2:] == [0.5**4, 0.5]
     assert kept["next_features"].tolist()[2:] == [[5], [101]]
-
-
-def test_a_divergence_leaves_the_others_decisions_open():
-    agent = make_agent()
-    play(agent, [[0, 0]] * 8, diverged={(3, 1)}, cut={(7, 0), (7, 1)})
-    kept = agent.memory.state_dict()
-    # Stream 0 went on to x = 5; stream 1, whose last step has no outcome, was at 104.
-    assert kept["next_features"].tolist()[:2] == [[5], [104]]
-    assert kept["features"].tolist()[2:] == [[5], [105]]
-
-
-def test_what_a_policy_that_looks_back_has_seen_ends_with_the_trace():
-    policy = Noises()
-    policy.observation_steps = 2
-    agent = make_agent(policy)
-    assert agent.steered.shape.features == 2
-    policy.asked.clear()
-    play(agent, [[0, 0]] * 8, diverged={(5, 1)}, cut={(3, 0), (3, 1), (7, 0), (7, 1)})
-    kept = agent.memory.state_dict()
-    # A new task begins at 5 and 105. Stream 1 diverges in its second step, having seen 105 and 106.
-    assert kept["features"].tolist() == [[1, 1], [101, 101], [5, 5], [105, 105]]
-    assert kept["next_features"].tolist() == [[4, 5], [104, 105], [8, 9], [105, 106]]
-
-
-def test_its_values_are_the_critics_of_the_likeliest_choice():
-    agent = make_agent()
-    assert agent.predict_values(at(9, 109), ["a", "b"]).tolist() == [0, 0]
-    play(agent, [[1, 0]] * 8, cut={(7, 0), (7, 1)})
-    agent.update()
-    before = agent._generator.get_state(), torch.get_rng_state()
-    values = agent.predict_values(at(9, 109), ["a", "b"])
-    assert torch.equal(before[0], agent._generator.get_state())
-    assert torch.equal(before[1], torch.get_rng_state())
-    features = torch.tensor([[9.0], [109.0]])
-    with torch.no_grad():
-        whitened = agent.steered.whitening(features)
-        mean, _ = agent.steered.actor.head(agent.steered.actor.body(whitened)).chunk(2, -1)
-        expected = agent.sac.critics(whitened, torch.tanh(mean)).min(0).values
-    assert values.dtype == np.float32
-    np.testing.assert_allclose(values, expected, rtol=1e-5)
 
 
 def make_sac(**options):
@@ -213,20 +189,6 @@ def test_densities_of_choices_are_those_of_a_squashed_gaussian():
     base = Independent(Normal(mean, log_std.exp()), 1)
     torch.testing.assert_close(log_prob, TransformedDistribution(base, [TanhTransform()]).log_prob(choice))
     torch.testing.assert_close(actor(features, temperature=0.0)[0], torch.tanh(mean))
-
-
-def test_each_critic_of_the_ensemble_is_a_network_of_its_own():
-    sac = make_sac(num_critics=3)
-    features, choice = torch.randn(4, 3), torch.randn(4, 2)
-    values = sac.critics(features, choice)
-    for i in range(3):
-        x = torch.cat([features, choice], 1)
-        for k in range(2):
-            x = x @ sac.critics.weights[k][i] + sac.critics.biases[k][i]
-            x = torch.nn.functional.silu(
-                (x - x.mean(1, True)) / (x.var(1, correction=0, keepdim=True) + 1e-5).sqrt()
-            )
-        torch.testing.assert_close(values[i], (x @ sac.critics.weights[2][i] + sac.critics.biases[2][i])[:, 0])
 
 
 def test_the_memory_forgets_the_oldest_and_draws_alike_after_loading():
@@ -326,36 +288,6 @@ def test_repeated_noise_is_the_same_in_every_step_and_padding_is_none():
     steered = SteeredPolicy(Noises(), shape)
     actions = steered.denoise(None, torch.tensor([[0.5, -1.0]]))
     assert actions.tolist() == [[[10.0, -20.0]] * 4]
-
-
-def test_policies_that_cannot_be_steered_are_told():
-    assert isinstance(Noises(), Steerable)
-    assert make_steerable(policy := Noises()) is policy
-    policy = SimpleNamespace(config=SimpleNamespace(type="vqbet"))
-    with pytest.raises(ValueError, match=r"--policy\.type=vqbet has no noise.*steering is for flow and diffusion"):
-        make_steerable(policy)
-
-
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(ValueError, match=r"algorithm\.utd must be > 0, got 0"):
-        SteeringConfig(utd=0)
-    with pytest.raises(ValueError, match=r"observation must be one of .*'state'\), got 'pixels'"):
-        SteeringConfig(observation="pixels")
-    with pytest.raises(ValueError, match="num_target_critics must be at most num_critics=1, got 2"):
-        SteeringConfig(num_critics=1, num_target_critics=2)
-    policy = Noises()
-    policy.config.input_features = {}
-    with pytest.raises(ValueError, match=r"observation=state needs a policy that observes observation\.state"):
-        make_agent(policy, observation="state")
-
-
-def test_the_policy_stays_in_evaluation_mode_after_an_evaluation():
-    """One puts what it evaluates into the mode that it found, all modules in it."""
-    agent = make_agent()
-    was_training = agent.steered.training
-    agent.steered.eval()
-    agent.steered.train(was_training)
-    assert not any(module.training for module in (agent.policy, *agent.steered.modules()))
 
 
 def test_decisions_since_the_last_update_are_saved():

@@ -10,8 +10,7 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor, nn
 from torch.distributions import Normal
 
-from cronos_lerobot.agents.adapters.critic import Critic
-from cronos_lerobot.agents.adapters.registry import Adapter, AdapterOptions, register_adapter
+from cronos_lerobot.agents.adapters.registry import Adapter, AdapterOptions, Critic, register_adapter
 from cronos_lerobot.agents.base import Batch
 from cronos_lerobot.agents.weights import unwrapped
 
@@ -35,8 +34,6 @@ class ACTAdapter(Adapter):
     Raises:
         ValueError: the policy ensembles its chunks over time, or the noise is beyond what is learned.
     """
-
-    options_read = frozenset({"noise_std"})
 
     def __init__(self, policy: Any, options: AdapterOptions) -> None:
         super().__init__(policy)

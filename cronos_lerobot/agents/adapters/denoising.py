@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from cronos_lerobot.agents.adapters.chain import Scored, Step, chain_log_prob, sample_chain
-from cronos_lerobot.agents.adapters.critic import Critic
-from cronos_lerobot.agents.adapters.registry import Adapter
+from cronos_lerobot.agents.adapters.registry import Adapter, Critic
 from cronos_lerobot.agents.base import Batch
 
 FEATURES = "features"
@@ -33,10 +32,6 @@ class DenoisingAdapter(Adapter):
     Raises:
         ValueError: the policy is to play more actions than a chunk has.
     """
-
-    has_entropy = False
-    """A Gaussian step's deviation is no parameter."""
-    is_chain = True
 
     def __init__(
         self, policy: Any, *, shape: tuple[int, int], num_steps: int, feature_width: int | None, first: int = 0

@@ -30,10 +30,8 @@ class DiffusionAdapter(DenoisingAdapter):
         options: of the noise.
 
     Raises:
-        ValueError: the policy denoises by DDPM, or eta is above 1.
+        ValueError: the policy denoises by DDPM.
     """
-
-    options_read = frozenset({"noise_std", "noise_level"})
 
     def __init__(self, policy: Any, options: AdapterOptions) -> None:
         config, model = policy.config, policy.diffusion
@@ -42,11 +40,6 @@ class DiffusionAdapter(DenoisingAdapter):
                 f"--policy.noise_scheduler_type={config.noise_scheduler_type} denoises in "
                 f"{model.num_inference_steps} steps: train the same weights with "
                 "--policy.noise_scheduler_type=DDIM --policy.num_inference_steps=5."
-            )
-        if options.noise_level > 1:
-            raise ValueError(
-                f"--algorithm.noise_level={options.noise_level} is the eta of DDIM for a diffusion policy: above "
-                "0 (no noise) and at most 1 (that of DDPM)."
             )
         super().__init__(
             policy,

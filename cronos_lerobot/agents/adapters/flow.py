@@ -1,12 +1,17 @@
-"""Flow policies whose denoising becomes a stochastic chain: Flow-SDE (Flow-GRPO, Liu et al., 2025; pi_RL, 2025).
+"""Flow policies whose denoising becomes a stochastic chain, which has a likelihood (Flow-GRPO, Liu et al., 2025).
 
-A flow policy integrates dx = v dt from noise (t = 1) to actions (t = 0); its answer to a noise is certain, so it
-has no likelihood that can be computed. The stochastic differential equation
+A flow policy integrates dx = v dt from noise (t = 1) to actions (t = 0). Its answer to a noise is certain, so it
+has no likelihood. Here a step from t to t' < t takes the policy's own estimates of the actions, a = x - t v, and
+of the noise, e = x + (1 - t) v, and draws a part of the noise anew:
 
-    dx = (v + s^2 / (2 t) (x + (1 - t) v)) dt + s dw,   s = noise_level * sqrt(t / (1 - t))
+    x' = (1 - t') a + sqrt(t'^2 - s^2) e + s z,   z ~ N(0, 1)
+    s = eta t' sqrt(1 - (t' (1 - t) / (t (1 - t')))^2)
 
-has the same marginals at every t, and its Euler steps are Gaussians. With noise_level 0 it is LeRobot's own
-integration.
+This is DDIM's step (Song et al., 2021) for x = (1 - t) a + t e; eta is `noise_level`. Eta 0 is LeRobot's Euler
+step, eta 1 the posterior of the forward process (DDPM). Every x' has (1 - t') of the actions and t' of the noise,
+however few the steps are, so the last one, t' = 0, adds no noise. In the limit of small steps it is Flow-SDE's
+equation with s = eta sqrt(2 t / (1 - t)). Its Euler steps would add eta sqrt(2 / (S (S - 1))) to the actions: with
+five steps its marginals are not the flow's.
 """
 
 from __future__ import annotations
@@ -25,8 +30,9 @@ from cronos_lerobot.agents.adapters.registry import AdapterOptions
 class FlowAdapter(DenoisingAdapter):
     """See `DenoisingAdapter`; a subclass says which velocity its policy has (`velocity`).
 
-    With `noise_steps` J < S, only J steps of a decision have noise, drawn anew for each; the others are the
-    policy's own. An update then differentiates J evaluations of the network in place of S (pi_RL's mixed steps).
+    The last of the S steps has no noise, so it has no likelihood: a trace is (B, S, H, D), `log_prob` (B, S - 1).
+    With `noise_steps` J < S - 1, only J steps of a decision have noise, drawn anew for each. An update then
+    differentiates J evaluations of the network instead of S - 1 (pi_RL's mixed steps).
 
     Args:
         policy: the LeRobot policy, on its device.
@@ -36,10 +42,8 @@ class FlowAdapter(DenoisingAdapter):
         feature_width: F, of what the critic reads; None if the subclass has values of its own.
 
     Raises:
-        ValueError: noise at more steps than there are.
+        ValueError: noise at more steps than can have it.
     """
-
-    options_read = frozenset({"noise_level", "noise_steps"})
 
     def __init__(
         self,
@@ -51,12 +55,16 @@ class FlowAdapter(DenoisingAdapter):
         feature_width: int | None,
     ) -> None:
         super().__init__(policy, shape=shape, num_steps=num_steps, feature_width=feature_width)
-        self.noise_level = options.noise_level
-        self.noise_steps = num_steps if options.noise_steps is None else options.noise_steps
-        if self.noise_steps > num_steps:
+        if num_steps < 2:
             raise ValueError(
-                f"--algorithm.noise_steps={self.noise_steps}, but the policy denoises in {num_steps} steps: give "
-                f"{num_steps} or fewer, or null for all."
+                "--policy.num_inference_steps must be at least 2 for PPO: the last step has no noise."
+            )
+        self.noise_level = options.noise_level
+        self.noise_steps = num_steps - 1 if options.noise_steps is None else options.noise_steps
+        if self.noise_steps >= num_steps:
+            raise ValueError(
+                f"--algorithm.noise_steps must be at most {num_steps - 1}, got {self.noise_steps}: the policy has "
+                f"{num_steps} steps, the last without noise."
             )
 
     @abstractmethod
@@ -64,24 +72,24 @@ class FlowAdapter(DenoisingAdapter):
         """Return v (B, H, D) = noise - actions at x (B, H, D) and times (B,), which fall from 1 (noise) to 0."""
 
     def step(self, context: Any, temperature: float, noisy: Tensor | None = None) -> Step:
-        """Euler steps of the equation above, from t to t + dt, dt = -1 / S.
+        """The steps above, from t to t' = t - 1 / S.
 
         Args:
             context: of `observe`.
-            temperature: factor of the noise level.
-            noisy: (B, S) bool, which steps of a row have noise; None is all.
+            temperature: factor of the noise level, which ends at 1.
+            noisy: (B, S) bool, which steps of a row have noise; None is all but the last.
         """
         dt = -1.0 / self.num_steps
         device = next(self.policy.parameters()).device
-        tables = self._tables(temperature * self.noise_level).to(device)
+        tables = self._tables(min(1.0, temperature * self.noise_level)).to(device)
 
         def step(k: Any, x: Tensor) -> tuple[Tensor, Tensor]:
-            t, past, pull, std = tables[:, k].reshape(4, -1, 1, 1)
+            t, past, change, std = tables[:, k].reshape(4, -1, 1, 1)
             if noisy is not None:
                 here = noisy[:, k].reshape(-1, 1, 1)
-                pull, std = pull * here, std * here
+                change, std = change * here, std * here
             v = self.velocity(context, x, t.flatten().expand(len(x)))
-            return x + dt * (v + pull * (x + past * v)), std
+            return x + dt * v + change * (x + past * v), std
 
         return step
 
@@ -90,16 +98,17 @@ class FlowAdapter(DenoisingAdapter):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """See `DenoisingAdapter`.
 
-        With `noise_steps` J < S the trace is (B, J, 2 H + 1, D): x before and after each step with noise, and a
-        row that is the step's number.
+        With `noise_steps` J < S - 1 the trace is (B, J, 2 H + 1, D): x before and after each step with noise, and
+        a row that is the step's number.
         """
-        if self.noise_steps == self.num_steps:
-            return super().draw(context, noise, temperature, generator)
-        size = (len(noise), self.num_steps)
+        if self.noise_steps == self.num_steps - 1:
+            end, chain, log_prob = super().draw(context, noise, temperature, generator)
+            return end, chain[:, :-1], log_prob[:, :-1]
+        size = (len(noise), self.num_steps - 1)
         order = torch.rand(size, generator=generator, device=noise.device).argsort(dim=1)
         numbers = order[:, : self.noise_steps].sort(dim=1).values
-        noisy = torch.zeros(size, dtype=torch.bool, device=noise.device).scatter_(1, numbers, True)
-        step = self.step(context, temperature, noisy)
+        noisy = torch.zeros((len(noise), self.num_steps), dtype=torch.bool, device=noise.device)
+        step = self.step(context, temperature, noisy.scatter_(1, numbers, True))
         chain, log_prob = sample_chain(step, noise, self.num_steps, self.scored, generator)
         rows = torch.arange(len(noise), device=noise.device)[:, None]
         label = numbers[..., None, None].expand(-1, -1, 1, self.shape[1]).to(noise)
@@ -108,7 +117,7 @@ class FlowAdapter(DenoisingAdapter):
 
     def judge(self, context: Any, trace: Tensor, temperature: float) -> Tensor:
         """See `DenoisingAdapter`; steps without noise are not looked at."""
-        if self.noise_steps == self.num_steps:
+        if self.noise_steps == self.num_steps - 1:
             return super().judge(context, trace, temperature)
         step, height = self.step(context, temperature), self.shape[0]
         log_probs = []
@@ -117,13 +126,12 @@ class FlowAdapter(DenoisingAdapter):
             log_probs.append(step_log_prob(mean, std, x[:, height:-1], self.scored))
         return torch.stack(log_probs, 1)
 
-    def _tables(self, level: float) -> Tensor:
-        """(4, S): t, 1 - t, s^2 / (2 t) and the deviation of each step's noise."""
-        dt = -1.0 / self.num_steps
+    def _tables(self, eta: float) -> Tensor:
+        """(4, S): t, 1 - t, what a step adds of the estimated noise beside Euler's, the deviation of new noise."""
         columns = []
         for k in range(self.num_steps):
-            t = 1.0 + k * dt
-            # At t = 1 the deviation has a pole; as in Flow-GRPO the step takes that of its end.
-            s = level * (t / (1 - min(t, 1 + dt))) ** 0.5
-            columns.append((t, 1 - t, s**2 / (2 * t), s * (-dt) ** 0.5))
+            t, after = 1.0 - k / self.num_steps, (self.num_steps - k - 1) / self.num_steps
+            kept = after * (1 - t) / (t * (1 - after))
+            s = eta * after * (1 - kept**2) ** 0.5
+            columns.append((t, 1 - t, (after**2 - s**2) ** 0.5 - after, s))
         return torch.tensor(columns, dtype=torch.float32).T

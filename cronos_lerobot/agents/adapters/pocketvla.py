@@ -1,4 +1,4 @@
-"""PocketVLA's flow head with the noise of Flow-SDE. Its heads of tokens need no adapter."""
+"""PocketVLA's flow head as a chain with noise. Its heads of tokens need no adapter."""
 
 from __future__ import annotations
 

@@ -13,8 +13,7 @@ import torch
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
-from cronos_lerobot.agents.adapters.critic import Critic
-from cronos_lerobot.agents.adapters.registry import Adapter
+from cronos_lerobot.agents.adapters.registry import Adapter, Critic
 from cronos_lerobot.agents.base import Batch
 
 FEATURES = "features"
@@ -38,12 +37,13 @@ class PrivilegedCritic(Adapter):
 
     def __init__(self, adapter: Adapter, shapes: Mapping[str, tuple[int, ...]]) -> None:
         super().__init__(adapter.policy)
-        for name in (OBS_ENV_STATE, OBS_STATE):
-            _check_shown(name, shapes)
+        if missing := {OBS_ENV_STATE, OBS_STATE} - shapes.keys():
+            raise ValueError(
+                f"--algorithm.critic_observation=environment_state reads {', '.join(sorted(missing))}, which the "
+                f"environment does not show: --env.privileged_state=true does beside pixels."
+            )
         self.adapter: Any = adapter
         self.decision_steps, self.observation_steps = adapter.decision_steps, adapter.observation_steps
-        self.options_read, self.has_entropy = adapter.options_read, adapter.has_entropy
-        self.is_chain = adapter.is_chain
         width = shapes[OBS_ENV_STATE][0] + shapes[OBS_STATE][0] + TEXT_WIDTH
         self.critic = Critic(width).to(next(adapter.policy.parameters()).device)
 
@@ -66,8 +66,6 @@ class PrivilegedCritic(Adapter):
         """What the critic reads; as it is, if that is what the batch holds."""
         if FEATURES in batch:
             return batch
-        for name in (OBS_ENV_STATE, OBS_STATE):
-            _check_shown(name, batch)
         texts = np.stack([text_vector(self.adapter.instruction(text)) for text in batch["task"]])
         # Of a history the latest.
         vectors = [x[:, -1] if x.ndim > 2 else x for x in (batch[OBS_ENV_STATE], batch[OBS_STATE])]
@@ -89,11 +87,3 @@ def text_vector(text: str) -> np.ndarray:
     parts = words + [" ".join(pair) for pair in pairwise(words)]
     vectors = [np.random.default_rng(zlib.crc32(part.encode())).normal(size=TEXT_WIDTH) for part in parts]
     return (np.sum(vectors, axis=0) / len(parts) ** 0.5).astype(np.float32)
-
-
-def _check_shown(name: str, shown: Mapping[str, Any]) -> None:
-    if name not in shown:
-        raise ValueError(
-            f"--algorithm.critic_observation=environment_state reads {name}, which the environment does not show: "
-            f"--env.privileged_state=true does beside pixels. It shows {sorted(map(str, shown))}."
-        )

@@ -2,14 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
-from cronos_lerobot.agents.base import Batch, check_trainable, is_trainable
+from cronos_lerobot.agents.base import Batch, missing_methods
+
+
+class Critic(nn.Module):
+    """Features (B, F) to values (B,), 0 at the start.
+
+    Args:
+        features: F.
+        width: of the two hidden layers.
+    """
+
+    def __init__(self, features: int, width: int = 256) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.LayerNorm(features), nn.Linear(features, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(),
+            nn.Linear(width, 1),
+        )  # fmt: skip
+        last = self.layers[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """See above."""
+        return self.layers(features.to(torch.float32)).squeeze(-1)
 
 
 @dataclass(frozen=True)
@@ -19,11 +43,11 @@ class AdapterOptions:
     noise_std: float = 0.1
     """Standard deviation at the start, in normalised units, of the noise that an adapter adds to actions; the
     least deviation of a diffusion's step."""
-    noise_level: float = 0.5
-    """Noise of a flow policy's denoising; 0 has none, 1 about that of the policy's own first noise. Of a
-    diffusion policy DDIM's eta."""
+    noise_level: float = 1.0
+    """DDIM's eta of the denoising of a flow or diffusion policy, 0 (no noise) to 1 (that of DDPM)."""
     noise_steps: int | None = None
-    """At how many steps of a flow policy's denoising there is noise; None is all."""
+    """At how many steps of a flow policy's denoising there is noise; None is all but the
+    last."""
 
 
 class Adapter(nn.Module):
@@ -36,16 +60,10 @@ class Adapter(nn.Module):
         policy: the same.
         decision_steps: how many actions it decides on at once.
         observation_steps: how many observations it looks at.
-        options_read: names of the AdapterOptions that it follows; the others are refused where they are given.
-        has_entropy: whether its decisions have an entropy that depends on the policy.
-        is_chain: whether the factors of a decision are the steps of a denoising chain.
     """
 
     decision_steps: int = 1
     observation_steps: int = 1
-    options_read: frozenset[str] = frozenset(field.name for field in fields(AdapterOptions))
-    has_entropy: bool = True
-    is_chain: bool = False
 
     def __init__(self, policy: Any) -> None:
         super().__init__()
@@ -73,16 +91,9 @@ class Adapter(nn.Module):
 
     @torch.no_grad()
     def load_own_parameters(self, parameters: dict[str, Tensor]) -> None:
-        """Go on with `own_parameters` of a checkpoint.
-
-        Raises:
-            ValueError: they are those of another adapter.
-        """
-        own = self.own_parameters()
-        if own.keys() != parameters.keys():
-            raise ValueError(f"The adapter's parameters are {sorted(own)}, those saved are {sorted(parameters)}.")
-        for name, param in parameters.items():
-            own[name].copy_(param)
+        """Go on with `own_parameters` of a checkpoint."""
+        for name, param in self.own_parameters().items():
+            param.copy_(parameters[name])
 
 
 @runtime_checkable
@@ -133,20 +144,17 @@ def make_trainable(policy: Any, options: AdapterOptions) -> Any:
     Raises:
         ValueError: it is neither; the message says who can train it all the same.
     """
-    if is_trainable(policy):
+    if not (missing := missing_methods(policy)):
         return policy
     policy_type = getattr(policy.config, "type", None)
     if policy_type in ADAPTERS:
         return ADAPTERS[policy_type](policy, options)
-    try:
-        check_trainable(policy)
-    except TypeError as error:
-        raise ValueError(
-            f"{error} There are adapters for --policy.type={', '.join(sorted(ADAPTERS))}; one of your own is "
-            "registered by a package that --discover_packages_path=<package> imports. "
-            "--algorithm.type=imitation learns with any policy that lerobot-train trains."
-        ) from error
-    return policy
+    raise ValueError(
+        f"--policy.type={policy_type} cannot be trained by reinforcement: it has no {', '.join(missing)}, and no "
+        f"adapter as {', '.join(sorted(ADAPTERS))} have. Register one of your own in a package that "
+        "--discover_packages_path=<package> imports, or learn with --algorithm.type=imitation, which takes every "
+        "policy that lerobot-train trains and lerobot-eval plays."
+    )
 
 
 def make_steerable(policy: Any) -> Any:
@@ -167,8 +175,3 @@ def make_steerable(policy: Any) -> Any:
         f"--policy.type={policy_type} has no noise that could be chosen: --algorithm.type=steering is for flow "
         f"and diffusion policies, {', '.join(types)}. Others learn with --algorithm.type=ppo or imitation."
     )
-
-
-def trained_tensors(policy: Any) -> Iterable[Tensor]:
-    """The parameters of a trainable policy, those beside an adapter's among them, that have a gradient."""
-    return (param for param in policy.parameters() if param.requires_grad)

@@ -32,7 +32,7 @@ class Prefix:
 
 
 class VLAAdapter(FlowAdapter):
-    """The chunk's chain under Flow-SDE; a critic on the vision-language model's output and the robot's state.
+    """A decision is the chain of a chunk; a critic on the vision-language model's output and the robot's state.
 
     The critic reads the mean of the last hidden states, as in pi_RL (Chen et al., 2025) that of pi0.5; that of
     pi0 there reads the action expert instead, because the prefix does not have the state, which it gets here

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import OBS_LANGUAGE, OBS_STR
 from torch import Tensor
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
@@ -18,10 +17,9 @@ from cronos_lerobot.agents.base import (
     Batch,
     Columns,
     LearningAgent,
-    plain_sample,
     samples,
 )
-from cronos_lerobot.agents.chunk_player import ChunkPlayer, Player, make_player
+from cronos_lerobot.agents.chunk_player import ChunkPlayer, SharedPlayer, make_player
 from cronos_lerobot.agents.history import observation_steps
 from cronos_lerobot.agents.imitation.batches import Demonstrations, draw_batch
 from cronos_lerobot.agents.imitation.config import ImitationConfig
@@ -29,7 +27,6 @@ from cronos_lerobot.agents.imitation.memory import OpenSegments, SegmentMemory, 
 from cronos_lerobot.agents.imitation.weights import Remembered, by_advantage, by_return, effective_share
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.agents.registry import AgentContext, register_agent
-from cronos_lerobot.agents.state import to_arrays, to_tensors
 from cronos_lerobot.agents.weights import check_precision
 
 FINE_TUNING = 0.1
@@ -74,17 +71,16 @@ class ImitationAgent(LearningAgent):
         self._has_success = self._is_warm = False
         self._demos = None
         if self.config.demos_share:
-            beside = context.observation_shapes if self.config.demos_share < 1 else None
-            self._demos = Demonstrations(self.config.demos, policy_config, beside)
+            self._demos = Demonstrations(self.config.demos, policy_config)
 
     @torch.no_grad()
     def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
-        """Choose an action for each of its streams; what it does not know of them is 0."""
+        """Choose an action for each of its streams."""
         with self._stopwatch("infer"):
-            rows = self._processors.rows(observation_columns(o_t), tau[self._streams])
-            ids = range(self._streams.stop - self._streams.start)
-            action = self._processors.physical_actions(self._player.act(rows, ids))
-        return plain_sample(action)
+            mine = tau[self._streams]
+            action = self._player.act(observation_columns(o_t), mine, range(len(mine)))
+            action = self._processors.physical_actions(action)
+        return ActionSample(action)
 
     def store(
         self,
@@ -150,28 +146,28 @@ class ImitationAgent(LearningAgent):
             params = self.policy.named_parameters(remove_duplicate=False)
             frozen = {name for name, param in params if not param.requires_grad}
             learner = {name: value for name, value in self._learner.state_dict().items() if name not in frozen}
-        memory = to_tensors(self._processes.gather_to_main(self.memory.state_dict()))
+        memory = self._processes.gather_to_main(self.memory.state_dict())
         return {"memory": memory, "learner": learner, "is_warm": self._is_warm}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on with the segments of this process, or with its share if there are more or fewer processes now."""
         processes = self._processes
-        self._is_warm = state.get("is_warm", False)
-        self.memory.load_state_dict(own_share(to_arrays(state["memory"]), processes.rank, processes.count))
+        self._is_warm = state["is_warm"]
+        self.memory.load_state_dict(own_share(state["memory"], processes.rank, processes.count))
         if self.config.ema_decay:
-            self._learner.load_state_dict(self.policy.state_dict() | state.get("learner", {}))
+            self._learner.load_state_dict(self.policy.state_dict() | state["learner"])
 
-    def _make_player(self, generator: torch.Generator) -> Player:
+    def _make_player(self, generator: torch.Generator) -> ChunkPlayer | SharedPlayer:
         if not samples(self.policy):
             if self.config.temperature != 1:
                 raise ValueError(
                     f"--algorithm.temperature={self.config.temperature} is not for --policy.type="
                     f"{self.policy.config.type}, which does not sample at a temperature."
                 )
-            return make_player(self.policy)
+            return make_player(self.policy, self._processors)
 
-        def plan(frames: list[Batch]) -> Tensor:
-            batch = frames[0] if len(frames) == 1 else with_history(frames)
+        def plan(columns: Columns, instructions: list[str]) -> Tensor:
+            batch = self._processors.batch(columns, instructions)
             sample = self.policy.sample_actions(batch, temperature=self.config.temperature, generator=generator)
             return sample["actions"]
 
@@ -184,7 +180,7 @@ class ImitationAgent(LearningAgent):
         except NotImplementedError as error:
             raise ValueError(
                 f"--policy.type={self.policy.config.type} has no optimizer preset or parameters to optimise: "
-                "--algorithm.type=imitation trains the policies that lerobot-train trains."
+                "--algorithm.type=imitation trains what lerobot-train trains."
             ) from error
         self.optimizer = preset.build(params)
         factor = FINE_TUNING if self.config.lr is None else self.config.lr / preset.lr
@@ -288,17 +284,3 @@ def copy_trained(policy: PreTrainedPolicy) -> PreTrainedPolicy:
     """A copy that shares the parameters that are not trained, which may be most of a large policy."""
     shared = {id(param): param for param in policy.parameters() if not param.requires_grad}
     return copy.deepcopy(policy, memo=shared)
-
-
-def with_history(frames: list[Batch]) -> Batch:
-    """Return preprocessed observations, oldest first, as one batch of a policy that looks back.
-
-    As `PolicyProcessors.batch` makes it of columns with a history: `observation.*` (B, H, ...), and of the
-    instruction, which is the same in all frames, the newest.
-    """
-    batch = dict(frames[-1])
-    for name, value in batch.items():
-        seen = name.startswith(f"{OBS_STR}.") and not name.startswith(OBS_LANGUAGE)
-        if seen and isinstance(value, Tensor):
-            batch[name] = torch.stack([frame[name] for frame in frames], 1)
-    return batch

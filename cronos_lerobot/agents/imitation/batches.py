@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import httpx
@@ -11,7 +11,6 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
-from lerobot.datasets.utils import INFO_PATH
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, REWARD
 from torch.utils.data import default_collate
 
@@ -62,7 +61,6 @@ class Demonstrations:
     Args:
         config: which one.
         policy: config of the policy that learns from it.
-        beside: shapes of what the run observes, if batches will have both.
 
     Raises:
         ValueError: the dataset lacks a column that the policy reads, has it in another shape, cannot be read, or
@@ -70,14 +68,11 @@ class Demonstrations:
         FileNotFoundError: there is no such dataset.
     """
 
-    def __init__(
-        self, config: DemosConfig, policy: PreTrainedConfig, beside: Mapping[str, tuple[int, ...]] | None = None
-    ) -> None:
+    def __init__(self, config: DemosConfig, policy: PreTrainedConfig) -> None:
         meta = _open_metadata(config)
         if config.root is not None:
             check_files_are_there(meta, config.root)
         wanted = _check_columns(config, policy, meta.features)
-        _check_pictures(config, meta.features, wanted, beside or {})
         deltas = resolve_delta_timestamps(policy, meta)
         self._dataset = LeRobotDataset(meta.repo_id, root=config.root, delta_timestamps=deltas)
         drop_last = getattr(policy, "drop_n_last_frames", 0) or 0
@@ -107,16 +102,9 @@ def _open_metadata(config: DemosConfig) -> LeRobotDatasetMetadata:
     try:
         return open_metadata(config.repo_id, config.root)
     except (OSError, httpx.HTTPError) as error:
-        folder = config.root
-        if folder is not None and (folder / INFO_PATH).is_file():
-            raise FileNotFoundError(f"--algorithm.demos.root={folder} cannot be read: {error}") from error
-        # What is not in the folder LeRobot downloads into it.
-        where = (
-            "on this machine" if folder is None else f"in --algorithm.demos.root={folder} ({folder.absolute()})"
-        )
         raise FileNotFoundError(
-            f"--algorithm.demos.repo_id={config.repo_id}: no LeRobotDataset {where}, and none came from the Hub "
-            f"({type(error).__name__})."
+            f"--algorithm.demos.repo_id={config.repo_id}, --algorithm.demos.root={config.root}: there is no "
+            f"LeRobotDataset that can be read ({error})."
         ) from error
 
 
@@ -150,25 +138,6 @@ def _check_columns(config: DemosConfig, policy: PreTrainedConfig, features: Mapp
                 "--env.task_observation."
             )
     return wanted
-
-
-def _check_pictures(
-    config: DemosConfig, features: Mapping[str, Any], names: Iterable[str], beside: Mapping[str, tuple[int, ...]]
-) -> None:
-    """A ValueError if pictures that will be in one batch with those of the run have another size."""
-    for name in sorted(name for name in names if name in beside and name.startswith(OBS_IMAGES)):
-        theirs, own = _height_and_width(features[name]["shape"]), _height_and_width(beside[name])
-        if theirs != own:
-            raise ValueError(
-                f"--algorithm.demos.repo_id={config.repo_id} has {name} of {theirs[0]} x {theirs[1]} pixels, the "
-                f"run of {own[0]} x {own[1]}, and batches have both: give --env.observation_height={theirs[0]} "
-                f"--env.observation_width={theirs[1]}, or record the demonstrations as the run sees them."
-            )
-
-
-def _height_and_width(shape: Sequence[int]) -> tuple[int, ...]:
-    """Of pictures with the channels last, as in the datasets of this package, or first."""
-    return tuple(shape[:2] if shape[2] in (1, 3) else shape[1:])
 
 
 def _read_episodes(dataset: LeRobotDataset, names: list[str], bounds: list[tuple[int, int]]) -> list[Segment]:

@@ -19,8 +19,6 @@ class Segment:
     instruction: str
     columns: Columns
     """(T, ...) each: raw observations, `action` float32 in physical units, `next.reward` float32."""
-    update: int = 0
-    """Updates of the policy before the segment was over, if the agent counts them."""
     success: bool = True
     """Whether the task was complete at any of its steps."""
 
@@ -137,12 +135,6 @@ class SegmentMemory:
         self._lengths = None
         while self._bytes > self.max_bytes and len(self.segments) > 1:
             self._bytes -= self.segments.popleft().nbytes
-
-    def forget(self, before: int) -> None:
-        """Let the segments go that were over before so many updates."""
-        self.segments = deque(segment for segment in self.segments if segment.update >= before)
-        self._lengths = None
-        self._bytes = sum(segment.nbytes for segment in self.segments)
 
     def draw(
         self, count: int, rng: np.random.Generator, weights: np.ndarray | None = None

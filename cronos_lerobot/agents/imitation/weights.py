@@ -43,17 +43,6 @@ class Remembered:
         return np.array([mass.sum() for mass in self.split(self.lengths * weights)])
 
 
-def by_task(instructions: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Weights of the segments' frames, (segments,), with which every instruction is drawn as often.
-
-    Args:
-        instructions: of the segments.
-        lengths: frames of each that can be drawn.
-    """
-    _, tasks = np.unique(instructions, return_inverse=True)
-    return 1.0 / np.bincount(tasks, weights=lengths)[tasks]
-
-
 def by_return(returns: np.ndarray, beta: float) -> np.ndarray:
     """exp(R / beta), (segments,), the largest 1: reward-weighted regression (Peters & Schaal, 2007).
 

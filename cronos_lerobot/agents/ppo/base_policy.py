@@ -44,16 +44,9 @@ class BasePolicy:
         return functional_call(self._evaluate, parameters, arguments, tie_weights=False)
 
     def load(self, parameters: dict[str, Tensor]) -> None:
-        """Go on with the parameters of a checkpoint.
-
-        Raises:
-            ValueError: they are not those of this policy.
-        """
-        if parameters.keys() != self.parameters.keys():
-            differing = sorted(parameters.keys() ^ self.parameters.keys())
-            raise ValueError(f"The base policy's parameters are another policy's; they differ in {differing}.")
-        for name, param in parameters.items():
-            self.parameters[name].copy_(param)
+        """Go on with the parameters of a checkpoint."""
+        for name, param in self.parameters.items():
+            param.copy_(parameters[name])
 
 
 class _Evaluate(nn.Module):

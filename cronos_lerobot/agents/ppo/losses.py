@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from cronos_lerobot.agents.ppo.config import PPOConfig
+from cronos_lerobot.processes import Processes
 
 LOG_RATIO_LIMIT = 20.0
 """Largest |log r|: e^20 times any advantage is finite in float32, and any early stop stops long before."""
@@ -79,3 +80,34 @@ def explained_variance(values: np.ndarray, returns: np.ndarray) -> float:
     """Return 1 - Var[R - V] / Var[R]: 1 is a perfect critic, 0 one that knows the mean only."""
     variance = float(np.var(returns))
     return float("nan") if variance == 0 else 1 - float(np.var(returns - values)) / variance
+
+
+class UpdateMetrics:
+    """Means, weighted by the minibatches' sizes, and maxima."""
+
+    def __init__(self) -> None:
+        self._sums: dict[str, float] = {}
+        self._weights: dict[str, float] = {}
+        self._maxima: dict[str, float] = {}
+
+    def add_means(self, values: dict[str, float], weight: float = 1.0) -> None:
+        """Let `values` count `weight` times."""
+        for name, value in values.items():
+            self._sums[name] = self._sums.get(name, 0.0) + value * weight
+            self._weights[name] = self._weights.get(name, 0.0) + weight
+
+    def add_maxima(self, values: dict[str, float]) -> None:
+        """Keep the largest of each of `values`."""
+        for name, value in values.items():
+            self._maxima[name] = max(value, self._maxima.get(name, value))
+
+    def result(self, processes: Processes) -> dict[str, float]:
+        """Return the mean over the processes of their means, and the maxima of all."""
+        together = UpdateMetrics()
+        for means, maxima in processes.gather((self._means(), self._maxima)):
+            together.add_means(means)
+            together.add_maxima(maxima)
+        return together._means() | together._maxima
+
+    def _means(self) -> dict[str, float]:
+        return {name: total / self._weights[name] for name, total in self._sums.items()}

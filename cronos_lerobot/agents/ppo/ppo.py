@@ -13,11 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cronos_lerobot.agents.base import Columns, check_trainable
+from cronos_lerobot.agents.base import Columns
 from cronos_lerobot.agents.ppo.base_policy import BasePolicy
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.ppo.learning_rate import AdaptiveLR, target_kl
 from cronos_lerobot.agents.ppo.losses import (
+    UpdateMetrics,
     approximate_kl,
     bounded_log_ratio,
     by_factor,
@@ -27,9 +28,7 @@ from cronos_lerobot.agents.ppo.losses import (
     kl_to_base,
     value_error,
 )
-from cronos_lerobot.agents.ppo.metrics import UpdateMetrics
 from cronos_lerobot.agents.ppo.rollout_buffer import Minibatch, RolloutBuffer
-from cronos_lerobot.agents.ppo.self_imitation import SelfImitation
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.agents.weights import check_precision
 from cronos_lerobot.processes import Processes
@@ -64,11 +63,9 @@ class PPO:
         rng: draws the order of the minibatches.
         processes: each learns from its own rollout, in minibatches of its own; they take every optimizer step
             together, with the mean of their gradients. Their rollouts have the same size.
-        self_imitation: what is cloned in each optimizer step that trains the policy.
 
     Raises:
-        TypeError: the policy is not trainable.
-        ValueError: cloning would train nothing of it, or there is no critic to train.
+        ValueError: there is nothing to train, or no critic.
     """
 
     def __init__(
@@ -78,9 +75,7 @@ class PPO:
         config: PPOConfig,
         rng: np.random.Generator,
         processes: Processes | None = None,
-        self_imitation: SelfImitation | None = None,
     ) -> None:
-        check_trainable(policy)
         self.policy = policy
         self.processors = processors
         self.config = config
@@ -97,22 +92,15 @@ class PPO:
             group["lr"] = lrs[group["name"]]
             group["params"] = [p for p in group["params"] if p.requires_grad]
             self._params[group["name"]] += group["params"]
-        if not self._params["value"]:
-            raise ValueError(
-                f"PPO has no critic to train: all that {type(policy).__name__} estimates values with is frozen, as"
-                " adapters of --peft.* leave what they do not name."
-            )
-        if not self._params["policy"]:
-            raise ValueError(
-                f"PPO has nothing to train: all of {type(policy).__name__} that decides is frozen, as adapters of"
-                " --peft.* leave what they do not name."
-            )
+        for name, params in self._params.items():
+            if not params:
+                raise ValueError(
+                    f"PPO has no {name} to train: all of it is frozen in {type(policy).__name__}, as adapters of "
+                    "--peft.* leave what they do not name."
+                )
         trained = self._params["policy"] + self._params["value"]
         check_precision(trained, getattr(policy, "config", None), config.type)
         _freeze_all_but(trained, policy)
-        self.self_imitation = self_imitation
-        if self_imitation is not None:
-            self_imitation.check(self._params["policy"])
         betas = (config.beta1, config.beta2)
         # Without `fused`, a small network's step on a CPU costs as much as a tenth of its backward pass.
         fused = True if processors.device.type == "cpu" else None
@@ -134,15 +122,13 @@ class PPO:
         config = self.config
         buffer.compute_advantages(config.gamma, config.gae_lambda)
         rollout = {name: self.processes.concatenate(array, axis=1) for name, array in buffer.results().items()}
-        own = ~rollout.pop("expert")
+        own = ~rollout.pop("intervened")
         if self._num_own(buffer) == 0:
             return {"policy_epochs": 0.0, "policy_lr": self.policy_lr, "value_lr": config.value_lr}
         rollout = {name: array[own] for name, array in rollout.items()}
         described = _describe_rollout(rollout)
         if config.normalize_advantage:
             buffer.normalize_advantages(rollout["advantages"].mean(), rollout["advantages"].std())
-        if self.self_imitation is not None:
-            described |= self.self_imitation.begin_update(self.num_updates)
         if self.target_kl is not None:
             described["target_kl"] = self.target_kl
         metrics = UpdateMetrics()
@@ -180,8 +166,6 @@ class PPO:
                 if steps:
                     seen.append(kl)
                     self.lr.see("kl_step", kl)
-                if self.self_imitation is not None:
-                    metrics.add_means(self.self_imitation.add_gradients(self._params["policy"]))
                 norms = self._optimizer_step(metrics)
                 self.lr.after_step(norms["policy"])
                 steps += 1
@@ -262,7 +246,7 @@ class PPO:
         log_ratio = bounded_log_ratio(new_log_prob, old_log_prob)
         advantage = self._tensor(minibatch.advantage)[:, None]
         weights = factor_weights(log_ratio, config.denoising_discount)
-        policy_loss = -(weights * clipped_objective(log_ratio, advantage, config.clip)).mean()
+        policy_loss = -(weights * clipped_objective(log_ratio, advantage, config.clip)).sum(1).mean()
         value_loss = self._value_error(new["value"], minibatch)
         total = policy_loss + config.value_coef * value_loss
         ratio = log_ratio.detach().exp()

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from cronos_lerobot.agents.base import Columns, Decision
+from cronos_lerobot.agents.base import Columns
+from cronos_lerobot.agents.decisions import Decision
 from cronos_lerobot.agents.ppo.gae import compute_gae
 
 STORED = (
     "rewards", "values", "log_probs", "boundaries", "bootstrap_values", "durations", "instruction_ids", "traces",
-    "expert",
+    "intervened",
 )  # fmt: skip
 """Arrays of a buffer that are filled as the streams go on."""
 
@@ -69,8 +70,8 @@ class RolloutBuffer:
         self.boundaries = np.zeros(shape, np.bool_)
         self.bootstrap_values = np.zeros(shape, np.float32)
         self.durations = np.ones(shape, np.int64)
-        self.expert = np.zeros(shape, np.bool_)
-        """Played by an expert: nothing is learned from these."""
+        self.intervened = np.zeros(shape, np.bool_)
+        """A person or a script acted: nothing is learned from these."""
         self.advantages = np.zeros(shape, np.float32)
         self.returns = np.zeros(shape, np.float32)
         self.instruction_ids = np.zeros(shape, np.int64)
@@ -86,7 +87,7 @@ class RolloutBuffer:
     @property
     def num_own(self) -> int:
         """Decisions in the buffer that the policy's own actions followed, over all streams."""
-        return len(self) - int(self.expert[: self.rows].sum())
+        return len(self) - int(self.intervened[: self.rows].sum())
 
     def state_dict(self) -> dict[str, Any]:
         """The decisions in use, stream by stream: arrays (N, rows, ...) of their types; {} if there are none."""
@@ -113,8 +114,6 @@ class RolloutBuffer:
             whole[:rows] = array[streams].swapaxes(0, 1)
             return whole
 
-        # Checkpoints from before there were takeovers have no experts.
-        state = {"expert": np.zeros(state["rewards"].shape, np.bool_)} | state
         restored = _map_arrays({name: state[name] for name in (*STORED, "observations")}, restore)
         vars(self).update(restored)
         self.rows = rows
@@ -122,26 +121,24 @@ class RolloutBuffer:
 
     def add(
         self,
-        observation: Columns,
-        instructions: list[str],
         decision: Decision,
+        instructions: list[str],
         reward: np.ndarray,
         boundary: np.ndarray,
         bootstrap_value: np.ndarray,
         duration: np.ndarray | int = 1,
-        expert: np.ndarray | bool = False,
+        intervened: np.ndarray | bool = False,
     ) -> None:
         """Copy one decision of every stream.
 
         Args:
-            observation: what was decided on, columns (N, ...).
+            decision: of all N streams.
             instructions: N instructions decided under.
-            decision: with its log-probability, and the value of the observation.
             reward: (N,), of several control steps the discounted sum.
             boundary: (N,) bool, the stream's trace is cut after this decision.
             bootstrap_value: (N,), read where `boundary` is set.
             duration: (N,) or a number, control steps that were played.
-            expert: (N,) bool or one, an expert played at any of them.
+            intervened: (N,) bool or one, a person or a script acted at any of them.
 
         Raises:
             RuntimeError: the buffer is full.
@@ -150,11 +147,11 @@ class RolloutBuffer:
         if self.rows == self.num_rows:
             raise RuntimeError(f"The rollout buffer is full: it holds {self.num_rows} rows; update and clear it.")
         if self.traces is None:
-            self._allocate(observation, decision)
+            self._allocate(decision)
         assert self.traces is not None
         assert self.log_probs is not None
         row = self.rows
-        for name, column in observation.items():
+        for name, column in decision.inputs.items():
             # An assignment would write fractions into whole numbers: a policy may see others on another device.
             np.copyto(self.observations[name][row], column, casting="no")
         self.instruction_ids[row] = [self._instruction_id(text) for text in instructions]
@@ -165,18 +162,18 @@ class RolloutBuffer:
         self.boundaries[row] = boundary
         self.bootstrap_values[row] = bootstrap_value
         self.durations[row] = duration
-        self.expert[row] = expert
+        self.intervened[row] = intervened
         self.rows += 1
 
     def compute_advantages(self, gamma: float, gae_lambda: float) -> None:
         """Fill `advantages` and `returns` of the rows in use.
 
-        Where an expert takes over or gives back, the trace is cut and bootstrapped from the next row's value.
+        Where help begins or ends, the trace is cut and bootstrapped from the next row's value.
         """
         used = slice(0, self.rows)
-        values, expert = self.values[used], self.expert[used]
-        handed_over = np.zeros_like(expert)
-        handed_over[:-1] = (expert[1:] != expert[:-1]) & ~self.boundaries[used][:-1]
+        values, helped = self.values[used], self.intervened[used]
+        handed_over = np.zeros_like(helped)
+        handed_over[:-1] = (helped[1:] != helped[:-1]) & ~self.boundaries[used][:-1]
         following = np.where(handed_over, np.roll(values, -1, axis=0), self.bootstrap_values[used])
         self.advantages[used], self.returns[used] = compute_gae(
             self.rewards[used],
@@ -189,8 +186,8 @@ class RolloutBuffer:
         )
 
     def results(self) -> Columns:
-        """Return `rewards`, `values`, `advantages`, `returns` and `expert` of the rows in use, (rows, N) each."""
-        names = ("rewards", "values", "advantages", "returns", "expert")
+        """Return what an update reads of the rows in use, (rows, N) each."""
+        names = ("rewards", "values", "advantages", "returns", "intervened")
         return {name: getattr(self, name)[: self.rows] for name in names}
 
     def normalize_advantages(self, mean: float, std: float) -> None:
@@ -205,7 +202,7 @@ class RolloutBuffer:
         observations: Columns | None = None,
         limit: int | None = None,
     ) -> Iterator[Minibatch]:
-        """Yield every decision exactly once but those that an expert played, in an order drawn from `rng`.
+        """Yield every decision without help exactly once, in an order drawn from `rng`.
 
         The last batch may be smaller.
 
@@ -216,7 +213,7 @@ class RolloutBuffer:
             limit: of so many decisions only, the first ones of that order.
         """
         observations = self.observations if observations is None else observations
-        own = np.flatnonzero(~self.expert[: self.rows])
+        own = np.flatnonzero(~self.intervened[: self.rows])
         order = own[rng.permutation(len(own))[:limit]]
         for start in range(0, len(order), batch_size):
             yield self._gather(order[start : start + batch_size], observations)
@@ -258,12 +255,12 @@ class RolloutBuffer:
             return_=self.returns[row, stream],
         )
 
-    def _allocate(self, observation: Columns, decision: Decision) -> None:
+    def _allocate(self, decision: Decision) -> None:
         shape = (self.num_rows, self.num_streams)
         self.traces = np.zeros((*shape, *decision.trace.shape[1:]), decision.trace.dtype)
         self.log_probs = np.zeros((*shape, *decision.log_prob.shape[1:]), np.float32)
         self.observations = {
-            name: np.zeros((*shape, *column.shape[1:]), column.dtype) for name, column in observation.items()
+            name: np.zeros((*shape, *column.shape[1:]), column.dtype) for name, column in decision.inputs.items()
         }
 
     def _instruction_id(self, text: str) -> int:

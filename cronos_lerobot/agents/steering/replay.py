@@ -21,9 +21,6 @@ end; the factor of what follows, 0 if nothing does; the features that follow (F,
 class ReplayMemory:
     """The newest decisions, drawn from uniformly.
 
-    LeRobot's ReplayBuffer takes one transition of one environment at a time, draws from PyTorch's global
-    generator, and has no state that a checkpoint could hold.
-
     Args:
         capacity: decisions; the oldest go while there are more.
     """

@@ -1,10 +1,4 @@
-"""Soft actor-critic (Haarnoja et al., 2018) over decisions, with an ensemble of critics as in REDQ (2021).
-
-LeRobot's SACAlgorithm is not used: its backup has one discount factor, where a decision that is cut short has
-another one; its Gaussian takes a covariance matrix of all dimensions, whose Cholesky factor is found anew for each
-of them, too much for the noise of a chunk; and it takes the optimizer's steps itself, without a place to average
-gradients over processes. Its MLP is the actor's.
-"""
+"""Soft actor-critic (Haarnoja et al., 2018) over decisions, with an ensemble of critics as in REDQ (2021)."""
 
 from __future__ import annotations
 

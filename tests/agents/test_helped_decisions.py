@@ -1,4 +1,4 @@
-"""What an expert played: PPO keeps it and learns nothing from it."""
+"""Decisions with help: PPO keeps them and learns nothing from them."""
 
 import numpy as np
 import pytest
@@ -6,23 +6,24 @@ import torch
 from dummies import TASKS, DummyPolicy
 from ppo_samples import flat, make_ppo, reward_for_up, rollout
 
-from cronos_lerobot.agents.base import ActionSample, Decision
+from cronos_lerobot.agents.base import ActionSample
+from cronos_lerobot.agents.decisions import Decision
 from cronos_lerobot.agents.ppo.agent import PPOAgent
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
 
 
-def one_stream(rewards, values, boundaries, bootstrap, expert):
+def one_stream(rewards, values, boundaries, bootstrap, helped):
     buffer = RolloutBuffer(len(rewards), 1)
     for i in range(len(rewards)):
-        decision = Decision(np.zeros((1, 1, 7)), np.zeros((1, 7)), np.zeros(1), np.array([values[i]]))
+        decision = Decision(np.zeros((1, 1, 7)), np.zeros((1, 7)), np.zeros(1), np.array([values[i]]), {})
         row = (np.array([array[i]]) for array in (rewards, boundaries, bootstrap))
-        buffer.add({}, ["a"], decision, *row, expert=np.array([expert[i]]))
+        buffer.add(decision, ["a"], *row, intervened=np.array([helped[i]]))
     buffer.compute_advantages(gamma=0.5, gae_lambda=0.5)
     return buffer
 
 
-def test_advantages_around_a_takeover_by_hand():
-    # Rows: own | expert, expert | own. The middle is a segment of its own, as a takeover is.
+def test_advantages_around_a_segment_with_help_by_hand():
+    # Rows: own | helped, helped | own. The middle is a segment of its own.
     # delta_0 = 1 + .5 * 6 - 2 = 2, cut; delta_3 = 0 + .5 * 8 - 1 = 3.
     buffer = one_stream([1, 5, 5, 0], [2, 70, 70, 1], [1, 0, 1, 1], [6, -9, 50, 8], [0, 1, 1, 0])
     assert buffer.advantages[[0, 3], 0].tolist() == [2, 3]
@@ -32,7 +33,7 @@ def test_advantages_around_a_takeover_by_hand():
     assert other.advantages[[0, 3], 0].tolist() == [2, 3]
 
 
-def test_an_expert_inside_a_segment_cuts_the_trace_before_and_after_it():
+def test_help_inside_a_segment_cuts_the_trace_before_and_after_it():
     # Bootstrapped from V of the next row: delta_0 = 1 + .5 * 4 - 2 = 1; delta_1 = 0 + .5 * 6 - 4 = -1, cut.
     # A_0 = 1 + .25 * -1 = .75. Row 3 ends the segment: delta_3 = 0 + .5 * 8 - 1 = 3.
     buffer = one_stream([1, 0, 77, 0], [2, 4, 6, 1], [0, 0, 0, 1], [-9, -9, -9, 8], [0, 0, 1, 0])
@@ -41,12 +42,12 @@ def test_an_expert_inside_a_segment_cuts_the_trace_before_and_after_it():
 
 
 def mark(buffer):
-    """Let an expert have played the odd streams."""
-    buffer.expert[:, 1::2] = True
+    """Let somebody have helped the odd streams."""
+    buffer.intervened[:, 1::2] = True
     return buffer
 
 
-def test_minibatches_and_metrics_leave_the_expert_out():
+def test_minibatches_and_metrics_leave_help_out():
     ppo = make_ppo()
     buffer = mark(rollout(ppo, reward_for_up))
     buffer.compute_advantages(0.99, 0.95)
@@ -79,11 +80,11 @@ def test_an_update_is_that_of_the_policys_own_decisions_alone():
     torch.testing.assert_close(*params, atol=0, rtol=0)
 
 
-def test_where_everything_was_the_experts_nothing_is_learned():
+def test_where_all_had_help_nothing_is_learned():
     ppo = make_ppo()
     before = flat(ppo.policy.parameters())
     buffer = rollout(ppo, reward_for_up)
-    buffer.expert[:] = True
+    buffer.intervened[:] = True
     assert ppo.update(buffer)["policy_epochs"] == 0
     assert torch.equal(flat(ppo.policy.parameters()), before)
 
@@ -98,21 +99,18 @@ class TwoSteps(DummyPolicy):
         return sample | {"actions": sample["actions"].repeat(1, 2, 1)}
 
 
-def test_a_decision_is_the_experts_if_any_of_its_steps_was():
+def test_a_decision_has_help_if_any_of_its_steps_has():
     ppo = make_ppo(policy=TwoSteps())
     agent = PPOAgent(ppo, RolloutBuffer(2, 3), torch.Generator())
     tau = [TASKS[0].instruction] * 3
-    experts = [[0, 1, 0], [0, 0, 0], [0, 0, 0], [1, 0, 0]]
-    for k, expert in enumerate(experts):
+    helped = [[0, 1, 0], [0, 0, 0], [0, 0, 0], [1, 0, 0]]
+    for k, now in enumerate(helped):
         o_t = {"agent_pos": np.zeros((3, 2), np.float32)}
         sample = agent.act(o_t, tau)
-        sample = ActionSample(sample.action, sample.log_prob, sample.value, np.array(expert, bool))
+        sample = ActionSample(sample.action, sample.log_prob, sample.value, np.array(now, bool))
         cut = np.full(3, k == 3)
         agent.store(o_t, tau, sample, np.zeros(3, np.float32), o_t, cut, np.zeros(3, bool))
-    assert agent.buffer.expert.tolist() == [[False, True, False], [True, False, False]]
-    # A checkpoint keeps it; one from before there were experts has none.
-    other, state = RolloutBuffer(2, 3), agent.buffer.state_dict()
-    other.load_state_dict(state)
-    assert np.array_equal(other.expert, agent.buffer.expert)
-    other.load_state_dict({name: value for name, value in state.items() if name != "expert"})
-    assert not other.expert.any()
+    assert agent.buffer.intervened.tolist() == [[False, True, False], [True, False, False]]
+    other = RolloutBuffer(2, 3)
+    other.load_state_dict(agent.buffer.state_dict())
+    assert np.array_equal(other.intervened, agent.buffer.intervened)
