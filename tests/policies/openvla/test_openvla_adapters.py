@@ -106,13 +106,6 @@ def test_a_merged_adapter_is_in_the_saved_weights_and_not_merged_again(published
     assert torch.equal(log_probs_and_values(once_more), log_probs_and_values(policy))
 
 
-def test_fresh_adapters_on_top_of_a_merged_one(published, published_adapter, tmp_path):
-    policy = make_policy(published, adapter=str(published_adapter), merge_adapter=True, lora_rank=2)
-    policy.save_pretrained(tmp_path)
-    again = OpenVLAPolicy.from_pretrained(tmp_path)
-    assert torch.equal(log_probs_and_values(again), log_probs_and_values(policy))
-
-
 def test_adapters_are_written_for_peft(published, parts, tmp_path):
     """What is written goes onto the published model, by PEFT alone, and does there what it did here."""
     policy = make_policy(published, lora_rank=4, lora_modules=["language"])
@@ -129,21 +122,3 @@ def test_adapters_are_written_for_peft(published, parts, tmp_path):
     assert (plain - expected).abs().max() > 1e-2
     with pytest.raises(ValueError, match="lora_rank"):
         make_policy(published).save_adapter(tmp_path / "none")
-
-
-def test_adapters_of_another_network_are_refused(published, published_adapter, tmp_path):
-    folder = shutil.copytree(published_adapter, tmp_path / "other")
-    state = load_file(folder / ADAPTER_WEIGHTS)
-    renamed = {key.replace("language_model", "llm"): value for key, value in state.items()}
-    save_file(renamed, folder / ADAPTER_WEIGHTS, metadata={"format": "pt"})
-    with pytest.raises(ValueError, match="llm"):
-        make_policy(published, adapter=str(folder))
-
-
-def test_adapters_that_the_config_cannot_describe_are_merged_or_refused(published, published_adapter, tmp_path):
-    folder = shutil.copytree(published_adapter, tmp_path / "other")
-    fields = json.loads((folder / ADAPTER_CONFIG).read_text()) | {"use_rslora": True}
-    (folder / ADAPTER_CONFIG).write_text(json.dumps(fields))
-    with pytest.raises(ValueError, match=r"is no plain LoRA \(use_rslora\).*--policy\.merge_adapter=true"):
-        make_policy(published, adapter=str(folder))
-    make_policy(published, adapter=str(folder), merge_adapter=True)

@@ -2,14 +2,13 @@
 
 import json
 import shutil
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot_policy_openvla import OpenVLAConfig, OpenVLAPolicy, make_openvla_pre_post_processors
-from openvla_samples import CAMERA, INPUTS, OUTPUTS, log_probs_and_values, make_batch, make_config, make_policy
+from lerobot_policy_openvla import OpenVLAPolicy, make_openvla_pre_post_processors
+from openvla_samples import log_probs_and_values, make_batch, make_config, make_policy
 from published_checkpoint import MEANS, write_checkpoint
 from safetensors.torch import load_file, save_file
 from torch import nn
@@ -61,24 +60,6 @@ def test_statistics_of_a_fine_tuning_run_replace_the_others(beside, published, t
         make_config(folder, adapter=adapter).resolve()
 
 
-def test_several_statistics_are_not_guessed_between(published):
-    with pytest.raises(ValueError, match=r"unnorm_key is not given.*\['bridge_orig', 'other'\]"):
-        make_config(published, unnorm_key=None).resolve()
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [{"image_resize_strategy": "letterbox"}, {"tvf_do_letterbox": True}, {"interpolations": ["lanczos"] * 2}],
-)
-def test_other_preprocessing_is_refused(changes, published, tmp_path):
-    folder = shutil.copytree(published, tmp_path / "other")
-    path = folder / "preprocessor_config.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-    (name,) = changes
-    with pytest.raises(ValueError, match=f"preprocessor_config.json has {name}.*supported"):
-        make_config(folder).resolve()
-
-
 def test_one_file_or_many_shards(parts, tmp_path, published):
     folder = write_checkpoint(tmp_path / "one", parts)
     tensors = parts.published_tensors()
@@ -118,36 +99,6 @@ def test_missing_and_unknown_tensors_are_refused(published, tmp_path):
     save_file(tensors | {"language_model.extra": torch.zeros(2)}, shard)
     with pytest.raises(ValueError, match=r"language_model\.extra"):
         make_policy(folder)
-
-
-def test_bad_settings_are_refused(published):
-    with pytest.raises(ValueError, match="checkpoint=openvla/openvla-7b"):
-        OpenVLAPolicy(OpenVLAConfig(input_features=INPUTS, output_features=OUTPUTS, device="cpu"))
-    with pytest.raises(ValueError, match=r"'audio'.*projector"):
-        make_config(published, lora_modules=["audio"])
-    for bad, message in (
-        ({"merge_adapter": True}, "give it as adapter"),
-        ({"lora_alpha": 32}, "lora_alpha=32 must be above 0, beside a lora_rank above 0, got 0"),
-        ({"lora_rank": 4, "lora_alpha": -5}, "lora_alpha=-5 must be above 0"),
-        ({"lora_rank": 4, "lora_dropout": 2.0}, "lora_dropout=2.0 must be at least 0 and below 1"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            make_config(published, **bad)
-    with pytest.raises(ValueError, match="'fp8'"):
-        make_config(published, dtype="fp8")
-    with pytest.raises(ValueError, match="merge_adapter"):
-        make_config(published, adapter="somewhere", lora_rank=4)
-    with pytest.raises(ValueError, match="image_key"):
-        make_policy(published, image_key="observation.images.wrist")
-
-
-def test_quantisation_needs_its_package(published):
-    if find_spec("bitsandbytes"):
-        policy = make_policy(published, lora_rank=4, quantization="nf4")
-        assert log_probs_and_values(policy).isfinite().all()
-    else:
-        with pytest.raises(ImportError, match=r"lerobot_policy_openvla\[quantized\]"):
-            make_policy(published, lora_rank=4, quantization="nf4")
 
 
 def test_a_policy_with_adapters_saves_them_alone(published, tmp_path):
@@ -195,7 +146,12 @@ def test_settings_that_a_saved_policy_cannot_change(published, tmp_path):
         policy.wrap_with_peft(peft_cli_overrides={"r": 4})
 
 
-def test_the_image_may_have_any_size(published):
-    policy = make_policy(published)
-    batch = make_batch(1)
-    assert policy.select_action(batch | {CAMERA: torch.zeros(1, 3, 100, 200)}).shape == (1, 7)
+def test_bad_settings_are_refused(published):
+    for bad, flag in (
+        ({"lora_modules": ["audio"]}, "lora_modules"),
+        ({"merge_adapter": True}, "merge_adapter"),
+        ({"lora_alpha": 32}, "lora_alpha"),
+        ({"adapter": "somewhere", "lora_rank": 4}, "merge_adapter"),
+    ):
+        with pytest.raises(ValueError, match=flag):
+            make_config(published, **bad)

@@ -1,6 +1,5 @@
 """What a policy is built on: a folder as it was called elsewhere, and the Hub's commit that was first built on."""
 
-import json
 import shutil
 
 import huggingface_hub
@@ -73,23 +72,3 @@ def test_a_repository_is_held_at_the_commit_that_was_first_built_on(cache, tmp_p
     again = OpenVLAPolicy.from_pretrained(tmp_path / "pinned")
     assert torch.equal(log_probs_and_values(again), expected)
     assert fingerprint_of(tmp_path / "pinned") == known
-
-    # Checkpoints were once without, and go on with what the Hub has.
-    old = shutil.copytree(tmp_path / "pinned", tmp_path / "old")
-    config = json.loads((old / "config.json").read_text())
-    (old / "config.json").write_text(json.dumps(config | {"checkpoint_revision": None}))
-    moved = fingerprint_of(old)
-    assert not torch.equal(log_probs_and_values(OpenVLAPolicy.from_pretrained(old)), expected)
-    cache(FIRST)
-    assert torch.equal(log_probs_and_values(OpenVLAPolicy.from_pretrained(old)), expected)
-    assert fingerprint_of(old) != moved
-
-
-def test_a_repository_as_the_policy_itself_is_held_too(cache):
-    cache(SECOND)
-    published = make_policy(NAME, stir=False)
-    assert published.config.checkpoint_revision == SECOND
-    config = published.config
-    config.checkpoint = config.checkpoint_revision = None
-    assert OpenVLAPolicy.from_pretrained(NAME, config=config).config.checkpoint_revision == SECOND
-    assert OpenVLAPolicy.from_pretrained(NAME, config=config, revision=FIRST).config.checkpoint_revision == FIRST

@@ -13,7 +13,6 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot_env_cronos import CronosEnvConfig
 from lerobot_policy_openvla import OpenVLAPolicy
 from openvla_samples import CAMERA, TASKS, make_batch, make_config
-from openvla_samples import make_policy as stirred_policy
 from peft import PeftModel
 from safetensors.torch import load_file
 
@@ -116,48 +115,6 @@ def test_clone_then_train_kill_resume(cloned, tmp_path, monkeypatch):
     assert changed == {"network"}
     policy = OpenVLAPolicy.from_pretrained(whole / "checkpoints/last/pretrained_model")
     assert torch.equal(policy.state_dict()["value_head.layers.4.bias"], after["value_head.layers.4.bias"])
-
-
-@pytest.mark.parametrize("start", ["lora on a whole policy", "adapter", "merged adapter"])
-def test_a_run_keeps_what_it_was_given(start, published, tmp_path, monkeypatch):
-    """It is resumed from what its checkpoints resolved, and the next seed begins from what it began with."""
-    policy = stirred_policy(published, lora_rank=0 if start == "lora on a whole policy" else 4)
-    if start == "lora on a whole policy":
-        policy.save_pretrained(tmp_path / "given")
-        for processor in make_pre_post_processors(policy.config):
-            processor.save_pretrained(tmp_path / "given")
-        given = (f"--policy.path={tmp_path / 'given'}", "--policy.lora_rank=4")
-    else:
-        policy.save_adapter(tmp_path / "given")
-        given = ("--policy.type=openvla", f"--policy.checkpoint={published}", "--policy.unnorm_key=bridge_orig")
-        given += (f"--policy.adapter={tmp_path / 'given'}",)
-        given += (f"--policy.merge_adapter={json.dumps(start == 'merged adapter')}",)
-    flags = (*given, "--policy.device=cpu", "--algorithm.type=ppo_paper", *SMALL_LOOP)
-    whole, last = train_twice(monkeypatch, tmp_path, *flags)
-    new = tmp_path / "new"
-    cronos_train(
-        monkeypatch, f"--config_path={whole}/checkpoints/last/pretrained_model/train_config.json", "--steps=8",
-        f"--output_dir={new}",
-    )  # fmt: skip
-    pairs = (
-        (whole / "checkpoints/last", last.parent),
-        (tmp_path / "broken/checkpoints/000008", new / "checkpoints/last"),
-    )
-    for one, other in pairs:
-        tensors, others = (load_file(folder / "pretrained_model/model.safetensors") for folder in (one, other))
-        assert tensors.keys() == others.keys()
-        assert all(torch.equal(tensor, others[name]) for name, tensor in tensors.items())
-
-
-def test_a_whole_network_goes_on(published, tmp_path, monkeypatch):
-    """Without adapters; the run keeps the checkpoint that it began with."""
-    start = ("--policy.type=openvla", f"--policy.checkpoint={published}", "--policy.unnorm_key=bridge_orig")
-    start += ("--policy.device=cpu", "--algorithm.type=ppo_paper", *SMALL_LOOP)
-    whole, last = train_twice(monkeypatch, tmp_path, *start)
-    resumed = load_file(last / "model.safetensors")
-    for folder, same in ((whole / "checkpoints/last", True), (tmp_path / "broken/checkpoints/000008", False)):
-        other = load_file(folder / "pretrained_model/model.safetensors")
-        assert all(torch.equal(tensor, other[name]) for name, tensor in resumed.items()) == same
 
 
 def test_the_papers_preset(published, tmp_path, monkeypatch):

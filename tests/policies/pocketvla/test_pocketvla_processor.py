@@ -1,10 +1,8 @@
 """The processors: action bounds and normalisation, saved and loaded LeRobot's way."""
 
 import numpy as np
-import pytest
 import torch
 from lerobot.policies import make_pre_post_processors
-from lerobot_policy_pocketvla.action_bounds import ActionBoundsProcessorStep
 from pocketvla_samples import make_batch, make_config
 
 STATS = {
@@ -56,30 +54,3 @@ def test_dataset_bounds_come_from_the_statistics_and_survive_saving(tmp_path):
     normalised = preprocessor(make_batch(1) | {"action": torch.full((1, 7), 3.0)})["action"]
     torch.testing.assert_close(normalised, torch.full((1, 7), 0.5))
     torch.testing.assert_close(postprocessor(torch.full((1, 7), 0.5)), torch.full((1, 7), 3.0))
-
-
-def test_bytes_pass_through_and_observations_need_no_action():
-    preprocessor, _ = make_pre_post_processors(make_config(), dataset_stats=STATS)
-    batch = make_batch(2)
-    out = preprocessor(batch)
-    assert out["observation.images.front"].dtype == torch.uint8
-    assert out["task"] == batch["task"]
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "stats", "message"),
-    [
-        ({"action_dim": 4}, STATS, "has 7 dimensions, the action has 4"),
-        ({"action_bounds": "dataset"}, None, "statistics"),
-    ],
-)
-def test_bounds_that_do_not_fit_are_refused(kwargs, stats, message):
-    with pytest.raises(ValueError, match=message):
-        make_pre_post_processors(make_config(**kwargs), dataset_stats=stats)
-
-
-def test_the_step_checks_its_bounds():
-    with pytest.raises(ValueError, match="dimension 1"):
-        ActionBoundsProcessorStep([0.0, 1.0], [1.0, 1.0])
-    with pytest.raises(ValueError, match="2 dimensions, the bounds have 1"):
-        ActionBoundsProcessorStep([0.0], [1.0]).convert(torch.zeros(3, 2))
