@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Generator
-from contextlib import contextmanager
+import reprlib
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 from lerobot.datasets import CODEBASE_VERSION, LeRobotDatasetMetadata
 from lerobot.datasets.utils import (
     DATA_DIR,
+    DEFAULT_DATA_PATH,
     DEFAULT_TASKS_PATH,
+    DEFAULT_VIDEO_PATH,
     EPISODES_DIR,
     INFO_PATH,
     VIDEO_DIR,
@@ -20,12 +23,23 @@ from lerobot.datasets.utils import (
 )
 
 PATTERNS = ("[", "*", "?", "::")
-"""What `datasets`, to which LeRobot hands the paths of data files, takes for a pattern or an archive in a path: it
-finds nothing there, or what is in a folder beside it, too."""
+"""What `datasets` takes for a pattern or an archive in a path. LeRobot hands it the paths of data files, so that
+it finds nothing there, or also what is in a folder beside it."""
+MAX_ROWS_PER_BYTE = 1
+"""A parquet file with more rows than bytes is no recording: it would take a million times its size in memory."""
 
 
 class DatasetFileError(ValueError):
     """A file of a dataset is missing or damaged, or is not what a dataset of ours holds."""
+
+
+def brief(value: object) -> str:
+    """A value from a file, or what an error says of one, short enough for a message."""
+    text = str(value) if isinstance(value, Exception) else _BRIEF.repr(value)
+    return text if len(text) <= 300 else f"{text[:297]}..."
+
+
+_BRIEF = reprlib.Repr(maxstring=150, maxother=150, maxlist=20)
 
 
 def open_metadata(
@@ -39,14 +53,39 @@ def open_metadata(
         revision: of the repo on the Hub.
 
     Raises:
-        DatasetFileError: a file of `meta/` in `root` is missing.
-        ValueError: another version of LeRobot made it, or the Hub has no version of it; or LeRobot cannot read
-            what is in a folder of this path.
+        DatasetFileError: a file of `meta/` in `root` is missing or damaged, or leads out of the dataset.
+        ValueError: another version of LeRobot made it, or the Hub has no version of it.
     """
     if root is not None:
         check_meta_is_there(Path(root), repo_id)
-    with versions_explained(repo_id):
-        return LeRobotDatasetMetadata(repo_id, root, revision)
+    try:
+        meta = LeRobotDatasetMetadata(repo_id, root, revision)
+    except (CompatibilityError, NotImplementedError) as error:
+        raise _other_version(repo_id) from error
+    except (KeyError, TypeError, json.JSONDecodeError, pa.ArrowInvalid) as error:
+        raise DatasetFileError(f"meta/ of {repo_id} cannot be read: {brief(error)}") from error
+    except RuntimeError as error:
+        if "must be tagged" not in str(error):
+            raise
+        raise ValueError(
+            f"{repo_id} on the Hub has no tag {CODEBASE_VERSION}: give a --dataset.revision that it has"
+        ) from error
+    check_names(meta)
+    return meta
+
+
+def check_names(meta: LeRobotDatasetMetadata) -> None:
+    """Check that all files of a dataset lie in its folder.
+
+    Raises:
+        DatasetFileError: names what leads out of it.
+    """
+    for path, expected in ((meta.data_path, DEFAULT_DATA_PATH), (meta.video_path, DEFAULT_VIDEO_PATH)):
+        if path not in (expected, None):
+            raise DatasetFileError(f"{INFO_PATH} keeps files at {brief(path)}, LeRobot at {expected}")
+    for name in meta.features:
+        if "/" in name or "\\" in name or name in (".", ".."):
+            raise DatasetFileError(f"{INFO_PATH} has a feature {brief(name)}, which is no name of a file")
 
 
 def check_meta_is_there(root: Path, repo_id: str) -> None:
@@ -66,17 +105,42 @@ def check_meta_is_there(root: Path, repo_id: str) -> None:
     try:
         info = json.loads((root / INFO_PATH).read_text())
         version, has_episodes = info["codebase_version"], bool(info["total_episodes"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise DatasetFileError(f"{root / INFO_PATH} is damaged: {error!r}") from error
-    with versions_explained(repo_id):
         check_version_compatibility(repo_id, version, CODEBASE_VERSION)
-    # The first segment brings them.
+    except (CompatibilityError, NotImplementedError) as error:
+        raise _other_version(repo_id) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise DatasetFileError(f"{root / INFO_PATH} is damaged: {brief(error)}") from error
+    # The first segment brings the other files.
     if not has_episodes:
         return
     if not (root / DEFAULT_TASKS_PATH).is_file():
         raise DatasetFileError(f"{root / DEFAULT_TASKS_PATH} is missing")
-    if not any((root / EPISODES_DIR).glob("*/*.parquet")):
+    episodes = sorted((root / EPISODES_DIR).glob("*/*.parquet"))
+    if not episodes:
         raise DatasetFileError(f"{root / EPISODES_DIR} is missing")
+    for path in (root / DEFAULT_TASKS_PATH, *episodes):
+        check_parquet(path, root)
+
+
+def check_parquet(path: Path, root: Path) -> pq.FileMetaData:
+    """Look at the end of a parquet file, before anything of it is read.
+
+    Returns:
+        What it says of its rows and columns.
+
+    Raises:
+        DatasetFileError: the file is missing, damaged, or says of itself what no recording is.
+    """
+    relative = path.relative_to(root)
+    try:
+        metadata = pq.read_metadata(path)
+    except FileNotFoundError:
+        raise DatasetFileError(f"{relative} is missing") from None
+    except (pa.ArrowInvalid, OSError) as error:
+        raise DatasetFileError(f"{relative} is damaged: {brief(error)}") from error
+    if metadata.num_rows > path.stat().st_size * MAX_ROWS_PER_BYTE:
+        raise DatasetFileError(f"{relative} has {metadata.num_rows} rows in {path.stat().st_size} bytes")
+    return metadata
 
 
 def check_path(root: Path) -> None:
@@ -87,17 +151,14 @@ def check_path(root: Path) -> None:
     """
     path = str(root.absolute())
     if found := [pattern for pattern in PATTERNS if pattern in path]:
-        raise ValueError(
-            f"{path} has {' and '.join(found)} in its path, with which LeRobot cannot read a dataset: choose a"
-            f" folder without {', '.join(PATTERNS)}"
-        )
+        raise ValueError(f"LeRobot cannot read a dataset in {path}: choose a path without {' '.join(found)}")
 
 
 def check_files_are_there(meta: LeRobotDatasetMetadata, root: Path) -> None:
     """Check that the dataset in a folder has an episode, and every data and video file that its episodes name.
 
-    For one that it does not find LeRobot downloads the Hub's dataset into the folder, over what is there. A folder
-    that it has downloaded into before, or without any such file, it may complete.
+    If one is missing, LeRobot downloads the Hub's dataset into the folder, over what is there. It may do so in a
+    folder that it has downloaded into before, or that has no such file.
 
     Args:
         meta: of the dataset in `root`.
@@ -113,13 +174,12 @@ def check_files_are_there(meta: LeRobotDatasetMetadata, root: Path) -> None:
         raise DatasetFileError(f"{root / missing[0]} is missing")
 
 
-def missing_files(meta: LeRobotDatasetMetadata) -> list[str]:
-    """Return the data and video files that `meta/episodes` names and the dataset's folder lacks, sorted."""
+def named_files(meta: LeRobotDatasetMetadata) -> list[str]:
+    """Return the data and video files that `meta/episodes` names, relative to the dataset's folder, sorted."""
     assert meta.episodes is not None
-    templates = {"data": meta.data_path} | {f"videos/{key}": meta.video_path for key in meta.video_keys}
+    templates = {"data": DEFAULT_DATA_PATH} | {f"videos/{key}": DEFAULT_VIDEO_PATH for key in meta.video_keys}
     named = set()
     for prefix, template in templates.items():
-        assert template is not None
         # Whole columns: to look at thousands of episodes one by one takes seconds.
         chunks, files = (
             meta.episodes[f"{prefix}/{name}"][: meta.total_episodes] for name in ("chunk_index", "file_index")
@@ -128,23 +188,16 @@ def missing_files(meta: LeRobotDatasetMetadata) -> list[str]:
             template.format(video_key=prefix.removeprefix("videos/"), chunk_index=chunk, file_index=file)
             for chunk, file in set(zip(chunks, files, strict=True))
         }
-    return sorted(file for file in named if not (meta.root / file).is_file())
+    return sorted(named)
 
 
-@contextmanager
-def versions_explained(repo_id: str) -> Generator[None]:
-    """Turn what LeRobot raises for other versions of its format into a ValueError of one line."""
-    try:
-        yield
-    except (CompatibilityError, NotImplementedError) as error:
-        raise ValueError(
-            f"{repo_id} has another version of LeRobot's format than this LeRobot's, {CODEBASE_VERSION}; "
-            "LeRobot's documentation says how to convert it"
-        ) from error
-    except RuntimeError as error:
-        if "must be tagged" not in str(error):
-            raise
-        raise ValueError(
-            f"{repo_id} on the Hub has no tag of a version, as {CODEBASE_VERSION}: name a revision of it that is "
-            "there, a branch say, or give it the tag"
-        ) from error
+def missing_files(meta: LeRobotDatasetMetadata) -> list[str]:
+    """Return those of `named_files` that the dataset's folder lacks."""
+    return [file for file in named_files(meta) if not (meta.root / file).is_file()]
+
+
+def _other_version(repo_id: str) -> ValueError:
+    return ValueError(
+        f"{repo_id} has another version of LeRobot's format than {CODEBASE_VERSION}: convert it as LeRobot's "
+        "documentation says"
+    )

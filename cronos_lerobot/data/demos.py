@@ -9,6 +9,7 @@ from lerobot.utils.constants import ACTION, DONE, REWARD
 from lerobot_env_cronos import CronosVectorEnv, Scene, Task
 from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW
 
+from cronos_lerobot.agents.actor import Actor
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.data.demo_starts import FREE_LAYOUTS, StartConfig, check_starts, other_tasks, tasks_before
 from cronos_lerobot.data.perturbations import (
@@ -19,10 +20,9 @@ from cronos_lerobot.data.perturbations import (
     drop_against_another,
     move_arm_at_random,
 )
-from cronos_lerobot.data.schema import SUCCESS, TRUNCATED
+from cronos_lerobot.data.schema import CONFIGURATION, SUCCESS, TRUNCATED
 from cronos_lerobot.data.writer import SegmentWriter
 
-CONFIGURATION = "cronos.configuration"
 MAX_FAILURES_IN_A_ROW = 200
 
 
@@ -38,16 +38,6 @@ class Expert(Protocol):
 
     def act(self) -> np.ndarray:
         """Actions (n, 7) in physical units for the environment's state as it is now."""
-
-
-class StreamPolicy(Protocol):
-    """A policy that acts in all streams of a vector environment and learns nothing."""
-
-    def forget(self, ids: np.ndarray) -> None:
-        """A new task begins in the streams `ids`."""
-
-    def choose(self, o_t: dict[str, np.ndarray], tau: list[str]) -> np.ndarray:
-        """Actions (n, 7) in physical units for what streams observe, with their instructions."""
 
 
 @dataclass
@@ -68,10 +58,8 @@ class DemoConfig:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if self.max_steps < 1:
-            raise ValueError(f"max_steps must be at least 1, got {self.max_steps}")
-        if self.steps_after_release < 0:
-            raise ValueError(f"steps_after_release must be at least 0, got {self.steps_after_release}")
+        if self.max_steps < 1 or self.steps_after_release < 0:
+            raise ValueError(f"--max_steps must be at least 1, --steps_after_release at least 0: {self}")
 
 
 @dataclass
@@ -113,7 +101,7 @@ class DemoCollector:
         *,
         seed: int = 0,
         tasks: Sequence[Task] | None = None,
-        policy: StreamPolicy | None = None,
+        policy: Actor | None = None,
     ) -> None:
         """Collect from all streams of `env` into `writer`, which may already hold episodes.
 
@@ -125,25 +113,20 @@ class DemoCollector:
             seed: decides layouts, noise, misses and starts.
             tasks: to demonstrate; all of the scene's when None, with its reset tasks if `config` says so.
             policy: that of `config.start.policy`.
-
-        Raises:
-            ValueError: there is a policy and `config` names none, or the other way round.
         """
-        if (policy is None) != (config.start.policy is None):
-            raise ValueError(f"start.policy is {config.start.policy}, and the policy that was given is {policy}")
         self.env, self.expert, self.writer, self.config, self.policy = env, expert, writer, config, policy
         self.finished, self.successes = 0, 0
         self._started = 0
         self._seed = (seed, writer.num_episodes)
         tasks = tasks or tasks_of(config, env.scene)
         self._kept = {task: writer.episodes_before[task.instruction] for task in tasks}
-        # A dataset that is gone on with goes on with the next configuration, as far as the attempts succeeded.
+        # A resumed dataset begins with the next configuration, as far as the attempts succeeded.
         self._tried = dict(self._kept)
         self._episodes: list[_Episode | None] = [None] * env.num_envs
         self._noise = ActionNoise(config.noise, env.num_envs)
         self._misses = GraspMisses(config.misses, env)
         self._failures_in_a_row = 0
-        check_starts(config.start, env.scene, tasks, len(env.benchmark.configurations["train"]))
+        check_starts(config.start, env.scene, tasks)
 
     def collect(self, num_episodes: int, on_episode: Callable[[int], object] = lambda frames: None) -> None:
         """Write `num_episodes` more episodes: in the end each task has the same number, as far as that divides.
@@ -180,7 +163,9 @@ class DemoCollector:
         earlier = np.array([e is not None and bool(e.preludes) and self._is_policys(e) for e in self._episodes])
         if not earlier.any():
             return labels
-        return np.where(earlier[:, None], self.policy.choose(observation, self.env.instructions), labels)
+        everyone = np.arange(self.env.num_envs)
+        chosen = self.policy.act(observation, self.env.instructions, everyone).action
+        return np.where(earlier[:, None], chosen, labels)
 
     def _perturb(self, labels: np.ndarray) -> np.ndarray:
         recording = np.array([episode is not None and not episode.preludes for episode in self._episodes])
@@ -199,7 +184,7 @@ class DemoCollector:
             episode.settling = False
             if self.policy is not None:
                 # What it planned at rest, it planned for what it saw before.
-                self.policy.forget(np.array([stream]))
+                self.policy.begin(np.array([stream]))
             if not episode.preludes and info["is_success"][stream]:
                 self._discard(stream, episode)
             return
@@ -255,13 +240,10 @@ class DemoCollector:
             self._discard(stream, episode)
 
     def _discard(self, stream: int, episode: _Episode) -> None:
-        """Nothing can be shown: the task was complete from the start, or the simulation broke down in the policy's
-        hands."""
+        """Nothing can be shown: the task was complete from the start, or the policy broke the simulation."""
         self._episodes[stream] = None
         self._count_failure(
-            "start.policy or start.leaning_share had left the task complete or the simulation broken down, or the"
-            " expert failed",
-            repr(episode.task.instruction),
+            "the start was complete or broken, or the expert failed,", repr(episode.task.instruction)
         )
 
     def _count_failure(self, what: str, last: str) -> None:

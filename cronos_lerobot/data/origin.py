@@ -1,14 +1,13 @@
 """What a dataset says about where it comes from: environment, benchmark, and how it was made.
 
-All of it is in `meta/cronos.json`. LeRobot's own tools (delete, split, merge) write new datasets without that
-file, so the environment and the benchmark are also in the feature that they judge, `next.success` of
-`meta/info.json`, which these tools keep, and which two datasets must have in common before LeRobot merges them.
+All of it is in `meta/cronos.json`. LeRobot's own tools (delete, split, merge) write datasets without that file.
+So format, environment and benchmark are also in the feature that they judge, `next.success` of `meta/info.json`.
+These tools keep it, and LeRobot merges only datasets that have it in common.
 """
 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -17,20 +16,40 @@ from typing import Any
 import draccus
 from lerobot_env_cronos import CronosVectorEnv, check_environment_id, gymnasium_id
 
-from cronos_lerobot.data.schema import SUCCESS, Features
+from cronos_lerobot.data.schema import FORMAT, STREAM_ID, SUCCESS, Features
+from cronos_lerobot.dataset_metadata import brief
 from cronos_lerobot.provenance import git_commit, package_versions
+from cronos_lerobot.whole_files import written_whole
 
 ORIGIN = "meta/cronos.json"
-DEMONSTRATIONS, STREAMS = "demonstrations", "streams"
-KINDS = (DEMONSTRATIONS, STREAMS)
+DEMONSTRATIONS, STREAMS, SEGMENTS = "demonstrations", "streams", "segments"
+"""Kinds of datasets: what the scripted expert showed; recorded streams; segments of streams that were chosen, with
+the columns of demonstrations."""
 NO_FLAGS = ("root", "discover_packages_path", "features", "features_map")
 """Fields that are left out: folders of whoever made the dataset, and what follows from the flags."""
-
 CHANGEABLE = ("protocol.", "algorithm.")
 """What the flags begin with that a resumed run may change."""
-
 MAYBE_FOLDERS = ("benchmark", "policy", "pretrained_path", "checkpoint", "adapter")
 """Fields that name a folder or something on the Hub; of a folder only that it was one. A hash says which."""
+
+README = """---
+configs:
+- config_name: default
+  data_files: data/*/*.parquet
+tags:
+- LeRobot
+- cronos
+---
+
+{what} in `{environment}`, recorded with cronos-lerobot. `meta/cronos.json` says how they were made.
+
+```python
+from lerobot.datasets import LeRobotDataset
+
+dataset = LeRobotDataset("<owner>/<name>", root="<this folder>")
+```
+"""
+"""Without its first lines `datasets.load_dataset` takes every parquet file of the folder for data."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +57,7 @@ class Origin:
     """Where a dataset comes from."""
 
     kind: str
-    """DEMONSTRATIONS or STREAMS."""
+    """DEMONSTRATIONS, STREAMS or SEGMENTS."""
     environment: str
     """Gymnasium id with the version."""
     benchmark: str
@@ -52,13 +71,16 @@ class Origin:
     commit: str | None = None
     start_policy: str | None = None
     """Of demonstrations that begin where a policy left the scene: a hash of that policy's files."""
-    gone_on: list[dict[str, Any]] = field(default_factory=list)
-    """Of streams, where their run went on with other flags of protocol or algorithm: the number of `episodes`
-    before that, of the recording before any filter, and the `flags` that hold from there on, the changed ones."""
+    resumed: list[dict[str, Any]] = field(default_factory=list)
+    """Of streams, where their run was resumed with other flags of protocol or algorithm: the number of `episodes`
+    before that, of the recording before any filter, and the changed `flags`."""
+    filters: list[dict[str, Any]] = field(default_factory=list)
+    """Calls of `cronos-streams filter` that it came through, the last one at the end; see `filter_streams`."""
+    format: int = FORMAT
 
     def values(self, flag: str, default: Any) -> list[Any]:
         """Everything that a flag has been, in its order; its default where none is said."""
-        changes = [change["flags"] for change in self.gone_on if flag in change["flags"]]
+        changes = [change["flags"] for change in self.resumed if flag in change["flags"]]
         return [self.flags.get(flag, default), *(change[flag] for change in changes)]
 
     @property
@@ -109,38 +131,39 @@ def _flatten(encoded: Mapping[str, Any], prefix: str) -> dict[str, Any]:
 
 
 def marked(features: Features, origin: Origin) -> Features:
-    """The features with the environment and the benchmark in the one that they judge."""
-    mark = {name: getattr(origin, name) for name in ("kind", "environment", "benchmark")}
+    """The features with format, environment and benchmark in the one that they judge."""
+    mark = {name: getattr(origin, name) for name in ("format", "environment", "benchmark")}
     return features | {SUCCESS: features[SUCCESS] | {"info": mark}}
 
 
 def write_origin(root: Path, origin: Origin) -> None:
-    """Write `meta/cronos.json` of a new dataset."""
-    partial = root / f"{ORIGIN}.partial"
-    with partial.open("w") as file:
+    """Write `meta/cronos.json` and README.md of a dataset."""
+    with written_whole(root / ORIGIN) as file:
         json.dump(asdict(origin), file, indent=2)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(root / ORIGIN)
+    what = {
+        DEMONSTRATIONS: "Demonstrations",
+        STREAMS: "Training streams",
+        SEGMENTS: "Segments of training streams",
+    }
+    (root / "README.md").write_text(README.format(what=what[origin.kind], environment=origin.environment))
 
 
 def with_changes(there: Origin, here: Origin, num_episodes: int) -> Origin:
-    """The origin of streams that go on after `num_episodes`, with the flags that have changed since they began.
+    """The origin of a dataset that is resumed after `num_episodes`, with the flags that have changed.
 
     Args:
         there: of the dataset.
         here: of what is to be appended.
         num_episodes: that the dataset keeps; what had changed after them has not.
     """
-    kept = [change for change in there.gone_on if change["episodes"] < num_episodes]
-    # As JSON gives them back: a tuple is a list.
-    now, before = json.loads(json.dumps([here.flags, there.flags]))
+    kept = [change for change in there.resumed if change["episodes"] < num_episodes]
+    now, before = _as_json(here.flags), _as_json(there.flags)
     for change in kept:
         before |= change["flags"]
     names = [name for name in now if name.startswith(CHANGEABLE) and now[name] != before.get(name)]
     if names and there.flags:
         kept.append({"episodes": num_episodes, "flags": {name: now[name] for name in sorted(names)}})
-    return replace(there, gone_on=kept)
+    return replace(there, resumed=kept)
 
 
 def read_origin(root: Path, features: Mapping[str, Mapping[str, Any]], what: str) -> Origin:
@@ -152,27 +175,37 @@ def read_origin(root: Path, features: Mapping[str, Mapping[str, Any]], what: str
         what: the dataset as the subject of a sentence.
 
     Raises:
-        ValueError: it does not say, or another version of the environment made it.
+        ValueError: it does not say, or another version of this package or of the environment made it.
     """
     mark = (features.get(SUCCESS) or {}).get("info") or {}
+    kind = STREAMS if STREAM_ID in features else DEMONSTRATIONS
     try:
         stored = json.loads((root / ORIGIN).read_text())
     except FileNotFoundError:
-        stored = mark
+        stored: dict[str, Any] = {"kind": kind, **mark}
     except ValueError as error:
-        raise ValueError(f"{root / ORIGIN} cannot be read: {error}") from error
+        raise ValueError(f"{root / ORIGIN} is damaged: {brief(error)}") from error
+    found = stored.get("format") if mark and isinstance(stored, dict) else None
+    if found != FORMAT:
+        raise ValueError(f"{what} has the format {brief(found)}, this version reads {FORMAT}: record it anew")
     check_environment_id(stored.get("environment"), what, "record it anew")
+    defaults = Origin("", "", "")
+    for name, value in stored.items():
+        if isinstance(default := getattr(defaults, name, None), list | dict) and not isinstance(
+            value, type(default)
+        ):
+            raise ValueError(f"{root / ORIGIN} is damaged: {name} is {brief(value)}")
     origin = Origin(**{name: stored[name] for name in Origin.__dataclass_fields__ if name in stored})
-    if origin.kind not in KINDS:
-        raise ValueError(f"{what} is of the kind {origin.kind!r}; valid kinds: {list(KINDS)}")
     for name, value in mark.items():
-        if value != getattr(origin, name):
-            raise ValueError(f"{what}: {ORIGIN} says {name} {getattr(origin, name)}, info.json says {value}")
+        if value != getattr(origin, name, None):
+            raise ValueError(f"{what}: {ORIGIN} and info.json have another {name}")
+    if (origin.kind == STREAMS) != (kind == STREAMS):
+        raise ValueError(f"{what} is of the kind {brief(origin.kind)}, but its columns are of another")
     return origin
 
 
 def check_same(there: Origin, here: Origin, what: str, ignored: tuple[str, ...] = ()) -> None:
-    """Check that a dataset may be gone on with.
+    """Check that a dataset may be resumed.
 
     Args:
         there: of the dataset.
@@ -183,33 +216,20 @@ def check_same(there: Origin, here: Origin, what: str, ignored: tuple[str, ...] 
     Raises:
         ValueError: names what differs.
     """
-    if there.kind != here.kind:
-        raise ValueError(f"{what} holds {there.kind}, not {here.kind}")
-    if there.environment != here.environment:
-        raise ValueError(f"{what} was recorded in {there.environment}, not in {here.environment}")
-    if there.benchmark != here.benchmark:
-        raise ValueError(
-            f"{what} was recorded on the benchmark {there.benchmark} ({there.source}), not on {here.benchmark}"
-            f" ({here.source}): --env.benchmark chooses"
-        )
-    if there.kind == DEMONSTRATIONS:
-        if not there.flags:
-            raise ValueError(f"{what} does not say how it was made: LeRobot's tools have edited it; record anew")
-        # As JSON gives them back: a tuple is a list.
-        now = json.loads(json.dumps(here.flags))
-        differing = [
-            f"--{name}={_text(there.flags.get(name))}, not {_text(now.get(name))}"
-            for name in sorted(there.flags.keys() | now.keys())
-            if name not in ignored and there.flags.get(name) != now.get(name)
-        ]
-        if differing:
-            raise ValueError(f"{what} was recorded with {'; '.join(differing)}: resume it with the same flags")
-        if there.start_policy != here.start_policy:
+    for name in ("kind", "environment", "benchmark", "start_policy"):
+        if (had := getattr(there, name)) != (has := getattr(here, name)):
+            raise ValueError(f"{what} cannot be resumed: its {name} is {brief(had)}, not {brief(has)}")
+    if there.kind != DEMONSTRATIONS:
+        return
+    had, has = there.flags, _as_json(here.flags)
+    for name in sorted(had.keys() | has.keys()):
+        if name not in ignored and had.get(name) != has.get(name):
             raise ValueError(
-                f"{what} was recorded after the policy {there.start_policy}, not after {here.start_policy}:"
-                " --start.policy names another one, or its files have changed"
+                f"{what} cannot be resumed: it was recorded with --{name}={brief(had.get(name))}, not"
+                f" {brief(has.get(name))}"
             )
 
 
-def _text(value: Any) -> str:
-    return json.dumps(value) if not isinstance(value, str) else value
+def _as_json(flags: Mapping[str, Any]) -> dict[str, Any]:
+    """Flags as a file gives them back: a tuple is a list."""
+    return json.loads(json.dumps(flags))

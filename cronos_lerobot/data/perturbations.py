@@ -35,12 +35,12 @@ class NoiseConfig:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if not 0 <= self.share <= 1 or not 0 <= self.rate <= 1:
-            raise ValueError(f"noise.share and noise.rate must be from 0 to 1, got {self.share}, {self.rate}")
-        if self.scale < 0:
-            raise ValueError(f"noise.scale must be at least 0, got {self.scale}")
+        if not (0 <= self.share <= 1 and 0 <= self.rate <= 1 and self.scale >= 0):
+            raise ValueError(
+                f"--noise.share and --noise.rate must be from 0 to 1, --noise.scale at least 0: {self}"
+            )
         if not 1 <= self.min_steps <= self.max_steps:
-            raise ValueError(f"need 1 <= noise.min_steps <= noise.max_steps: {self.min_steps}, {self.max_steps}")
+            raise ValueError(f"--noise.min_steps must be from 1 to --noise.max_steps: {self}")
 
 
 @dataclass
@@ -57,9 +57,9 @@ class MissConfig:
     def __post_init__(self) -> None:
         """Check the numbers."""
         if not 0 <= self.share <= 1:
-            raise ValueError(f"misses.share must be from 0 to 1, got {self.share}")
+            raise ValueError(f"--misses.share must be from 0 to 1, got {self.share}")
         if not 0 < self.min_offset_m <= self.max_offset_m:
-            raise ValueError(f"need 0 < misses.min_offset_m <= misses.max_offset_m: {self}")
+            raise ValueError(f"--misses.min_offset_m must be above 0 and at most --misses.max_offset_m: {self}")
 
 
 class ActionNoise:

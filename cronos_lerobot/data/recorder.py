@@ -1,7 +1,7 @@
 """Records training streams as a LeRobotDataset: an observer that the training loop calls once per step."""
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -11,15 +11,15 @@ from lerobot.utils.constants import ACTION, DONE, OBS_IMAGES, REWARD
 from lerobot_env_cronos import CronosVectorEnv
 
 from cronos_lerobot.agents.processing import observation_columns
-from cronos_lerobot.data.drawing import LateCamera, UndrawnFrames
 from cronos_lerobot.data.origin import STREAMS, origin_of
 from cronos_lerobot.data.schema import (
-    EXPERT,
-    INTERVENTION,
+    EVENT,
+    INTERVENED,
     LOG_PROB,
     POLICY_VERSION,
-    POSITION,
+    SEGMENT_COLUMNS,
     SEGMENT_INDEX,
+    SEGMENTS_SINCE_RESET,
     STEP,
     STREAM_ID,
     STREAM_INTERVENTIONS,
@@ -33,7 +33,7 @@ from cronos_lerobot.data.schema import (
     stream_features,
     with_cameras,
 )
-from cronos_lerobot.data.writer import SegmentWriter
+from cronos_lerobot.data.writer import LateCamera, SegmentWriter, UndrawnFrames
 from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import Step
 
@@ -77,8 +77,6 @@ class StreamRecorder:
             streams = num_envs
         if isinstance(streams, str) or not 1 <= streams <= num_envs:
             raise ValueError(f"streams must be 'all' or from 1 to num_envs={num_envs}, got {streams!r}")
-        if segment_length < 1:
-            raise ValueError(f"segment_length must be at least 1 step, got {segment_length}")
         self.writer = writer
         self.num_envs = num_envs
         self.num_streams = streams
@@ -98,6 +96,7 @@ class StreamRecorder:
         *,
         segment_length: int,
         streams: int | str = "all",
+        describes: Sequence[str] = ("log_prob", "value"),
         cameras: Mapping[str, LateCamera] | None = None,
         state: Mapping[str, Any] | None = None,
         flags: Mapping[str, Any] | None = None,
@@ -111,32 +110,29 @@ class StreamRecorder:
             root: its folder; must not exist for a new dataset and must for a resumed one.
             segment_length: the most steps between two task switches (K).
             streams: how many of the streams to record, or "all".
-            cameras: pictures to record in place of the observation's, by name; `on_step` then takes, under
+            describes: what the agent says of its actions, some of "log_prob" and "value".
+            cameras: pictures to record instead of the observation's, by name; `on_step` then takes, under
                 `pixels` and this name, the states (n, nq) to draw from.
             state: of `state_dict()`. Everything that was written after it is dropped from the dataset.
             flags: what the streams are made with, for `meta/cronos.json`.
-            writer_options: passed on to `SegmentWriter`.
-
-        Raises:
-            ValueError: the dataset to resume is of another scene, version or benchmark.
-            FolderInUseError: another process writes to `root`.
+            writer_options: passed on to `SegmentWriter`, which also says what is raised.
         """
-        writer_options |= {"origin": origin_of(env, STREAMS, flags or {})}
+        space = env.single_observation_space
         if cameras:
+            space = with_cameras(space, {name: (camera.height, camera.width) for name, camera in cameras.items()})
             # A loop that is far ahead of the drawing waits: no more than two rounds of segments are due.
             pixels = sum(camera.height * camera.width for camera in cameras.values())
             rounds = 2 * segment_length * (env.num_envs if isinstance(streams, str) else streams)
             writer_options = {"max_pending_bytes": rounds * pixels * 3} | writer_options
-        if state is None:
-            space = env.single_observation_space
-            if cameras is not None:
-                sizes = {name: (camera.height, camera.width) for name, camera in cameras.items()}
-                space = with_cameras(space, sizes)
-            features = stream_features(space, **feature_names(env))
-            fps = int(env.metadata["render_fps"])
-            writer = SegmentWriter(repo_id, root, features, fps, **writer_options)
-        else:
-            writer = SegmentWriter.resume(repo_id, root, state["writer"], **writer_options)
+        writer = SegmentWriter(
+            repo_id,
+            root,
+            stream_features(space, describes=describes, **feature_names(env)),
+            int(env.metadata["render_fps"]),
+            resume=None if state is None else state["num_episodes"],
+            origin=origin_of(env, STREAMS, flags or {}),
+            **writer_options,
+        )
         recorder = cls(
             writer, num_envs=env.num_envs, segment_length=segment_length, streams=streams, cameras=cameras
         )
@@ -152,7 +148,7 @@ class StreamRecorder:
                 segment and anything else on its first frame; `cut` says where a switch or a reset follows.
 
         Raises:
-            ValueError: an intervention inside a segment or none at its start; a segment that outgrows
+            ValueError: an event inside a segment or none at its start; a segment that outgrows
                 `segment_length` or changes its instruction.
         """
         same = partial(np.full, self.num_envs)
@@ -162,22 +158,18 @@ class StreamRecorder:
             SUCCESS: step.success,
             DONE: same(False),
             TRUNCATED: step.cut,
-            INTERVENTION: step.preceded_by,
+            EVENT: step.preceded_by,
             STREAM_INTERVENTIONS: step.interventions,
             STEP: same(step.t),
             SEGMENT_INDEX: step.piece,
-            POSITION: step.segments_since_reset,
+            SEGMENTS_SINCE_RESET: step.segments_since_reset,
             LOG_PROB: step.action.log_prob,
             VALUE: step.action.value,
             STREAM_ID: np.arange(self.num_envs),
             TOTAL_INTERVENTIONS: same(int(np.sum(step.interventions))),
             POLICY_VERSION: same(step.policy_version),
-            EXPERT: same(False) if step.action.expert is None else step.action.expert,
+            INTERVENED: step.intervened,
         }
-        columns = {key: np.asarray(column) for key, column in columns.items()}
-        for key, column in columns.items():
-            if len(column) != self.num_envs:
-                raise ValueError(f"{key} has leading dimension {len(column)}, expected {self.num_envs}")
         columns |= observation_columns(step.observation)
         for stream in range(self.num_streams):
             self._append(stream, columns, step.instructions[stream])
@@ -196,7 +188,7 @@ class StreamRecorder:
             if length
         }
         return {
-            "writer": self.writer.state_dict(),
+            "num_episodes": self.writer.num_episodes,
             "num_streams": self.num_streams,
             "partial_segments": partial,
         }
@@ -221,22 +213,18 @@ class StreamRecorder:
                 self._lengths[stream] = len(frames)
             self._tasks[stream] = segment["task"]
 
-    def _append(self, stream: int, columns: Mapping[str, np.ndarray], task: str) -> None:
+    def _append(self, stream: int, columns: Mapping[str, Any], task: str) -> None:
         length = self._lengths[stream]
-        intervention = Intervention(int(columns[INTERVENTION][stream]))
-        step = int(columns[STEP][stream])
-        if (intervention == Intervention.NONE) == (length == 0):
+        event = Intervention(int(columns[EVENT][stream]))
+        place = f"stream {stream}, step {columns[STEP][stream]}"
+        if (event == Intervention.NONE) == (length == 0):
             raise ValueError(
-                f"stream {stream}, step {step}: intervention {intervention.name} on frame {length} of its"
-                " segment; the first follows an intervention (a task switch at least), no other does"
+                f"{place}: event {event.name} on frame {length} of its segment; the first frame has one"
             )
         if length == self.segment_length:
-            raise ValueError(f"stream {stream}, step {step}: segment longer than {self.segment_length} steps")
+            raise ValueError(f"{place}: segment longer than {self.segment_length} steps")
         if length and task != self._tasks[stream]:
-            raise ValueError(
-                f"stream {stream}, step {step}: the instruction changed inside a segment, from"
-                f" {self._tasks[stream]!r} to {task!r}"
-            )
+            raise ValueError(f"{place}: the instruction changed from {self._tasks[stream]!r} to {task!r}")
         self._tasks[stream] = task
         for key, buffer in self._buffers[stream].items():
             buffer[length] = columns[key][stream]
@@ -247,21 +235,11 @@ class StreamRecorder:
         length, whole = self._lengths[stream], self._buffers[stream]
         frames: dict[str, Any] = {key: buffer[:length] for key, buffer in whole.items()}
         frames |= {key: UndrawnFrames(camera, frames[key]) for key, camera in self._cameras.items()}
-        success = frames[SUCCESS]
-        metadata = {
-            STREAM_ID: stream,
-            SEGMENT_INDEX: int(frames[SEGMENT_INDEX][0]),
-            POSITION: int(frames[POSITION][0]),
-            STEP: int(frames[STEP][0]),
-            INTERVENTION: int(frames[INTERVENTION][0]),
-            POLICY_VERSION: int(frames[POLICY_VERSION][0]),
-            SUCCESS: bool(success.any()),
-            SUCCESS_FRAME: int(success.argmax()) if success.any() else -1,
-        }
-        # A resumed recording from before there were takeovers goes on without the column.
-        metadata |= {EXPERT: bool(frames[EXPERT].any())} if EXPERT in frames else {}
         self.writer.add_segment(
-            frames, self._tasks[stream], episode_metadata=metadata, written=partial(self._written.append, whole)
+            frames,
+            self._tasks[stream],
+            episode_metadata=segment_row(frames),
+            written=partial(self._written.append, whole),
         )
         self._buffers[stream] = self._new_buffer()
         self._lengths[stream] = 0
@@ -277,3 +255,10 @@ class StreamRecorder:
                 shape, dtype = (self._cameras[key].num_positions,), np.dtype(np.float64)
             buffer[key] = np.empty((self.segment_length, *shape), dtype=dtype)
         return buffer
+
+
+def segment_row(frames: Mapping[str, Any]) -> dict[str, Any]:
+    """What the row of a segment in `meta/episodes` says: SEGMENT_COLUMNS and SUCCESS_FRAME of its frames."""
+    row: dict[str, Any] = {name: frames[name][0].item() for name in SEGMENT_COLUMNS}
+    row |= {name: bool(frames[name].any()) for name in (SUCCESS, INTERVENED)}
+    return row | {SUCCESS_FRAME: int(frames[SUCCESS].argmax()) if row[SUCCESS] else -1}

@@ -12,17 +12,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from lerobot.utils.constants import ACTION, REWARD
 
-from cronos_lerobot.data.schema import EXPERT, STREAM_COLUMNS, TRUNCATED
+from cronos_lerobot.data.schema import DECISION_COLUMNS, INTERVENED, STREAM_COLUMNS, TRUNCATED
 from cronos_lerobot.data.streams import Segment, StreamDataset
 from cronos_lerobot.protocol.interventions import Intervention
 
 if TYPE_CHECKING:
     from lerobot.rl import ReplayBuffer
-
-INFO = {name: name.removeprefix("cronos.") for name in (*STREAM_COLUMNS, "task_index")}
-"""Columns that become `complementary_info`, and what they are called there."""
-IS_INTERVENTION = "is_intervention"
-"""What LeRobot's actor calls EXPERT there (`TeleopEvents.IS_INTERVENTION`)."""
 
 
 def to_replay_buffer(
@@ -42,9 +37,9 @@ def to_replay_buffer(
         options: of `ReplayBuffer`, such as `capacity` (by default all frames) and `storage_device`.
 
     Returns:
-        The buffer, with `complementary_info` of each transition: `STREAM_COLUMNS` without `cronos.`, such as
-        `log_prob`, `policy_version`, `stream_id` and `step`, LeRobot's `task_index`, and, if it was recorded,
-        `is_intervention` of the takeovers' transitions, as LeRobot's actor marks them.
+        The buffer, with `complementary_info` of each transition: the columns of the stream without `cronos.`, such
+        as `policy_version`, `stream_id` and `step`, LeRobot's `task_index`, and `is_intervention`, as LeRobot's
+        actor calls it.
 
     Raises:
         ValueError: there is no such column, or the buffer is to take successors from its next row
@@ -64,10 +59,10 @@ def to_replay_buffer(
 
 
 def _transitions(streams: StreamDataset, state_keys: Sequence[str]) -> Iterator[dict[str, Any]]:
-    names_task = (
-        streams.origin.flags.get("env.task_observation", "none" if streams.origin.flags else None) != "none"
-    )
-    info = INFO | ({EXPERT: IS_INTERVENTION} if EXPERT in streams.meta.features else {})
+    flags = streams.origin.flags
+    names_task = not flags or flags.get("env.task_observation", "none") != "none"
+    stored = [name for name in (*STREAM_COLUMNS, *DECISION_COLUMNS, "task_index") if name in streams.meta.features]
+    info = {name: "is_intervention" if name == INTERVENED else name.removeprefix("cronos.") for name in stored}
     segments = streams.segments
     following = [*segments[1:], None]
     states = _states(streams, segments[0], state_keys)
@@ -100,7 +95,7 @@ def _goes_on(segment: Segment, after: Segment | None) -> bool:
         after is not None
         and after.stream == segment.stream
         and after.step == segment.step + segment.length
-        and after.intervention == Intervention.TASK_SWITCH
+        and after.event == Intervention.TASK_SWITCH
     )
 
 

@@ -1,10 +1,10 @@
 """The LeRobotDataset (v3) features of demonstrations and of recorded training streams.
 
-A frame is LeRobot's usual (observation, action, what followed): `observation.*` is what the policy saw,
-`action` what it chose, and `next.*` what came of that action. One LeRobot episode is one *segment* of a
-stream: contiguous in time, under one instruction, crossing no teleport of any body or of the arm. The
-`cronos.*` columns make the stream whole again. They start with neither `observation` nor `action`, so
-LeRobot never takes them for an input or an output of a policy.
+A frame is LeRobot's usual (observation, action, what followed): `observation.*` is what the policy saw, `action`
+is what was executed, `next.*` is what followed. One LeRobot episode is one *segment* of a stream: contiguous in
+time, under one instruction, without a teleport of any body or of the arm. The `cronos.*` columns put the stream
+back together. LeRobot never takes them for inputs or outputs of a policy: they start with neither `observation`
+nor `action`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,40 +20,58 @@ from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 from cronos_lerobot.agents.processing import VECTOR_KEYS
 from cronos_lerobot.data.video import check_video_size
 
+FORMAT = 2
+"""Of the columns below and of `meta/cronos.json`. Any other number is refused."""
+ROBOT_TYPE = "widowx"
+"""`robot_type` of demonstrations and streams: LeRobot merges only datasets of one robot."""
+
 SUCCESS = "next.success"
 TRUNCATED = "next.truncated"
 STREAM_ID = "cronos.stream_id"
 STEP = "cronos.step"
 SEGMENT_INDEX = "cronos.segment_index"
-POSITION = "cronos.position"
-INTERVENTION = "cronos.intervention"
+SEGMENTS_SINCE_RESET = "cronos.segments_since_reset"
+EVENT = "cronos.event"
 STREAM_INTERVENTIONS = "cronos.stream_interventions"
 TOTAL_INTERVENTIONS = "cronos.total_interventions"
 POLICY_VERSION = "cronos.policy_version"
 LOG_PROB = "cronos.log_prob"
 VALUE = "cronos.value"
-EXPERT = "intervention"
-"""Whether an expert chose the action (a takeover), as LeRobot's DAgger recordings call it. Streams recorded
-before there were takeovers lack it."""
+INTERVENED = "intervention"
+"""LeRobot's own name: a person or a script acted on this frame."""
 SUCCESS_FRAME = "cronos.success_frame"
 """Of an episode's row in `meta/episodes`: the first frame after which the task was complete, -1 if none."""
+CONFIGURATION = "cronos.configuration"
+"""Of a demonstration's row in `meta/episodes`: the training configuration it began in, -1 for a drawn layout."""
 
 Features = dict[str, dict[str, Any]]
 
-
-_STREAM_COLUMNS: dict[str, str] = {
+STREAM_COLUMNS = {
     STREAM_ID: "int64",
     STEP: "int64",
     SEGMENT_INDEX: "int64",
-    POSITION: "int64",
-    INTERVENTION: "int8",
+    SEGMENTS_SINCE_RESET: "int64",
+    EVENT: "int8",
     STREAM_INTERVENTIONS: "int64",
     TOTAL_INTERVENTIONS: "int64",
     POLICY_VERSION: "int64",
-    LOG_PROB: "float32",
-    VALUE: "float32",
+    INTERVENED: "bool",
 }
-STREAM_COLUMNS = tuple(_STREAM_COLUMNS)
+"""Columns of every recorded stream, with their dtypes."""
+DECISION_COLUMNS = (LOG_PROB, VALUE)
+"""What the agent says of its actions. A recording lacks what the agent does not know."""
+SEGMENT_COLUMNS = (
+    STREAM_ID,
+    SEGMENT_INDEX,
+    SEGMENTS_SINCE_RESET,
+    STEP,
+    EVENT,
+    POLICY_VERSION,
+    SUCCESS,
+    INTERVENED,
+)
+"""Columns that an episode's row in `meta/episodes` repeats, beside SUCCESS_FRAME: the value of its first frame;
+of SUCCESS and INTERVENED whether any frame has it."""
 
 
 def demonstration_features(
@@ -79,64 +97,53 @@ def demonstration_features(
     Raises:
         ValueError: the space is not such a Dict, or a list of names has the wrong length.
     """
-    if not isinstance(observation_space, gymnasium.spaces.Dict):
-        raise ValueError(f"the observation space must be a gymnasium Dict, got {observation_space}")
     features: Features = {}
     names = {"agent_pos": state_names, "environment_state": environment_state_names}
-    for key, space in observation_space.items():
+    for key, space in cast(gymnasium.spaces.Dict, observation_space).items():
         if key == "pixels":
-            cameras = cast(gymnasium.spaces.Dict, space)
-            for camera, box in cameras.items():
+            for camera, box in cast(gymnasium.spaces.Dict, space).items():
                 features[f"{OBS_IMAGES}.{camera}"] = _camera_feature(box.shape or (), video)
         elif key in VECTOR_KEYS:
             features[VECTOR_KEYS[key]] = _vector_feature(key, space.shape or (), names[key])
         else:
             raise ValueError(f"unknown observation {key!r}; valid: 'pixels', {sorted(VECTOR_KEYS)}")
     features[ACTION] = _vector_feature(ACTION, (len(ACTION_NAMES),), ACTION_NAMES)
-    features[REWARD] = _scalar_feature("float32")
-    features[SUCCESS] = _scalar_feature("bool")
-    features[DONE] = _scalar_feature("bool")
-    features[TRUNCATED] = _scalar_feature("bool")
-    return features
+    return features | _scalar_features({REWARD: "float32", SUCCESS: "bool", DONE: "bool", TRUNCATED: "bool"})
 
 
 def stream_features(
-    observation_space: gymnasium.Space,
-    *,
-    state_names: Sequence[str] | None = None,
-    environment_state_names: Sequence[str] | None = None,
+    observation_space: gymnasium.Space, *, describes: Sequence[str] = ("log_prob", "value"), **names: Any
 ) -> Features:
-    """Features of a recorded training stream: those of `demonstration_features`, `STREAM_COLUMNS` and EXPERT.
+    """Features of a recorded training stream: those of a demonstration and the annotations.
 
     No frame is `next.done`: a stream never ends. The last frame of a finished segment is `next.truncated`; the
     observation that followed it is not recorded.
 
     - `cronos.stream_id`: which of the parallel streams.
     - `cronos.step`: control steps of this stream before this one, from 0, without a gap.
-    - `cronos.segment_index`: pieces of this stream before this one; a task switch or a divergence ends one.
-    - `cronos.position`: task switches since the stream's last scene reset.
-    - `cronos.intervention`: an `Intervention`, what happened between the frame before and this one.
-    - `cronos.stream_interventions`, `cronos.total_interventions`: interventions that count (scene and
-      heuristic resets, takeovers at their price) so far, those right before this frame included, of this stream
-      and of all together.
+    - `cronos.segment_index`: segments of this stream before this one; a task switch or a divergence ends one.
+    - `cronos.segments_since_reset`: task switches since the stream's last scene reset.
+    - `cronos.event`: an `Intervention`, what happened between the frame before and this one.
+    - `cronos.stream_interventions`, `cronos.total_interventions`: interventions so far that count, those right
+      before this frame included, of this stream and of all together.
     - `cronos.policy_version`: policy updates before this action.
-    - `cronos.log_prob`: log-probability of the action under the policy that chose it, summed over the
-      action's dimensions [nats]; 0 where an expert did.
+    - `cronos.log_prob`: log-probability of the action under the policy that chose it, summed over the action's
+      dimensions [nats].
     - `cronos.value`: that policy's value of the observation.
-    - `intervention`: an expert chose the action.
+    - `intervention`: a person or a script acted on this frame.
+
+    Args:
+        observation_space: as for `demonstration_features`.
+        describes: what the agent says of its actions, some of "log_prob" and "value".
+        names: as for `demonstration_features`.
     """
-    columns = {key: _scalar_feature(dtype) for key, dtype in _STREAM_COLUMNS.items()}
-    observation_and_action = demonstration_features(
-        observation_space, state_names=state_names, environment_state_names=environment_state_names
-    )
-    return observation_and_action | columns | {EXPERT: _scalar_feature("bool")}
+    own = STREAM_COLUMNS | {f"cronos.{name}": "float32" for name in describes}
+    return demonstration_features(observation_space, **names) | _scalar_features(own)
 
 
 def with_cameras(space: gymnasium.Space, cameras: Mapping[str, tuple[int, int]]) -> gymnasium.spaces.Dict:
-    """An observation space with other pictures: uint8 (height, width, 3) by camera, in place of its own."""
-    if not isinstance(space, gymnasium.spaces.Dict):
-        raise ValueError(f"the observation space must be a gymnasium Dict, got {space}")
-    spaces = {key: part for key, part in space.items() if key != "pixels"}
+    """An observation space with other pictures: uint8 (height, width, 3) by camera, instead of its own."""
+    spaces = {key: part for key, part in cast(gymnasium.spaces.Dict, space).items() if key != "pixels"}
     boxes: dict[str, gymnasium.Space] = {
         name: gymnasium.spaces.Box(0, 255, (*size, 3), np.uint8) for name, size in cameras.items()
     }
@@ -156,7 +163,7 @@ def feature_names(env: CronosVectorEnv) -> dict[str, Sequence[str]]:
 
 def frame_format(feature: Mapping[str, Any]) -> tuple[tuple[int, ...], np.dtype]:
     """Shape and dtype of one frame of a feature as the writer takes it: pixels are uint8 (H, W, 3)."""
-    shape = () if feature["shape"] == (1,) else tuple(feature["shape"])
+    shape = () if tuple(feature["shape"]) == (1,) else tuple(feature["shape"])
     return shape, np.dtype(np.uint8 if feature["dtype"] in ("image", "video") else feature["dtype"])
 
 
@@ -165,21 +172,16 @@ def _camera_feature(shape: tuple[int, ...], video: bool) -> dict[str, Any]:
         raise ValueError(f"pixels must have the shape (H, W, 3), got {shape}")
     if video:
         check_video_size("the pixels", shape[:2])
-    return {
-        "dtype": "video" if video else "image",
-        "shape": tuple(shape),
-        "names": ["height", "width", "channels"],
-    }
+    names = ["height", "width", "channels"]
+    return {"dtype": "video" if video else "image", "shape": tuple(shape), "names": names}
 
 
 def _vector_feature(key: str, shape: tuple[int, ...], names: Sequence[str] | None) -> dict[str, Any]:
-    if len(shape) != 1:
-        raise ValueError(f"{key} must be a vector, got the shape {shape}")
     names = [f"{key}_{i}" for i in range(shape[0])] if names is None else list(names)
-    if len(names) != shape[0]:
-        raise ValueError(f"{key} has {shape[0]} dimensions but {len(names)} names: {names}")
+    if len(shape) != 1 or len(names) != shape[0]:
+        raise ValueError(f"{key} has the shape {shape} but {len(names)} names: {names}")
     return {"dtype": "float32", "shape": tuple(shape), "names": names}
 
 
-def _scalar_feature(dtype: str) -> dict[str, Any]:
-    return {"dtype": dtype, "shape": (1,), "names": None}
+def _scalar_features(dtypes: Mapping[str, str]) -> Features:
+    return {key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in dtypes.items()}

@@ -1,16 +1,19 @@
 """The files of a LeRobotDataset (v3), a *shard* at a time: one data, one episodes and one mp4 file each.
 
-Pixels of the dtype `image` have no file of their own: they are PNG inside the data file, as LeRobot does it.
+Pixels of the dtype `image` have no file of their own: they are PNG inside the data file, as in LeRobot.
 
-A shard is written under `<root>/.incomplete`, in the tree it will have, and moved into place when it is
-whole, `info.json` last. A process killed at any moment leaves a dataset that loads: LeRobot takes the number
-of episodes from `info.json` and looks up everything else from there.
+A shard is written under `<root>/.incomplete`, in the tree it will have, and moved into place when it is whole,
+`info.json` last. A process killed at any moment leaves a dataset that loads: LeRobot takes the number of episodes
+from `info.json` and looks up everything else from there.
 """
 
 import contextlib
+import io
 import os
+import re
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,17 +22,9 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.datasets.compute_stats import aggregate_stats
 from lerobot.datasets.feature_utils import get_hf_features_from_features
-from lerobot.datasets.io_utils import (
-    load_episodes,
-    write_info,
-    write_stats,
-    write_table_one_row_group_per_episode,
-    write_tasks,
-)
+from lerobot.datasets.io_utils import load_episodes, write_info, write_stats, write_tasks
 from lerobot.datasets.utils import (
     DEFAULT_DATA_PATH,
     DEFAULT_EPISODES_PATH,
@@ -40,11 +35,15 @@ from lerobot.datasets.utils import (
 )
 from lerobot.datasets.video_utils import get_video_info
 from lerobot.utils.utils import flatten_dict, unflatten_dict
+from PIL import Image
 
-from cronos_lerobot.data.png import encode_png
-from cronos_lerobot.data.stats import Stats, episode_stats, vector_stats
+from cronos_lerobot.data.stats import DatasetStats, Stats, episode_stats, vector_stats
+from cronos_lerobot.data.video import MAX_FILE_DURATION_S, fast_encoder
+from cronos_lerobot.dataset_metadata import DatasetFileError
 
 INCOMPLETE = ".incomplete"
+PLACE = re.compile(r"chunk-\d{3,}/file-\d{3,}\.(parquet|mp4)")
+"""How the files of data, videos and episodes are called; others are never deleted."""
 
 
 class VideoSink(Protocol):
@@ -60,31 +59,40 @@ class VideoSink(Protocol):
 
 
 class Shard:
-    """One data file, one episodes file and one mp4 per video key, being written under `.incomplete`."""
+    """One data file, one episodes file and one mp4 per video key, being written under `.incomplete`.
+
+    Args:
+        meta: of the dataset.
+        index: number of the shard: 0, 1, ...
+        stats: of the dataset; takes in what is written.
+        open_video: takes a video key and a path.
+    """
 
     def __init__(
-        self, meta: LeRobotDatasetMetadata, index: int, open_video: Callable[[str, Path], VideoSink]
+        self,
+        meta: LeRobotDatasetMetadata,
+        index: int,
+        stats: DatasetStats,
+        open_video: Callable[[str, Path], VideoSink],
     ) -> None:
-        """Start shard `index` (0, 1, ...) of the dataset `meta`; `open_video` takes a video key and a path."""
         chunk, file = divmod(index, meta.info.chunks_size)
         self._place = {"chunk_index": chunk, "file_index": file}
         self._meta = meta
-        self._staging = meta.root / INCOMPLETE
+        self._stats = stats
         self.num_frames = 0
         self.num_bytes = 0
         self.rows: list[dict[str, Any]] = []
-        self.stats: list[Stats] = []
         self._schema = get_hf_features_from_features(meta.features).arrow_schema
-        self._data = pq.ParquetWriter(self._stage(self._data_path), self._schema, compression="snappy")
-        self.videos = {key: open_video(key, self._stage(self._video_path(key))) for key in meta.video_keys}
+        self._data_path = DEFAULT_DATA_PATH.format(**self._place)
+        self._episodes_path = DEFAULT_EPISODES_PATH.format(**self._place)
+        self._data = pq.ParquetWriter(stage(meta.root, self._data_path), self._schema, compression="snappy")
+        self.videos = {key: open_video(key, stage(meta.root, self._video_path(key))) for key in meta.video_keys}
 
-    @property
-    def _data_path(self) -> str:
-        return DEFAULT_DATA_PATH.format(**self._place)
-
-    @property
-    def _episodes_path(self) -> str:
-        return DEFAULT_EPISODES_PATH.format(**self._place)
+    def is_full_for(self, length: int) -> bool:
+        """Whether an episode of so many frames belongs into the next shard."""
+        info = self._meta.info
+        most = int(MAX_FILE_DURATION_S * info.fps)
+        return self.num_frames + length > most or self.num_bytes >= info.data_files_size_in_mb * 2**20
 
     def append(
         self, frames: Mapping[str, np.ndarray], task: str, task_index: int, metadata: Mapping[str, Any]
@@ -104,7 +112,7 @@ class Shard:
         metadata: Mapping[str, Any],
         stats: Stats,
     ) -> None:
-        """Write one episode of another dataset with the same features.
+        """Write one episode of another dataset that has all features of this one.
 
         Args:
             rows: its rows of the data file, from its first frame on; its indices are replaced.
@@ -117,35 +125,32 @@ class Shard:
         columns = self._bookkeeping(rows.num_rows, task_index)
         for name, values in columns.items():
             place = rows.schema.get_field_index(name)
-            rows = rows.set_column(
-                place, rows.schema.field(place), pa.array(values, rows.schema.field(place).type)
-            )
+            field = rows.schema.field(place)
+            rows = rows.set_column(place, field, pa.array(values, field.type))
         # The source's schema metadata would describe the source.
         rows = rows.select(self._schema.names).cast(self._schema).replace_schema_metadata(self._schema.metadata)
         stats = stats | {name: vector_stats(values) for name, values in columns.items()}
         self._append(rows, videos, task, metadata, stats)
 
-    def publish(self, tasks: Mapping[str, int], encoder: RGBEncoderConfig | None) -> None:
+    def publish(self, tasks: Mapping[str, int]) -> None:
         """Move the shard into the dataset and count it in `info.json`, which makes it part of the dataset.
 
         Everything is on disk before the first file moves, so that they all move within a millisecond.
 
         Args:
             tasks: `task_index` by instruction, of the whole dataset.
-            encoder: of the videos, for `info.json`; None where it describes them already.
         """
         meta, info = self._meta, self._meta.info
         for key, video in self.videos.items():
             video.close()
-            if info.total_episodes == 0 and encoder is not None:
-                # As LeRobot's `update_video_info` does with a file that is in place.
-                described = get_video_info(self._stage(self._video_path(key)), encoder)
-                info.features[key]["info"] = (info.features[key].get("info") or {}) | described
-        write_tasks(tasks_frame(tasks), self._staging)
+            if not info.features[key].get("info"):
+                described = get_video_info(stage(meta.root, self._video_path(key)), fast_encoder())
+                info.features[key]["info"] = described
+        write_tasks(tasks_frame(tasks), meta.root / INCOMPLETE)
         self._data.close()
         table = pa.Table.from_pylist(self.rows, schema=_episodes_schema(meta.root))
-        pq.write_table(table, self._stage(self._episodes_path))
-        meta.stats = aggregate_stats([*([meta.stats] if meta.stats else []), *self.stats])
+        pq.write_table(table, stage(meta.root, self._episodes_path))
+        meta.stats = self._stats.stats()
         info.total_episodes += len(self.rows)
         info.total_frames += self.num_frames
         videos = [self._video_path(key) for key in self.videos]
@@ -193,14 +198,12 @@ class Shard:
         row |= {key: value.tolist() for key, value in flatten_dict({"stats": stats}).items()}
         row |= {f"meta/episodes/{key}": value for key, value in self._place.items()}
         self.rows.append(row)
-        self.stats.append(stats)
+        self._stats.add_rows(table)
+        self._stats.add_images([stats])
         self.num_frames += table.num_rows
 
     def _video_path(self, key: str) -> str:
         return DEFAULT_VIDEO_PATH.format(video_key=key, **self._place)
-
-    def _stage(self, relative: str) -> Path:
-        return stage(self._meta.root, relative)
 
 
 def stage(root: Path, relative: str) -> Path:
@@ -240,7 +243,7 @@ def tasks_frame(tasks: Mapping[str, int]) -> pd.DataFrame:
     return pd.DataFrame({"task_index": list(tasks.values())}, index=pd.Index(list(tasks), name="task"))
 
 
-def truncate(meta: LeRobotDatasetMetadata, num_episodes: int) -> None:
+def truncate(meta: LeRobotDatasetMetadata, num_episodes: int) -> DatasetStats:
     """Drop all episodes from `num_episodes` on, and every file that belongs to no episode.
 
     Killed half-way, the dataset still loads, and doing it again completes it.
@@ -249,70 +252,118 @@ def truncate(meta: LeRobotDatasetMetadata, num_episodes: int) -> None:
         meta: of the dataset on disk; its `info`, `stats` and `episodes` are brought up to date.
         num_episodes: how many of the first episodes to keep.
 
+    Returns:
+        The statistics of what is left.
+
     Raises:
         ValueError: the dataset has fewer episodes.
+        DatasetFileError: something in its folder is a link, which may lead out of it.
     """
     root, info = meta.root, meta.info
     if num_episodes > info.total_episodes:
         raise ValueError(f"cannot keep {num_episodes} episodes of {root}: it has only {info.total_episodes}")
-    files = {path: pq.read_table(path) for path in sorted(root.glob("meta/episodes/*/*.parquet"))}
-    kept = {path: table.filter(pc.field("episode_index") < num_episodes) for path, table in files.items()}
-    rows = [row for table in kept.values() for row in table.to_pylist()]
-    info.total_episodes = len(rows)
-    info.total_frames = sum(row["length"] for row in rows)
-    meta.stats = aggregate_stats([stats_of_row(row) for row in rows]) if rows else None
+    if link := next((path for path in root.rglob("*") if path.is_symlink()), None):
+        raise DatasetFileError(f"{link} is a symbolic link: a dataset that is resumed has none")
+    files = {path: pq.read_table(path) for path in _files(root / "meta/episodes")}
+    kept = {path: _first(table, num_episodes) for path, table in files.items()}
+    rows = pa.concat_tables(kept.values()) if kept else pa.table({"length": []})
+    info.total_episodes, info.total_frames = rows.num_rows, pc.sum(rows["length"]).as_py() or 0
+    named = {folder: _places(rows, folder) for folder in ("data", *(f"videos/{key}" for key in meta.video_keys))}
+    stats = _stats_of(meta, rows, [path for path in _files(root / "data") if _place(path) in named["data"]])
+    meta.stats = stats.stats()
     move_into_place(root, stage_summary(meta, {} if meta.tasks is None else dict(meta.tasks["task_index"])))
-    if not rows:
+    if not rows.num_rows:
         (root / STATS_PATH).unlink(missing_ok=True)
-
     for path, table in kept.items():
         if table.num_rows < files[path].num_rows:
-            _replace_or_delete(root, path, table, pq.write_table)
-    data_files = {DEFAULT_DATA_PATH.format(**_place(row, "data")) for row in rows}
-    for path in root.glob("data/*/*.parquet"):
-        if str(path.relative_to(root)) not in data_files:
-            path.unlink()
-        elif pq.read_table(path, columns=["episode_index"])["episode_index"][-1].as_py() >= num_episodes:
-            table = pq.read_table(path, filters=[("episode_index", "<", num_episodes)])
-            _replace_or_delete(root, path, table, write_table_one_row_group_per_episode)
-    for key in meta.video_keys:
-        videos = {DEFAULT_VIDEO_PATH.format(video_key=key, **_place(row, f"videos/{key}")) for row in rows}
-        for path in (root / "videos" / key).glob("*/*.mp4"):
-            if str(path.relative_to(root)) not in videos:
+            _replace_or_delete(root, path, [table])
+    for folder, places in named.items():
+        for path in _files(root / folder):
+            if _place(path) not in places:
                 path.unlink()
+            elif folder == "data" and _last_episode(path) >= num_episodes:
+                _replace_or_delete(root, path, (_first(group, num_episodes) for group in _row_groups(path)))
     shutil.rmtree(root / INCOMPLETE, ignore_errors=True)
-    meta.episodes = load_episodes(root) if rows else None
+    meta.episodes = load_episodes(root) if rows.num_rows else None
+    return stats
 
 
 def next_shard_index(meta: LeRobotDatasetMetadata) -> int:
     """The first shard number that no file of the dataset uses."""
-    paths: Iterable[Path] = meta.root.glob("data/*/*.parquet")
-    numbers = [(int(path.parent.name.split("-")[1]), int(path.stem.split("-")[1])) for path in paths]
+    numbers = [
+        (int(path.parent.name.split("-")[1]), int(path.stem.split("-")[1])) for path in _files(meta.root / "data")
+    ]
     return max((chunk * meta.info.chunks_size + file + 1 for chunk, file in numbers), default=0)
-
-
-def _replace_or_delete(root: Path, path: Path, table: pa.Table, write: Callable[[pa.Table, Path], None]) -> None:
-    if table.num_rows == 0:
-        path.unlink()
-        return
-    relative = str(path.relative_to(root))
-    write(table, stage(root, relative))
-    move_into_place(root, [relative])
-
-
-def _place(row: Mapping[str, Any], prefix: str) -> dict[str, int]:
-    return {name: row[f"{prefix}/{name}"] for name in ("chunk_index", "file_index")}
 
 
 def stats_of_row(row: Mapping[str, Any]) -> Stats:
     """The statistics in a row of `meta/episodes`."""
     flat = {key: np.array(value) for key, value in row.items() if key.startswith("stats/")}
-    return unflatten_dict(flat)["stats"]
+    return unflatten_dict(flat)["stats"] if flat else {}
+
+
+def _files(folder: Path) -> list[Path]:
+    """Files of a folder of data, videos or episodes that are named as LeRobot names them, in their order."""
+    return sorted(path for path in folder.glob("*/*") if PLACE.fullmatch(f"{path.parent.name}/{path.name}"))
+
+
+def _place(path: Path) -> str:
+    return f"{path.parent.name}/{path.stem}"
+
+
+def _places(rows: pa.Table, folder: str) -> set[str]:
+    """Files of a folder that rows of `meta/episodes` name, without the ending."""
+    if not rows.num_rows:
+        return set()
+    chunks, files = (rows[f"{folder}/{name}"].to_pylist() for name in ("chunk_index", "file_index"))
+    return {f"chunk-{chunk:03d}/file-{file:03d}" for chunk, file in set(zip(chunks, files, strict=True))}
+
+
+def _first(table: pa.Table, num_episodes: int) -> pa.Table:
+    return table.filter(pc.field("episode_index") < num_episodes)
+
+
+def _last_episode(path: Path) -> int:
+    return pc.max(pq.read_table(path, columns=["episode_index"])["episode_index"]).as_py()
+
+
+def _row_groups(path: Path) -> Iterator[pa.Table]:
+    with pq.ParquetFile(path) as file:
+        for number in range(file.num_row_groups):
+            yield file.read_row_group(number)
+
+
+def _stats_of(meta: LeRobotDatasetMetadata, rows: pa.Table, data: Sequence[Path]) -> DatasetStats:
+    """Statistics of the episodes `rows`, whose frames are in the files `data`."""
+    stats = DatasetStats(meta.features)
+    numbers = [key for key, feature in meta.features.items() if feature["dtype"] not in ("image", "video")]
+    for path in data:
+        with pq.ParquetFile(path) as file:
+            for batch in file.iter_batches(columns=numbers):
+                stats.add_rows(_first(pa.Table.from_batches([batch]), meta.info.total_episodes))
+    images = tuple(f"stats/{key}/" for key in meta.features if key not in numbers)
+    of_images = rows.select([name for name in rows.column_names if images and name.startswith(images)])
+    stats.add_images(stats_of_row(row) for row in of_images.to_pylist())
+    return stats
+
+
+def _replace_or_delete(root: Path, path: Path, tables: Iterable[pa.Table]) -> None:
+    """Put row groups in the place of a file, or nothing if they have no row."""
+    relative, writer = str(path.relative_to(root)), None
+    for table in tables:
+        if table.num_rows:
+            writer = writer or pq.ParquetWriter(stage(root, relative), table.schema, compression="snappy")
+            writer.write_table(table)
+    if writer is None:
+        path.unlink()
+        return
+    writer.close()
+    move_into_place(root, [relative])
 
 
 def _episodes_schema(root: Path) -> pa.Schema | None:
     """The schema of the episodes written so far: LeRobot reads all such files as one table."""
-    path = next(iter(sorted(root.glob("meta/episodes/*/*.parquet"))), None)
+    path = next(iter(_files(root / "meta/episodes")), None)
     return None if path is None else pq.read_schema(path)
 
 
@@ -324,7 +375,18 @@ def _to_table(columns: Mapping[str, np.ndarray], schema: pa.Schema) -> pa.Table:
             flat = pa.array(np.ascontiguousarray(values).reshape(-1), type=field.type.value_type)
             arrays.append(pa.FixedSizeListArray.from_arrays(flat, type=field.type))
         elif pa.types.is_struct(field.type):  # the storage of datasets.Image
-            arrays.append(pa.array([{"bytes": encode_png(image)} for image in values], type=field.type))
+            arrays.append(pa.array([{"bytes": _encode_png(image)} for image in values], type=field.type))
         else:
             arrays.append(pa.array(values, type=field.type))
     return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def _encode_png(pixels: np.ndarray) -> bytes:
+    """A uint8 (H, W, 3) RGB image as the bytes of a PNG file.
+
+    Matching runs only (`Z_RLE`) is the fastest setting of zlib on rendered frames, and after PNG's row filters
+    its files are no larger than those of the default search.
+    """
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG", compress_level=1, compress_type=zlib.Z_RLE)
+    return buffer.getvalue()

@@ -13,7 +13,7 @@ see what the last action brought.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from cronos_lerobot.agents.ppo.gae import compute_gae
 from cronos_lerobot.data.origin import Origin
 from cronos_lerobot.data.schema import STEP, STREAM_ID, SUCCESS, VALUE
 from cronos_lerobot.data.streams import StreamDataset
+from cronos_lerobot.whole_files import written_whole
 
 PROGRESS, ADVANTAGE = "progress", "advantage"
 WEIGHT_BY = (PROGRESS, ADVANTAGE)
@@ -53,31 +54,36 @@ class Weighting:
     weight_by: str = PROGRESS
     """`progress`: how near the segment came to grasp and success; `advantage`: GAE of its rewards and values."""
     gamma: float | None = None
-    """Discount per control step, in (0, 1]; null is 0.98 for progress, and the run's for advantage."""
+    """Discount per control step, from 0 to 1; null is 0.98 for progress, and the run's for advantage."""
     gae_lambda: float | None = None
-    """Weight of the longer returns in an advantage, in [0, 1]; null is the run's."""
+    """Weight of the longer returns in an advantage, from 0 to 1; null is the run's."""
 
     def __post_init__(self) -> None:
         if self.weight_by not in WEIGHT_BY:
-            raise ValueError(f"weight_by must be one of {list(WEIGHT_BY)}, got {self.weight_by!r}")
-        if self.gamma is not None and not 0 < self.gamma <= 1:
-            raise ValueError(f"gamma must be in (0, 1] or null, got {self.gamma}")
-        if self.gae_lambda is not None and not 0 <= self.gae_lambda <= 1:
-            raise ValueError(f"gae_lambda must be in [0, 1] or null, got {self.gae_lambda}")
-        if self.gae_lambda is not None and self.weight_by != ADVANTAGE:
-            raise ValueError(f"gae_lambda={self.gae_lambda} needs weight_by={ADVANTAGE}, got {self.weight_by!r}")
+            raise ValueError(f"--weight_by must be one of {list(WEIGHT_BY)}, got {self.weight_by!r}")
+        for name, value in (("gamma", self.gamma), ("gae_lambda", self.gae_lambda)):
+            if value is not None and not 0 <= value <= 1:
+                raise ValueError(f"--{name} must be from 0 to 1, got {value}")
 
-    def discounts(self, flags: Mapping[str, Any]) -> tuple[float, float]:
-        """gamma and gae_lambda with numbers in place of null.
+    def discounts(self, origin: Origin) -> tuple[float, float]:
+        """gamma and gae_lambda with numbers instead of null.
 
         Args:
-            flags: of the run that recorded, as `StreamDataset.origin` has them.
+            origin: of the recording.
+
+        Raises:
+            ValueError: a value that is not given changed while the run was recorded.
         """
         if self.weight_by == PROGRESS:
             return PROGRESS_GAMMA if self.gamma is None else self.gamma, 0.0
-        run = (flags.get("algorithm.gamma", ADVANTAGE_GAMMA), flags.get("algorithm.gae_lambda", ADVANTAGE_LAMBDA))
-        gamma, gae_lambda = self.gamma, self.gae_lambda
-        return float(run[0]) if gamma is None else gamma, float(run[1]) if gae_lambda is None else gae_lambda
+        defaults = {"gamma": ADVANTAGE_GAMMA, "gae_lambda": ADVANTAGE_LAMBDA}
+        found = []
+        for name, default in defaults.items():
+            values, given = origin.values(f"algorithm.{name}", default), getattr(self, name)
+            if given is None and len(values) > 1:
+                raise ValueError(f"the recorded run was resumed with another {name}, {values}: give --{name}")
+            found.append(float(values[0]) if given is None else given)
+        return found[0], found[1]
 
 
 def write_progress(streams: StreamDataset, output: Path, weighting: Weighting) -> dict[str, Any]:
@@ -93,20 +99,20 @@ def write_progress(streams: StreamDataset, output: Path, weighting: Weighting) -
         `gae_lambda`.
 
     Raises:
-        ValueError: rewards that do not go with the successes, no value for every frame, or `output` is a folder.
+        ValueError: rewards that do not fit the successes, or no value for every frame.
     """
-    if output.is_dir():
-        raise ValueError(f"{output} is a folder; name a file in it, {output / 'progress.parquet'} say")
-    flags = streams.origin.flags
-    if weighting.weight_by == ADVANTAGE:
-        _check_discounts(streams.origin, weighting)
-    gamma, gae_lambda = weighting.discounts(flags)
+    gamma, gae_lambda = weighting.discounts(streams.origin)
     made_with: dict[str, Any] = {"dataset": streams.repo_id, "weight_by": weighting.weight_by, "gamma": gamma}
-    frames = streams.annotations([*INDICES, STREAM_ID, STEP, REWARD, SUCCESS, VALUE])
-    frames = frames.sort_values("index", kind="stable")
-    if weighting.weight_by == PROGRESS:
+    is_progress = weighting.weight_by == PROGRESS
+    if not is_progress and VALUE not in streams.meta.features:
+        raise ValueError(
+            f"{streams.repo_id} has no {VALUE}: its agent has no critic; --weight_by={PROGRESS} needs none"
+        )
+    names = [*INDICES, STREAM_ID, STEP, REWARD, SUCCESS, *(() if is_progress else (VALUE,))]
+    frames = streams.annotations(names).sort_values("index", kind="stable")
+    if is_progress:
         # What is not said is the default of `cronos-train`: LeRobot's tools drop it.
-        rows = _progress_rows(frames, flags.get("protocol.reward", "difference"), gamma)
+        rows = _progress_rows(frames, streams.origin.flags.get("protocol.reward", "difference"), gamma)
     else:
         made_with["gae_lambda"] = gae_lambda
         _check_values(frames)
@@ -114,65 +120,54 @@ def write_progress(streams: StreamDataset, output: Path, weighting: Weighting) -
     columns = {name: frames[name].to_numpy(np.int64) for name in INDICES}
     columns[COLUMN] = np.concatenate(rows).astype(np.float32)
     table = pa.table(columns).replace_schema_metadata({MADE_WITH: json.dumps(made_with).encode()})
-    output.parent.mkdir(parents=True, exist_ok=True)
-    partial = output.with_name(f".{output.name}.partial")
-    pq.write_table(table, partial)
-    partial.replace(output)
+    with written_whole(output, "wb") as file:
+        pq.write_table(table, file)
     return made_with
 
 
 def _progress_rows(frames: pd.DataFrame, reward: str, gamma: float) -> list[np.ndarray]:
     rows = []
-    for _, segment in frames.groupby("episode_index", sort=False):
-        levels = reward_levels(segment[REWARD].to_numpy(np.float64), segment[SUCCESS].to_numpy(np.bool_), reward)
+    for segment in _segments(frames, [REWARD, SUCCESS, STREAM_ID, STEP]):
+        levels = reward_levels(segment[REWARD].astype(np.float64), segment[SUCCESS].astype(np.bool_), reward)
         if levels is None:
-            stream, step = (int(segment[name].iloc[0]) for name in (STREAM_ID, STEP))
             raise ValueError(
-                f"stream {stream}, step {step}: the rewards of this segment do not go with {SUCCESS} as"
-                f" --protocol.reward={reward} has it ({GRASP_REWARD} grasped, {SUCCESS_REWARD} complete);"
+                f"stream {segment[STREAM_ID][0]}, step {segment[STEP][0]}: the rewards are not those of"
+                f" --protocol.reward={reward} ({GRASP_REWARD} grasped, {SUCCESS_REWARD} complete);"
                 f" --weight_by={ADVANTAGE} takes any reward"
             )
         rows.append(progress(levels, gamma))
     return rows
 
 
-def _check_discounts(origin: Origin, weighting: Weighting) -> None:
-    for name, given in (("gamma", weighting.gamma), ("gae_lambda", weighting.gae_lambda)):
-        values = origin.values(f"algorithm.{name}", None)
-        if given is None and len(values) > 1:
-            raise ValueError(
-                f"the recorded run was gone on with another --algorithm.{name}, {values}: say which with --{name}"
-            )
+def _segments(frames: pd.DataFrame, names: Sequence[str]) -> Iterator[dict[str, np.ndarray]]:
+    """Columns of one episode after the other."""
+    begins = np.flatnonzero(np.diff(frames["episode_index"].to_numpy())) + 1
+    columns = {name: np.split(frames[name].to_numpy(), begins) for name in names}
+    for parts in zip(*columns.values(), strict=True):
+        yield dict(zip(columns, parts, strict=True))
 
 
 def _check_values(frames: pd.DataFrame) -> None:
     values, episodes = frames[VALUE].to_numpy(), frames["episode_index"].to_numpy()
     instead = f"; --weight_by={PROGRESS} needs none"
     if bad := int((~np.isfinite(values)).sum()):
-        raise ValueError(
-            f"{VALUE} is not finite in {bad} of {len(values)} frames: who chose these actions had no critic"
-            f"{instead}"
-        )
-    if not values.any():
-        raise ValueError(f"{VALUE} is 0 in every frame: who chose these actions had no critic{instead}")
+        raise ValueError(f"{VALUE} is not finite in {bad} of {len(values)} frames{instead}")
     # The value of a decision is recorded with each of its actions: two a decision repeat half of them. The flags
-    # need not tell, as those of a policy of one's own, and are lost with LeRobot's tools.
+    # need not tell, as those of your own policy, and are lost with LeRobot's tools.
     # Before the first update a critic may say 0 of everything.
     within = (episodes[1:] == episodes[:-1]) & (values[1:] != 0)
     repeated = int((within & (values[1:] == values[:-1])).sum())
     if repeated > within.sum() / 3:
         raise ValueError(
-            f"{VALUE} is the same as in the frame before in {repeated} of {within.sum()} frames: the policy that "
-            f"was recorded played several actions a decision, and advantages want values of every frame{instead}"
+            f"{VALUE} is that of the frame before in {repeated} of {within.sum()} frames: the policy played "
+            f"several actions a decision, and advantages need a value of every frame{instead}"
         )
 
 
 def _advantage_rows(frames: pd.DataFrame, gamma: float, gae_lambda: float) -> list[np.ndarray]:
     return [
-        summed_advantages(
-            segment[REWARD].to_numpy(np.float64), segment[VALUE].to_numpy(np.float64), gamma, gae_lambda
-        )
-        for _, segment in frames.groupby("episode_index", sort=False)
+        summed_advantages(segment[REWARD].astype(np.float64), segment[VALUE].astype(np.float64), gamma, gae_lambda)
+        for segment in _segments(frames, [REWARD, VALUE])
     ]
 
 

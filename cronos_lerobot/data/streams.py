@@ -29,14 +29,14 @@ from huggingface_hub import HfFileSystem
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
 
-from cronos_lerobot.data.file_check import read_rows
 from cronos_lerobot.data.origin import read_origin
 from cronos_lerobot.data.schema import (
-    EXPERT,
-    INTERVENTION,
+    EVENT,
+    INTERVENED,
     POLICY_VERSION,
-    POSITION,
+    SEGMENT_COLUMNS,
     SEGMENT_INDEX,
+    SEGMENTS_SINCE_RESET,
     STEP,
     STREAM_COLUMNS,
     STREAM_ID,
@@ -44,12 +44,18 @@ from cronos_lerobot.data.schema import (
     SUCCESS_FRAME,
     TRUNCATED,
 )
+from cronos_lerobot.data.stats import to_array
 from cronos_lerobot.data.stream_check import COLUMNS, check
 from cronos_lerobot.data.video import Clip, read_frames
-from cronos_lerobot.dataset_metadata import check_files_are_there, missing_files, open_metadata
+from cronos_lerobot.dataset_metadata import (
+    brief,
+    check_files_are_there,
+    check_parquet,
+    missing_files,
+    named_files,
+    open_metadata,
+)
 from cronos_lerobot.protocol.interventions import Intervention
-
-_SUMMARY = (STREAM_ID, SEGMENT_INDEX, POSITION, STEP, INTERVENTION, POLICY_VERSION, SUCCESS, SUCCESS_FRAME)
 
 
 @dataclass(frozen=True)
@@ -58,14 +64,14 @@ class Segment:
 
     stream: int
     index: int
-    """Pieces of this stream before it."""
+    """Segments of this stream before it."""
     step: int
     """Control steps of this stream before it."""
     length: int
     """Frames [control steps]."""
     task: str
     """The instruction."""
-    intervention: Intervention
+    event: Intervention
     """What happened between the segment before and this one."""
     position: int
     """Task switches since the last scene reset: 0 for the first segment after it."""
@@ -73,12 +79,12 @@ class Segment:
     """The first frame after which the task was complete; None if it never was."""
     policy_version: int
     """Policy updates before its first action."""
+    helped: bool
+    """Whether a person or a script acted on any of its frames."""
     episode: int
     """LeRobot's episode index."""
     start: int
     """LeRobot's index of its first frame."""
-    taken_over: bool = False
-    """Whether an expert did it, not the policy."""
 
     @property
     def success(self) -> bool:
@@ -104,9 +110,9 @@ class Switch:
     after: Segment
 
     @property
-    def intervention(self) -> Intervention:
+    def event(self) -> Intervention:
         """What happened there; a new instruction at least."""
-        return self.after.intervention
+        return self.after.event
 
 
 class StreamDataset:
@@ -134,29 +140,23 @@ class StreamDataset:
         streaming: bool = False,
     ) -> None:
         self.repo_id = repo_id
-        if revision is not None and root is not None:
-            raise ValueError(f"revision={revision} is of the Hub, and root={root} a folder: give one of them")
         try:
             self.meta = open_metadata(repo_id, root, revision)
             if revision is not None and not self._is_snapshot:
                 raise ValueError(
-                    f"revision={revision} is of the Hub, and {repo_id} is in {self.meta.root}: leave revision out,"
-                    " or move that folder"
+                    f"revision={revision} is of the Hub, but {repo_id} is in the folder {self.meta.root}"
                 )
             if root is not None and not streaming:
                 check_files_are_there(self.meta, Path(root))
             self._dataset = None if streaming else LeRobotDataset(repo_id, root=root, revision=revision)
         except (DatasetsError, pa.ArrowInvalid) as error:
-            if root is not None:
-                read_rows(Path(root))
             # What Arrow found is the cause of what `datasets` raises.
-            raise ValueError(f"a file of {repo_id} is damaged: {error.__cause__ or error}") from error
-        if STREAM_ID not in self.meta.features:
-            raise ValueError(f"{repo_id} has no recorded streams: it lacks the columns {list(STREAM_COLUMNS)}")
+            cause = error.__cause__ if isinstance(error.__cause__, Exception) else error
+            raise ValueError(f"a file of {repo_id} is damaged: {brief(cause)}") from error
+        if lacking := [name for name in (*STREAM_COLUMNS, TRUNCATED) if name not in self.meta.features]:
+            raise ValueError(f"{repo_id} has no recorded streams: it lacks the columns {lacking}")
         self.origin = read_origin(self.meta.root, self.meta.features, f"dataset {repo_id}")
         """Where it comes from."""
-        if lacking := [name for name in (*STREAM_COLUMNS, TRUNCATED) if name not in self.meta.features]:
-            raise ValueError(f"{repo_id} has lost columns of a recorded stream: {lacking}")
         if not self.meta.total_episodes:
             raise ValueError(f"{repo_id} in {self.meta.root} has no episode yet")
         self._files: Any = fsspec.filesystem("file") if self.is_local else HfFileSystem()
@@ -185,11 +185,37 @@ class StreamDataset:
         return self._dataset
 
     @cached_property
+    def rows(self) -> pd.DataFrame:
+        """One row per segment, by episode: LeRobot's bookkeeping, SEGMENT_COLUMNS and SUCCESS_FRAME.
+
+        LeRobot's tools drop the last two, or leave nulls where one of two merged datasets lacked them. What is not
+        in `meta/episodes` is then read from the frames.
+        """
+        assert self.meta.episodes is not None
+        wanted, ours = (
+            ["episode_index", "dataset_from_index", "length", "tasks"],
+            [*SEGMENT_COLUMNS, SUCCESS_FRAME],
+        )
+        there = [name for name in ours if name in self.meta.episodes.column_names]
+        table = self.meta.episodes.with_format("arrow").select_columns([*wanted, *there])[
+            : self.meta.total_episodes
+        ]
+        rows = cast(pa.Table, table).to_pandas()
+        if len(there) == len(ours) and not rows[ours].isna().any(axis=None):
+            return rows
+        frames = self.annotations(["episode_index", *SEGMENT_COLUMNS])
+        by_episode = frames.groupby("episode_index")
+        found = by_episode.first()
+        found[[SUCCESS, INTERVENED]] = by_episode[[SUCCESS, INTERVENED]].any()
+        first_success = by_episode.cumcount()[frames[SUCCESS]].groupby(frames["episode_index"]).first()
+        found[SUCCESS_FRAME] = first_success.reindex(found.index, fill_value=-1)
+        return rows[wanted].merge(found, left_on="episode_index", right_index=True)
+
+    @cached_property
     def segments(self) -> list[Segment]:
         """All segments, stream by stream, each stream in the order of time."""
-        rows = self._episodes()
         # In the order of the steps, not of the segments' numbers, which `check` verifies.
-        rows = rows.sort_values([STREAM_ID, STEP], kind="stable")
+        rows = self.rows.sort_values([STREAM_ID, STEP], kind="stable")
         return [_segment(row) for row in rows.to_dict("records")]
 
     @cached_property
@@ -230,8 +256,7 @@ class StreamDataset:
         segments = self.segments if stream is None else self.segments_of(stream)
         if any((a.stream, a.step) == (b.stream, b.step) for a, b in pairwise(segments)):
             raise ValueError(
-                f"{self.repo_id} has steps of a stream twice, as recordings that were merged: what followed "
-                "what is in each of them, read them one by one"
+                f"{self.repo_id} holds several recordings: read them one by one to know what followed what"
             )
         return segments
 
@@ -294,12 +319,11 @@ class StreamDataset:
 
     def annotations(self, names: Sequence[str]) -> pd.DataFrame:
         """Columns of single numbers, of all frames that `info.json` counts, in LeRobot's order."""
-        assert self.meta.episodes is not None
-        paths = [f"{self._base}/{self.meta.get_data_file_path(i)}" for i in range(self.meta.total_episodes)]
-        # Each file once; they are in the order of their episodes.
-        tables = [
-            pq.read_table(path, columns=list(names), filesystem=self._files) for path in dict.fromkeys(paths)
-        ]
+        tables = []
+        for file in (name for name in named_files(self.meta) if name.startswith("data/")):
+            if self.is_local:
+                check_parquet(self.meta.root / file, self.meta.root)
+            tables.append(pq.read_table(f"{self._base}/{file}", columns=list(names), filesystem=self._files))
         # A killed recording may have left rows behind that it had not counted yet.
         return pa.concat_tables(tables).slice(0, self.meta.total_frames).to_pandas()
 
@@ -313,36 +337,8 @@ class StreamDataset:
         Raises:
             StreamError: a step is missing or there twice, or an annotation is wrong.
         """
-        columns = [*COLUMNS, *({EXPERT} & self.meta.features.keys())]
-        frames = self.annotations(columns)
+        frames = self.annotations(COLUMNS)
         check(frames, self.meta.total_frames, self.meta.total_episodes, is_finished=is_finished)
-
-    def _episodes(self) -> pd.DataFrame:
-        """One row per segment: LeRobot's columns and ours."""
-        assert self.meta.episodes is not None
-        names = ["episode_index", "dataset_from_index", "length", "tasks"]
-        has_ours = all(name in self.meta.episodes.column_names for name in _SUMMARY)
-        ours = [*(_SUMMARY if has_ours else ()), *({EXPERT} & set(self.meta.episodes.column_names))]
-        wanted = self.meta.episodes.select_columns([*names, *ours])
-        rows = cast(pd.DataFrame, wanted.to_pandas()).iloc[: self.meta.total_episodes]
-        if has_ours:
-            return rows
-        # LeRobot's dataset tools drop columns they do not know from the episodes, but not from the frames.
-        summary = {*_SUMMARY, *({EXPERT} & self.meta.features.keys())} - {SUCCESS_FRAME, *rows.columns}
-        frames = self.annotations(["episode_index", *sorted(summary)])
-        first = frames.groupby("episode_index").first()
-        number = frames.groupby("episode_index").cumcount()
-        succeeded = number[frames[SUCCESS]].groupby(frames["episode_index"]).first()
-        first[SUCCESS_FRAME] = succeeded.reindex(first.index, fill_value=-1)
-        return rows.merge(first, left_on="episode_index", right_index=True)
-
-
-def to_array(column: pa.ChunkedArray) -> np.ndarray:
-    """A column of a data file as an array (T, ...)."""
-    if pa.types.is_fixed_size_list(column.type) or pa.types.is_list(column.type):
-        values = column.combine_chunks()
-        return np.asarray(values.flatten()).reshape(len(values), -1)
-    return column.to_numpy()
 
 
 def _reset(segment: Segment) -> tuple[int, int]:
@@ -357,11 +353,11 @@ def _segment(row: dict[str, Any]) -> Segment:
         step=int(row[STEP]),
         length=int(row["length"]),
         task=str(row["tasks"][0]),
-        intervention=Intervention(int(row[INTERVENTION])),
-        position=int(row[POSITION]),
+        event=Intervention(int(row[EVENT])),
+        position=int(row[SEGMENTS_SINCE_RESET]),
         success_frame=int(row[SUCCESS_FRAME]) if row[SUCCESS_FRAME] >= 0 else None,
         policy_version=int(row[POLICY_VERSION]),
+        helped=bool(row[INTERVENED]),
         episode=int(row["episode_index"]),
         start=int(row["dataset_from_index"]),
-        taken_over=bool(row.get(EXPERT, False)),
     )

@@ -1,8 +1,6 @@
 """Mp4 files that hold many episodes back to back: encoded from memory, copied from other files, and read."""
 
-import os
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -26,40 +24,7 @@ def check_video_size(flag: str, size: Sequence[int]) -> None:
     """Raise a ValueError, unless pictures of a `size`, (height, width) [px], can be a video's: it halves both."""
     height, width = size
     if height % 2 or width % 2:
-        raise ValueError(f"{flag} are {height} and {width}: a video's height and width must be even")
-
-
-@contextmanager
-def ordinary_priority() -> Generator[None]:
-    """Take back the real-time priority that SVT-AV1, LeRobot's default, gives the threads of a process of root.
-
-    As it opens, it makes its own threads and the one that called it SCHED_FIFO at 99: nothing else on the cores
-    of those, and of all threads that they begin later, would run beside them.
-    """
-    if not hasattr(os, "sched_setscheduler") or not os.path.isdir("/proc/self/task"):
-        yield
-        return
-    before = os.sched_getscheduler(0), os.sched_getparam(0)
-    is_real_time = _real_time_threads()
-    try:
-        yield
-    finally:
-        for thread in _real_time_threads() - is_real_time:
-            try:
-                os.sched_setscheduler(thread, *before)
-            except ProcessLookupError:  # it has ended
-                continue
-
-
-def _real_time_threads() -> set[int]:
-    threads = set()
-    for thread in map(int, os.listdir("/proc/self/task")):
-        try:
-            if os.sched_getscheduler(thread) & ~os.SCHED_RESET_ON_FORK in (os.SCHED_FIFO, os.SCHED_RR):
-                threads.add(thread)
-        except ProcessLookupError:
-            continue
-    return threads
+        raise ValueError(f"{flag} are {height} and {width}: both must be even for a video")
 
 
 class VideoFile:
@@ -83,8 +48,6 @@ class VideoFile:
         self._stream.height = height
         self._stream.width = width
         self._stream.time_base = self._time_base
-        with ordinary_priority():
-            self._stream.codec_context.open()
 
     def append(self, frames: np.ndarray) -> None:
         """Encode an episode, uint8 (T, H, W, 3) RGB; its first frame becomes a keyframe."""

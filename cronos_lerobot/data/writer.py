@@ -17,36 +17,80 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.utils import INFO_PATH
 from lerobot.utils.constants import DEFAULT_FEATURES
 
-from cronos_lerobot.data.drawing import UndrawnFrames
-from cronos_lerobot.data.origin import (
-    STREAMS,
-    Origin,
-    check_same,
-    marked,
-    read_origin,
-    with_changes,
-    write_origin,
-)
-from cronos_lerobot.data.schema import Features, frame_format
+from cronos_lerobot.data.origin import Origin, check_same, marked, read_origin, with_changes, write_origin
+from cronos_lerobot.data.schema import ROBOT_TYPE, Features, frame_format
+from cronos_lerobot.data.stats import DatasetStats
 from cronos_lerobot.data.storage import INCOMPLETE, Shard, next_shard_index, truncate
 from cronos_lerobot.data.video import MAX_FILE_DURATION_S, VideoFile, fast_encoder
-from cronos_lerobot.dataset_metadata import check_path, open_metadata
+from cronos_lerobot.dataset_metadata import brief, check_path, open_metadata
 from cronos_lerobot.locks import FolderLock
 
 FLUSH_INTERVAL_S = 20.0
 """Age of the oldest segment not on disk at which all are written [s]. A full queue takes a few seconds more to
 encode, so that what ended 30 s ago is on disk."""
 
-Column = np.ndarray | UndrawnFrames
-
 
 class RecordingError(RuntimeError):
     """The dataset can no longer be written; what was flushed before stays and loads."""
+
+
+@dataclass(frozen=True)
+class LateCamera:
+    """A camera whose pictures are drawn from states when they are written, by the writer's thread.
+
+    A frame of 640 x 480 takes software rendering milliseconds, which the training loop should not wait for. Its
+    pixels take some thousand times the memory of the state.
+
+    Args:
+        height: of a picture [px].
+        width: of a picture [px].
+        num_positions: generalised positions (MuJoCo's nq) of a state.
+        draw: from states float64 (1, nq) to pictures uint8 (1, height, width, 3); called in another thread.
+    """
+
+    height: int
+    width: int
+    num_positions: int
+    draw: Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class UndrawnFrames:
+    """The pictures of one segment, of which only the states are there: float64 (T, nq)."""
+
+    camera: LateCamera
+    positions: np.ndarray
+
+    dtype = np.dtype(np.uint8)
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the pictures."""
+        return len(self), self.camera.height, self.camera.width, 3
+
+    @property
+    def nbytes(self) -> int:
+        """Of the pictures: what stands in a queue counts as the work that it is."""
+        return int(np.prod(self.shape))
+
+    def draw(self, out: np.ndarray) -> np.ndarray:
+        """Draw into the beginning of `out` (at least T, height, width, 3) and return that part of it.
+
+        One at a time, because whoever draws for the training loop meanwhile waits for it.
+        """
+        for i in range(len(self)):
+            out[i] = self.camera.draw(self.positions[i : i + 1])[0]
+        return out[: len(self)]
+
+
+Column = np.ndarray | UndrawnFrames
 
 
 @dataclass
@@ -83,89 +127,48 @@ class SegmentWriter:
         features: Features,
         fps: int,
         *,
-        robot_type: str | None = None,
-        encoder: RGBEncoderConfig | None = None,
-        max_pending_bytes: int = 256 * 2**20,
-        flush_interval_s: float = FLUSH_INTERVAL_S,
-        origin: Origin | None = None,
-    ) -> None:
-        """Start a new dataset.
-
-        Args:
-            repo_id: the dataset's name, "owner/name".
-            root: its folder, which must not exist yet.
-            features: LeRobot's feature dictionary, without the bookkeeping columns (`timestamp`, ...).
-            fps: frames per second, the control frequency.
-            robot_type: for `info.json`.
-            encoder: of the videos; `fast_encoder()` when None.
-            max_pending_bytes: segments waiting for the encoder; `add_segment` blocks when it is exceeded.
-            flush_interval_s: the longest that a segment waits for a flush [s].
-            origin: where it comes from; what appends to it later has to be of the same.
-
-        Raises:
-            FileExistsError: `root` exists.
-            OSError: it cannot be made, or another process writes to it.
-            ValueError: LeRobot could not read what is in a folder of this path.
-        """
-        check_path(Path(root))
-        has_video = any(feature["dtype"] == "video" for feature in features.values())
-        with ExitStack() as on_failure:
-            self._lock = on_failure.enter_context(FolderLock(root))
-            meta = LeRobotDatasetMetadata.create(
-                repo_id, fps, features if origin is None else marked(features, origin), robot_type=robot_type,
-                root=Path(root), use_videos=has_video,
-            )  # fmt: skip
-            if origin is not None:
-                write_origin(meta.root, origin)
-            self._start(meta, encoder, max_pending_bytes, flush_interval_s)
-            on_failure.pop_all()
-
-    @classmethod
-    def resume(
-        cls,
-        repo_id: str,
-        root: str | Path,
-        state: Mapping[str, Any] | None = None,
-        *,
-        encoder: RGBEncoderConfig | None = None,
+        resume: int | None = None,
+        robot_type: str = ROBOT_TYPE,
         max_pending_bytes: int = 256 * 2**20,
         flush_interval_s: float = FLUSH_INTERVAL_S,
         origin: Origin | None = None,
         may_differ: tuple[str, ...] = (),
-    ) -> Self:
-        """Go on with the dataset in `root` as it was at `state`; what was written after it is dropped.
+    ) -> None:
+        """Start a new dataset, or resume one.
 
         Args:
-            repo_id: the dataset's name.
-            root: its folder.
-            state: of `state_dict()`; None keeps every episode that was flushed.
-            encoder: as for a new dataset; it must match, LeRobot assumes one encoding per camera.
-            max_pending_bytes: as for a new dataset.
-            flush_interval_s: as for a new dataset.
-            origin: of what is to be appended.
+            repo_id: the dataset's name, "owner/name".
+            root: its folder, which must not exist yet, or hold the dataset to resume.
+            features: LeRobot's feature dictionary, without the bookkeeping columns (`timestamp`, ...).
+            fps: frames per second, the control frequency.
+            resume: how many of the first episodes to keep, -1 for all; None starts a new dataset.
+            robot_type: for `info.json`.
+            max_pending_bytes: segments waiting for the encoder; `add_segment` blocks when it is exceeded.
+            flush_interval_s: the longest that a segment waits for a flush [s].
+            origin: where it comes from; what is appended later has to be of the same.
             may_differ: flags of the origin that may be others than they were.
 
         Raises:
-            FileNotFoundError: there is no dataset in `root`.
-            DatasetFileError: a file of its `meta/` is missing.
-            ValueError: the dataset holds fewer episodes than `state`, or is of another origin.
-            FolderInUseError: another process writes to it.
+            FileExistsError: `root` exists, and nothing is to be resumed.
+            FileNotFoundError: there is no dataset to resume.
+            DatasetFileError: a file of its `meta/` is missing, or something leads out of its folder.
+            ValueError: it has fewer episodes or other features than given, or another origin.
+            OSError: `root` cannot be made, or another process writes to it (FolderInUseError).
         """
-        if not (Path(root) / INFO_PATH).is_file():
+        root = Path(root)
+        check_path(root)
+        self.features = features
+        self._flush_interval_s, self._max_pending = flush_interval_s, max_pending_bytes
+        if resume is not None and not (root / INFO_PATH).is_file():
             raise FileNotFoundError(f"no LeRobotDataset to resume in {root}")
-        writer = cls.__new__(cls)
         with ExitStack() as on_failure:
-            writer._lock = on_failure.enter_context(FolderLock(root))
-            meta = open_metadata(repo_id, Path(root))
-            if origin is not None:
-                there = read_origin(meta.root, meta.features, f"the dataset in {root}")
-                check_same(there, origin, f"the dataset in {root}", may_differ)
-            truncate(meta, meta.info.total_episodes if state is None else state["num_episodes"])
-            if origin is not None and origin.kind == STREAMS:
-                write_origin(meta.root, with_changes(there, origin, meta.info.total_episodes))
-            writer._start(meta, encoder, max_pending_bytes, flush_interval_s)
+            self._lock = on_failure.enter_context(FolderLock(root))
+            if resume is None:
+                self._create(repo_id, root, fps, robot_type, origin)
+            else:
+                self._resume(repo_id, root, resume, origin, may_differ)
+            self._start()
             on_failure.pop_all()
-        return writer
 
     @property
     def root(self) -> Path:
@@ -207,14 +210,7 @@ class SegmentWriter:
         """
         self._check_alive()
         self._check_frames(frames)
-        metadata = dict(episode_metadata or {})
-        if self._metadata_keys is None:
-            self._metadata_keys = set(metadata)
-        if set(metadata) != self._metadata_keys:
-            raise ValueError(
-                f"episode_metadata has the keys {sorted(metadata)}, not {sorted(self._metadata_keys)}"
-            )
-        segment = _Segment(frames, task, metadata, written)
+        segment = _Segment(frames, task, dict(episode_metadata or {}), written)
         with self._room:
             self._room.wait_for(
                 lambda: self._pending == 0 or self._pending + segment.num_bytes <= self._max_pending
@@ -229,10 +225,6 @@ class SegmentWriter:
         self._queue.put(request)
         request.done.wait()
         self._check_alive()
-
-    def state_dict(self) -> dict[str, Any]:
-        """What `resume` needs to come back to the last flush."""
-        return {"num_episodes": self.num_episodes}
 
     def finalize(self) -> None:
         """Flush, stop the thread, and accept no more segments. Idempotent."""
@@ -256,24 +248,32 @@ class SegmentWriter:
         """Finalize, also after an exception: what was recorded until then stays."""
         self.finalize()
 
-    def _start(
-        self,
-        meta: LeRobotDatasetMetadata,
-        encoder: RGBEncoderConfig | None,
-        max_pending: int,
-        flush_interval_s: float,
+    def _create(self, repo_id: str, root: Path, fps: int, robot_type: str, origin: Origin | None) -> None:
+        has_video = any(feature["dtype"] == "video" for feature in self.features.values())
+        features = self.features if origin is None else marked(self.features, origin)
+        self._meta = LeRobotDatasetMetadata.create(
+            repo_id, fps, features, robot_type=robot_type, root=root, use_videos=has_video
+        )
+        if origin is not None:
+            write_origin(root, origin)
+        self._stats = DatasetStats(self._meta.features)
+
+    def _resume(
+        self, repo_id: str, root: Path, num_episodes: int, origin: Origin | None, may_differ: tuple[str, ...]
     ) -> None:
-        if flush_interval_s <= 0:
-            raise ValueError(f"flush_interval_s must be more than 0 s, got {flush_interval_s}")
-        self._meta = meta
-        self._encoder = encoder or fast_encoder()
-        self._max_pending = max_pending
-        self._flush_interval_s = flush_interval_s
-        self.features: Features = {
-            key: feature for key, feature in meta.features.items() if key not in DEFAULT_FEATURES
-        }
+        what = f"the dataset in {root}"
+        self._meta = open_metadata(repo_id, root)
+        if origin is not None:
+            there = read_origin(root, self._meta.features, what)
+            check_same(there, origin, what, may_differ)
+        _check_features(self._meta.features, self.features, what)
+        self._stats = truncate(self._meta, self._meta.total_episodes if num_episodes < 0 else num_episodes)
+        if origin is not None:
+            write_origin(root, with_changes(there, origin, self._meta.total_episodes))
+
+    def _start(self) -> None:
+        meta = self._meta
         self._tasks: dict[str, int] = {} if meta.tasks is None else dict(meta.tasks["task_index"])
-        self._metadata_keys: set[str] | None = None
         self._max_shard_frames = int(MAX_FILE_DURATION_S * meta.fps)
         self._shard: Shard | None = None
         self._canvas: dict[str, np.ndarray] = {}
@@ -301,8 +301,7 @@ class SegmentWriter:
 
     def _check_frames(self, frames: Mapping[str, Column]) -> None:
         if set(frames) != set(self.features):
-            missing, unknown = set(self.features) - set(frames), set(frames) - set(self.features)
-            raise ValueError(f"segment lacks {sorted(missing)} and has unknown {sorted(unknown)}")
+            raise ValueError(f"a segment has the columns {sorted(frames)}, not {sorted(self.features)}")
         length = len(next(iter(frames.values())))
         if not 1 <= length <= self._max_shard_frames:
             raise ValueError(f"a segment needs 1 to {self._max_shard_frames} frames, got {length}")
@@ -348,13 +347,10 @@ class SegmentWriter:
             self._publish()
             return
         length = len(next(iter(item.frames.values())))
-        max_bytes = self._meta.info.data_files_size_in_mb * 2**20
-        if self._shard is not None and (
-            self._shard.num_frames + length > self._max_shard_frames or self._shard.num_bytes >= max_bytes
-        ):
+        if self._shard is not None and self._shard.is_full_for(length):
             self._publish()
         if self._shard is None:
-            self._shard = Shard(self._meta, self._next_shard, self._open_video)
+            self._shard = Shard(self._meta, self._next_shard, self._stats, self._open_video)
             # A writer that lags would else flush after every segment, and never catch up.
             self._oldest = max(item.ended, time.monotonic() - self._flush_interval_s / 2)
             self._next_shard += 1
@@ -376,10 +372,23 @@ class SegmentWriter:
 
     def _publish(self) -> None:
         if self._shard is not None:
-            self._shard.publish(self._tasks, self._encoder)
+            self._shard.publish(self._tasks)
             self._shard = None
             self._on_disk = self._meta.info.total_episodes, self._meta.info.total_frames
 
     def _open_video(self, key: str, path: Path) -> VideoFile:
         height, width, _ = self._meta.features[key]["shape"]
-        return VideoFile(path, self._meta.fps, height, width, self._encoder)
+        return VideoFile(path, self._meta.fps, height, width, fast_encoder())
+
+
+def _check_features(there: Features, ours: Features, what: str) -> None:
+    """Check that what is appended has the columns of a dataset, and nothing is written elsewhere."""
+
+    def described(features: Features, key: str) -> Any:
+        feature = features.get(key)
+        return feature and (feature["dtype"], tuple(feature["shape"]), feature["names"] and list(feature["names"]))
+
+    for key in {*there, *ours} - set(DEFAULT_FEATURES):
+        if described(there, key) != described(ours, key):
+            had, has = brief(described(there, key)), brief(described(ours, key))
+            raise ValueError(f"{what} cannot be resumed: its column {brief(key)} is {had}, not {has}")

@@ -2,6 +2,7 @@ import json
 import os
 import signal
 import sys
+import time
 from pathlib import Path
 
 import gymnasium
@@ -14,7 +15,7 @@ from synthetic_segments import FPS, assert_same_pictures, features, segment
 
 from cronos_lerobot.data import storage
 from cronos_lerobot.data.schema import demonstration_features
-from cronos_lerobot.data.video import ordinary_priority
+from cronos_lerobot.data.video import fast_encoder
 from cronos_lerobot.data.writer import RecordingError, SegmentWriter
 
 LENGTHS = [12, 1, 25, 7, 18]
@@ -32,8 +33,12 @@ def segments():
     return [(segment(length, seed), f"task {seed % 3}") for seed, length in enumerate(LENGTHS)]
 
 
+def resume(root: Path, num_episodes=-1, video=True) -> SegmentWriter:
+    return SegmentWriter("me/test", root, features(video), FPS, resume=num_episodes)
+
+
 def write(root: Path, segments, flush_after=(), video=True) -> SegmentWriter:
-    writer = SegmentWriter("me/test", root, features(video), FPS, robot_type="widowx")
+    writer = SegmentWriter("me/test", root, features(video), FPS)
     for i, (frames, task) in enumerate(segments):
         writer.add_segment(frames, task, episode_metadata={"number": i})
         if i in flush_after:
@@ -110,13 +115,6 @@ def test_a_data_file_of_images_that_grew_too_big_is_followed_by_another(tmp_path
     assert assert_holds(tmp_path / "d", segments).meta.episodes["data/file_index"] == [0, 0, 1]
 
 
-def test_a_file_that_would_grow_too_long_is_followed_by_another(tmp_path, segments, monkeypatch):
-    monkeypatch.setattr("cronos_lerobot.data.writer.MAX_FILE_DURATION_S", 30 / FPS)
-    write(tmp_path / "d", segments).finalize()
-    dataset = assert_holds(tmp_path / "d", segments)
-    assert dataset.meta.episodes["data/file_index"] == [0, 0, 1, 2, 2]
-
-
 def test_delta_timestamps_stay_within_an_episode(tmp_path, segments, video):
     write(tmp_path / "d", segments, video=video).finalize()
     deltas = {key: [-1 / FPS, 0, 1 / FPS] for key in (CAMERA, "action")}
@@ -134,13 +132,14 @@ def test_delta_timestamps_stay_within_an_episode(tmp_path, segments, video):
 
 def test_same_dataset_as_lerobots_own_writer(tmp_path, segments, video):
     write(tmp_path / "ours", segments, flush_after=[1, 3], video=video).finalize()
-    theirs = LeRobotDataset.create("me/test", FPS, features(video), root=tmp_path / "theirs", use_videos=video)
+    theirs = LeRobotDataset.create(
+        "me/test", FPS, features(video), root=tmp_path / "theirs", use_videos=video, rgb_encoder=fast_encoder()
+    )
     for frames, task in segments:
         for t in range(len(frames["action"])):
             row = {key: np.atleast_1d(array[t]) for key, array in frames.items()}
             theirs.add_frame(row | {"task": task})
-        with ordinary_priority():
-            theirs.save_episode()
+        theirs.save_episode()
     theirs.finalize()
     ours, theirs = (LeRobotDataset("me/test", root=tmp_path / name) for name in ("ours", "theirs"))
     assert ours.num_frames == theirs.num_frames
@@ -148,7 +147,9 @@ def test_same_dataset_as_lerobots_own_writer(tmp_path, segments, video):
     assert ours.hf_dataset.features == theirs.hf_dataset.features
     assert set(ours.meta.stats) == set(theirs.meta.stats)
     for key, stats in theirs.meta.stats.items():
-        for name, value in stats.items():
+        # Quantiles of numbers are those of all frames, see test_stats.py.
+        kept = {name: stats[name] for name in stats if key == CAMERA or not name.startswith("q")}
+        for name, value in kept.items():
             atol = 2e-3 * max(1.0, float(np.ptp(np.concatenate([stats["max"], stats["min"]]))))
             np.testing.assert_allclose(ours.meta.stats[key][name], value, atol=atol, err_msg=f"{key} {name}")
     schemas = [pq.read_schema(dataset.root / "data/chunk-000/file-000.parquet") for dataset in (ours, theirs)]
@@ -191,8 +192,8 @@ def test_killed_after_a_flush_it_loads_with_exactly_what_was_flushed(killed, seg
     assert_holds(killed, segments[:3])
 
 
-def test_resumes_after_a_kill_without_gap_or_duplicate(killed, segments):
-    with SegmentWriter.resume("me/test", killed) as writer:
+def test_resumes_after_a_kill_without_gap_or_duplicate(killed, segments, video):
+    with resume(killed, video=video) as writer:
         for i, (frames, task) in enumerate(segments[3:], start=3):
             writer.add_segment(frames, task, episode_metadata={"number": i})
     dataset = assert_holds(killed, segments)
@@ -205,7 +206,7 @@ def test_truncates_to_a_state_and_goes_on(tmp_path, segments, flush_after, video
     straight = write(tmp_path / "straight", segments, video=video)
     straight.finalize()
     write(tmp_path / "d", segments, flush_after=flush_after, video=video).finalize()
-    with SegmentWriter.resume("me/test", tmp_path / "d", {"num_episodes": 2}) as writer:
+    with resume(tmp_path / "d", 2, video) as writer:
         assert writer.num_frames == sum(LENGTHS[:2])
         assert_holds(tmp_path / "d", segments[:2])
         assert writer.episodes_before.total() == 2
@@ -220,7 +221,7 @@ def test_truncates_to_a_state_and_goes_on(tmp_path, segments, flush_after, video
 
 def test_truncates_to_nothing(tmp_path, segments, video):
     write(tmp_path / "d", segments, video=video).finalize()
-    with SegmentWriter.resume("me/test", tmp_path / "d", {"num_episodes": 0}) as writer:
+    with resume(tmp_path / "d", 0, video) as writer:
         writer.add_segment(*segments[3], episode_metadata={"number": 0})
     assert_holds(tmp_path / "d", [segments[3]])
 
@@ -245,7 +246,7 @@ def test_killed_while_publishing_it_still_loads_and_resumes(tmp_path, segments, 
     writer._lock.release()
     dataset = LeRobotDataset("me/test", root=tmp_path / "d")
     assert (dataset.num_episodes, len(dataset)) == (2, sum(LENGTHS[:2]))
-    with SegmentWriter.resume("me/test", tmp_path / "d") as writer:
+    with resume(tmp_path / "d", video=video) as writer:
         for i, (frames, task) in enumerate(segments[2:], start=2):
             writer.add_segment(frames, task, episode_metadata={"number": i})
     assert_holds(tmp_path / "d", segments)
@@ -290,35 +291,21 @@ def test_a_full_disk_leaves_nothing_of_the_flush_that_failed(tmp_path, segments,
     assert_holds(tmp_path / "d", segments[:2])
 
 
-def test_an_exception_keeps_what_was_recorded(tmp_path, segments):
-    def record_and_stop():
-        with SegmentWriter("me/test", tmp_path / "d", features(), FPS) as writer:
-            writer.add_segment(*segments[0])
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        record_and_stop()
-    assert_holds(tmp_path / "d", segments[:1])
-
-
 @pytest.mark.parametrize(
-    ("key", "value", "message"),
+    "change",
     [
-        ("action", np.zeros((12, 7)), "action must be float32"),
-        ("action", np.zeros((11, 7), np.float32), "action must be float32"),
-        ("observation.images.front", np.zeros((12, 32, 64, 3), np.uint8), "must be uint8"),
-        ("extra", np.zeros(12), "unknown \\['extra'\\]"),
+        {"action": np.zeros((12, 7))},
+        {"action": np.zeros((11, 7), np.float32)},
+        {CAMERA: np.zeros((12, 32, 64, 3), np.uint8)},
+        {"extra": np.zeros(12)},
     ],
+    ids=["dtype", "length", "size", "unknown"],
 )
-def test_wrong_segments_are_refused(tmp_path, segments, key, value, message):
+def test_wrong_segments_are_refused(tmp_path, segments, change):
     with SegmentWriter("me/test", tmp_path / "d", features(), FPS) as writer:
-        with pytest.raises(ValueError, match=message):
-            writer.add_segment(segments[0][0] | {key: value}, "task")
-        with pytest.raises(ValueError, match="lacks \\['action'\\]"):
-            writer.add_segment({k: v for k, v in segments[0][0].items() if k != "action"}, "task")
-        writer.add_segment(segments[0][0], "task", episode_metadata={"a": 1})
-        with pytest.raises(ValueError, match="episode_metadata"):
-            writer.add_segment(segments[0][0], "task", episode_metadata={"b": 1})
+        with pytest.raises(ValueError, match=next(iter(change))):
+            writer.add_segment(segments[0][0] | change, "task")
+        writer.add_segment(segments[0][0], "task")
 
 
 def test_nothing_is_overwritten_or_resumed_by_mistake(tmp_path, segments):
@@ -326,17 +313,9 @@ def test_nothing_is_overwritten_or_resumed_by_mistake(tmp_path, segments):
     with pytest.raises(FileExistsError):
         SegmentWriter("me/test", tmp_path / "d", features(), FPS)
     with pytest.raises(ValueError, match="has only 1"):
-        SegmentWriter.resume("me/test", tmp_path / "d", {"num_episodes": 2})
+        resume(tmp_path / "d", 2)
     with pytest.raises(FileNotFoundError, match="no LeRobotDataset"):
-        SegmentWriter.resume("me/test", tmp_path / "nothing")
-
-
-def test_finalize_twice_then_no_more(tmp_path, segments):
-    writer = write(tmp_path / "d", segments[:1])
-    writer.finalize()
-    writer.finalize()
-    with pytest.raises(RuntimeError, match="finalized"):
-        writer.add_segment(*segments[1])
+        resume(tmp_path / "nothing")
 
 
 def test_frames_at_the_end_of_the_longest_file_are_found(tmp_path):
@@ -356,3 +335,35 @@ def test_frames_at_the_end_of_the_longest_file_are_found(tmp_path):
     for index in [*range(4800, 5000, 7), 4999, 5000, 5199]:
         shade = dataset[index]["observation.images.front"].numpy() * 255
         assert abs(shade.mean() - index % length) < 3
+
+
+def wait_for_episodes(writer: SegmentWriter, count: int) -> None:
+    end = time.monotonic() + 30
+    while writer.num_episodes < count:
+        assert time.monotonic() < end, f"{writer.num_episodes} of {count} episodes on disk"
+        time.sleep(0.02)
+
+
+def test_flushes_by_itself_what_has_waited(tmp_path, segments):
+    """Whether or not more segments come."""
+    writer = SegmentWriter("me/test", tmp_path / "d", features(), FPS, flush_interval_s=0.2)
+    writer.add_segment(*segments[0])
+    wait_for_episodes(writer, 1)
+    assert_holds(tmp_path / "d", segments[:1])
+    for frames, task in segments[1:]:
+        writer.add_segment(frames, task)
+        time.sleep(0.12)
+    # Segment 2 waits 0.2 s at most, though segments keep coming.
+    assert writer.num_episodes >= 2
+    wait_for_episodes(writer, len(segments))
+    writer.finalize()
+    dataset = assert_holds(tmp_path / "d", segments)
+    assert len(set(dataset.meta.episodes["data/file_index"])) > 1
+
+
+def test_a_writer_that_lags_still_puts_segments_together(tmp_path, segments):
+    """Half of forty segments wait longer than the interval."""
+    with SegmentWriter("me/test", tmp_path / "d", features(video=False), FPS, flush_interval_s=1) as writer:
+        for _ in range(40):
+            writer.add_segment(*segments[0], written=lambda: time.sleep(0.05))
+    assert len(list((tmp_path / "d").glob("data/*/*.parquet"))) < 20

@@ -6,7 +6,6 @@ import numpy as np
 from synthetic_segments import FPS, STATE_DIM, images, observation_space
 from synthetic_streams import ORIGIN, make_step
 
-from cronos_lerobot.data.origin import Origin
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.schema import stream_features
 from cronos_lerobot.data.writer import SegmentWriter
@@ -61,12 +60,16 @@ def rewards_of(levels: list[float], reward: str) -> np.ndarray:
 
 
 def record_weighted(
-    root, *, reward="difference", value: Callable[[int], float] = float, origin: Origin = ORIGIN
+    root,
+    *,
+    reward="difference",
+    value: Callable[[int], float] = float,
+    origin=ORIGIN,
+    describes=("log_prob", "value"),
 ) -> None:
-    """Record one stream with pictures; `value` is that of the frame at a step."""
-    writer = SegmentWriter(
-        "me/stream", root, stream_features(observation_space(environment_state=None)), FPS, origin=origin
-    )
+    """Record one stream with pictures; `value` is that of a step, `describes` what the agent knows."""
+    features = stream_features(observation_space(environment_state=None), describes=describes)
+    writer = SegmentWriter("me/stream", root, features, FPS, origin=origin)
     recorder = StreamRecorder(writer, num_envs=1, segment_length=K)
     pictures = images(sum(len(levels) - 1 for _, levels in SEGMENTS))
     t = switches = resets = 0
