@@ -1,6 +1,6 @@
-"""Runs chains of tasks through a fixed number of environments; a chain that ends makes room for the next one.
+"""Runs chains of tasks in a fixed number of streams; a chain that ends makes room for the next one.
 
-An independent episode is a chain of one task, so both suites go through here.
+All suites are chains: an independent episode is a chain of one task, and a stream is a long one that never stops.
 """
 
 from __future__ import annotations
@@ -8,13 +8,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-from lerobot_env_cronos import SequentialVectorEnv, Task
-from lerobot_env_cronos.sequential import ChainStep
-from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
+from lerobot_env_cronos import STEPS_PER_TASK, Task
 
-from cronos_lerobot.evaluation.actors import Actor
+from cronos_lerobot.agents.actor import Actor, StreamSeed
 
 
 @dataclass(frozen=True)
@@ -22,15 +21,29 @@ class Chain:
     """What is to be done."""
 
     number: int
-    """Of the ordering, or of the task in an independent evaluation."""
+    """Of the task (independent), the ordering (sequential), or the first task of the cycle (stream)."""
     tasks: tuple[Task, ...]
     configuration: int
-    """Index into the split."""
+    """Where it starts: index into the split."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How a chain goes on."""
+
+    window: int = STEPS_PER_TASK
+    """Control steps for each task."""
+    advance: str = "window"
+    """When the next task is given: `window` (the window is over) or `on_success` (at once)."""
+    end_effector_reset: bool = False
+    """Send the arm home between tasks."""
+    stops: bool = True
+    """Whether a chain ends at its first failed task, and at the success of its last one."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What happened, T steps and the start; a video is drawn from it."""
+    """T steps and the start, to draw pictures from."""
 
     qpos: np.ndarray
     """(T + 1, nq) float32, joint positions."""
@@ -45,40 +58,23 @@ class ChainResult:
     """How a chain ended."""
 
     chain: Chain
-    length: int
-    """Tasks completed; the first that failed is the one after them."""
+    success: tuple[bool, ...]
+    """Of each task that was given."""
     steps: int
     """Control steps."""
-    trajectory: Trajectory | None = None
-    """If the runner keeps them."""
     found_complete: tuple[int, ...] = ()
-    """Positions of completed tasks that were complete when they were given."""
+    """Positions of successes whose task was complete when it was given."""
     never_grasped: tuple[int, ...] = ()
-    """Positions of the other completed tasks whose object was in no grasp from the task's start to its success."""
+    """Positions of other successes without a grasp of the object from the task's start to its success."""
+    starts: tuple[str, ...] = ()
+    """How each task's bodies lay when it was given, if the runner was asked to look."""
+    trajectory: Trajectory | None = None
+    """If the runner keeps it."""
 
     @property
-    def is_success(self) -> bool:
-        """Whether all tasks were completed."""
-        return self.length == len(self.chain.tasks)
-
-
-Noise = Callable[[Chain], np.ndarray]
-"""The randomness of a chain's actions: uniform numbers in [0, 1), (steps, action dimensions) float32."""
-
-
-def chain_noise(window: int, *key: int) -> Noise:
-    """Randomness that depends on `key` and on a chain's number and configuration, and on nothing else.
-
-    Args:
-        window: control steps for each task.
-        key: non-negative integers: the evaluation's seed, suite and split.
-    """
-
-    def draw(chain: Chain) -> np.ndarray:
-        rng = np.random.default_rng([*key, chain.number, chain.configuration])
-        return rng.random((window * len(chain.tasks), len(ACTION_NAMES)), dtype=np.float32)
-
-    return draw
+    def length(self) -> int:
+        """Tasks completed."""
+        return sum(self.success)
 
 
 @dataclass
@@ -87,132 +83,195 @@ class _Run:
 
     index: int
     chain: Chain
-    noise: np.ndarray
     steps: int = 0
-    qpos: list[np.ndarray] = field(default_factory=list)
-    position: list[int] = field(default_factory=lambda: [0])
-    is_complete: list[bool] = field(default_factory=lambda: [False])
+    elapsed: int = 0
+    success: list[bool] = field(default_factory=list)
     found_complete: list[int] = field(default_factory=list)
     never_grasped: list[int] = field(default_factory=list)
-    _was_found: bool = False
-    _was_grasped: bool = False
+    starts: list[str] = field(default_factory=list)
+    frames: list[tuple[np.ndarray, int, bool]] = field(default_factory=list)
+    was_found: bool = False
+    was_grasped: bool = False
 
-    def begin_task(self, is_complete: bool, is_grasped: bool) -> None:
-        """Note how the task at hand was found."""
-        self._was_found, self._was_grasped = is_complete, is_grasped
+    @property
+    def task(self) -> Task:
+        return self.chain.tasks[len(self.success) - 1]
 
-    def record(self, position: int, is_success: bool, is_grasped: bool) -> None:
-        """Note a step of task `position`; `is_success` at most once for each task."""
-        was_complete = self.is_complete[-1] and self.position[-1] == position
+    @property
+    def is_last(self) -> bool:
+        return len(self.success) == len(self.chain.tasks)
+
+    def record(self, is_success: bool, is_grasped: bool) -> None:
+        """Note a control step."""
         self.steps += 1
-        self.position.append(position)
-        self.is_complete.append(is_success or was_complete)
-        self._was_grasped |= is_grasped
-        if is_success and self._was_found:
-            self.found_complete.append(position)
-        elif is_success and not self._was_grasped:
-            self.never_grasped.append(position)
+        self.elapsed += 1
+        self.was_grasped |= is_grasped
+        if is_success and not self.success[-1]:
+            self.success[-1] = True
+            if self.was_found:
+                self.found_complete.append(len(self.success) - 1)
+            elif not self.was_grasped:
+                self.never_grasped.append(len(self.success) - 1)
 
-    def result(self, length: int) -> ChainResult:
-        trajectory = None
-        if self.qpos:
-            trajectory = Trajectory(np.stack(self.qpos), np.array(self.position), np.array(self.is_complete))
-        kinds = tuple(self.found_complete), tuple(self.never_grasped)
-        return ChainResult(self.chain, length, self.steps, trajectory, *kinds)
+    def result(self) -> ChainResult:
+        trajectory = Trajectory(*map(np.array, zip(*self.frames, strict=True))) if self.frames else None
+        return ChainResult(
+            self.chain,
+            tuple(self.success),
+            self.steps,
+            tuple(self.found_complete),
+            tuple(self.never_grasped),
+            tuple(self.starts),
+            trajectory,
+        )
 
 
 class ChainRunner:
     """Runs chains with one actor.
 
     Args:
-        env: the environments; what it decides (window, advance, split, ...) holds for all chains.
+        env: streams of their own, never those of a training. Needs `scene_reset`, `set_task`, `observe`, `step`,
+            and `end_effector_reset` if the rules ask for it. Its `is_success` and `is_grasped`, if it has them,
+            are those of the current tasks now.
         actor: chooses the actions.
-        keeps_states: return trajectories, from which videos can be drawn.
+        rules: of all chains.
+        look: says how the bodies of streams (k,) lie, a word each; None does not look.
+        keeps_states: return trajectories; needs `positions` of the environment.
     """
 
-    def __init__(self, env: SequentialVectorEnv, actor: Actor, *, keeps_states: bool = True) -> None:
-        self.env, self.actor = env, actor
-        self._keeps_states = keeps_states
+    def __init__(
+        self,
+        env: Any,
+        actor: Actor,
+        rules: Rules = Rules(),  # noqa: B008 - frozen
+        *,
+        look: Callable[[Any, np.ndarray], Iterable[str]] | None = None,
+        keeps_states: bool = False,
+    ) -> None:
+        self.env, self.actor, self.rules = env, actor, rules
+        self._look, self._keeps_states = look, keeps_states
         self._everyone = np.arange(env.num_envs)
         self._runs: dict[int, _Run] = {}
-        self._results: dict[int, ChainResult] = {}
 
     def run(
-        self, chains: Sequence[Chain], noise: Noise, on_end: Callable[[ChainResult], None] = lambda result: None
+        self,
+        chains: Sequence[Chain],
+        split: str,
+        seed: StreamSeed,
+        on_end: Callable[[ChainResult], None] = lambda result: None,
     ) -> list[ChainResult]:
-        """Run `chains` and return their results, in the same order.
+        """Run chains and return their results, in the same order.
 
         Args:
-            chains: in the order in which they get a free environment.
-            noise: the randomness of each of them.
+            chains: in the order in which they get a free stream.
+            split: of their configurations.
+            seed: of the action sampling. A chain's randomness depends on it, on the chain's number and on its
+                configuration, and on nothing else.
             on_end: called with each result as it comes in.
         """
-        waiting = deque(enumerate(chains))
-        self._runs, self._results = {}, {}
-        self.env.done[:] = True
-        began = np.zeros(0, dtype=int)
-        while True:
-            began = np.union1d(began, self._fill(waiting, noise))
-            running = self._everyone[~self.env.done]
-            if not len(running):
-                return [self._results[i] for i in range(len(chains))]
-            self.actor.begin(began)
-            step = self.env.apply(self._choose(running))
-            for index in self._record(step, running):
-                on_end(self._results[index])
-            began = self._everyone[step.switched]
+        waiting, results = deque(enumerate(chains)), {}
+        self._runs = {}
+        self._instructions = [chains[0].tasks[0].instruction] * self.env.num_envs
+        observation = self.env.observe()
+        while waiting or self._runs:
+            fresh = np.union1d(self._fill(waiting, split, seed), self._switch())
+            if len(fresh):
+                _scatter(observation, fresh, self.env.observe(fresh))
+            observation, info = self._step(observation)
+            for i in self._record(info):
+                run = self._runs.pop(i)
+                results[run.index] = run.result()
+                on_end(results[run.index])
+        return [results[i] for i in range(len(chains))]
 
-    def _fill(self, waiting: deque[tuple[int, Chain]], noise: Noise) -> np.ndarray:
-        """Start waiting chains in free environments; returns those (k,).
+    def _fill(self, waiting: deque[tuple[int, Chain]], split: str, seed: StreamSeed) -> np.ndarray:
+        """Start waiting chains in free streams; returns those (k,).
 
-        A policy with one memory for the whole batch can only clear it for all: its chains are started together.
+        An actor with one memory for all streams can only clear it for all: its chains start together.
         """
-        free = self._everyone[self.env.done][: len(waiting)]
-        if not len(free) or not (self.actor.is_per_environment or self.env.done.all()):
-            return np.zeros(0, dtype=int)
-        started = [waiting.popleft() for _ in free]
-        tasks = [chain.tasks for _, chain in started]
-        self.env.start(free, tasks, np.array([chain.configuration for _, chain in started]))
-        for i, (index, chain) in zip(free, started, strict=True):
-            self._runs[int(i)] = _Run(index, chain, noise(chain))
-            self._begin_task(int(i))
-            self._keep_state(int(i))
+        free = np.array([i for i in self._everyone if i not in self._runs], dtype=int)[: len(waiting)]
+        if not len(free) or not (self.actor.is_per_stream or not self._runs):
+            return free[:0]
+        runs = {int(i): _Run(*waiting.popleft()) for i in free}
+        self.env.scene_reset(free, np.array([run.chain.configuration for run in runs.values()]), split)
+        self._runs |= runs
+        self._give_next_task(free)
+        seeds = [(*seed, run.chain.number, run.chain.configuration) for run in runs.values()]
+        self.actor.begin(free, seeds)
         return free
 
-    def _begin_task(self, i: int) -> None:
-        self._runs[i].begin_task(bool(self.env.is_success[i]), bool(self.env.is_grasped[i]))
+    def _switch(self) -> np.ndarray:
+        """Give the next task where it is due; returns those streams (k,)."""
+        at_once = self.rules.advance == "on_success"
+        window, runs = self.rules.window, sorted(self._runs.items())
+        due = [i for i, run in runs if (run.success[-1] if at_once else run.elapsed >= window)]
+        ids = np.array(due, dtype=int)
+        if len(ids):
+            if self.rules.end_effector_reset:
+                self.env.end_effector_reset(ids)
+            self._give_next_task(ids)
+            self.actor.begin(ids)
+        return ids
 
-    def _keep_state(self, i: int) -> None:
+    def _give_next_task(self, ids: np.ndarray) -> None:
+        runs = [self._runs[int(i)] for i in ids]
+        for run in runs:
+            run.success.append(False)
+        self.env.set_task(ids, [run.task for run in runs])
+        looks = list(self._look(self.env, ids)) if self._look else []
+        for row, (i, run) in enumerate(zip(ids, runs, strict=True)):
+            run.elapsed = 0
+            run.was_found, run.was_grasped = self._now("is_success", i), self._now("is_grasped", i)
+            run.starts += looks[row : row + 1]
+            self._instructions[i] = run.task.instruction
+            if not run.frames:
+                self._keep_state(i, run)
+
+    def _now(self, name: str, i: int) -> bool:
+        known = getattr(self.env, name, None)
+        return known is not None and bool(known[i])
+
+    def _keep_state(self, i: int, run: _Run) -> None:
         if self._keeps_states:
-            self._runs[i].qpos.append(self.env.simulation.qpos[i].astype(np.float32))
+            qpos = self.env.positions(np.array([i]))[0].astype(np.float32)
+            run.frames.append((qpos, len(run.success) - 1, run.success[-1]))
 
-    def _choose(self, running: np.ndarray) -> np.ndarray:
-        """Actions (n, 7), zero for those that are not running."""
-        env = self.env
-        if self.actor.is_per_environment:
-            ids, observation = running, env.observe(running)
+    def _step(self, observation: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Act in the streams that run; the others hold still."""
+        ids = np.array(sorted(self._runs)) if self.actor.is_per_stream else self._everyone
+        rows = observation if len(ids) == len(self._everyone) else _take(observation, ids)
+        chosen = self.actor.act(rows, [self._instructions[i] for i in ids], ids).action
+        actions = np.zeros((len(self._everyone), chosen.shape[1]))
+        actions[ids] = chosen
+        observation, *_, info = self.env.step(actions)
+        return observation, info
+
+    def _record(self, info: dict[str, np.ndarray]) -> list[int]:
+        """Note what a step did; returns the streams whose chains are over."""
+        over = []
+        diverged, grasped = info.get("diverged"), info.get("is_grasped")
+        for i, run in sorted(self._runs.items()):
+            # A simulation that broke down proves nothing, whatever it shows.
+            broke_down = diverged is not None and bool(diverged[i])
+            run.record(bool(info["is_success"][i]) and not broke_down, grasped is None or bool(grasped[i]))
+            self._keep_state(i, run)
+            window_over = run.elapsed >= self.rules.window
+            if self.rules.stops:
+                is_over = broke_down or (window_over and not run.success[-1]) or (run.is_last and run.success[-1])
+            else:
+                is_over = run.is_last and window_over
+            if is_over:
+                over.append(i)
+        return over
+
+
+def _take(batch: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
+    return {name: _take(value, rows) if isinstance(value, dict) else value[rows] for name, value in batch.items()}
+
+
+def _scatter(into: dict[str, Any], rows: np.ndarray, batch: dict[str, Any]) -> None:
+    for name, value in batch.items():
+        if isinstance(value, dict):
+            _scatter(into[name], rows, value)
         else:
-            ids, observation = self._everyone, env.observe_running(running)
-        uniform = np.zeros((len(ids), len(ACTION_NAMES)), np.float32)
-        for row, i in enumerate(ids):
-            if not env.done[i]:
-                run = self._runs[int(i)]
-                uniform[row] = run.noise[run.steps]
-        instructions = env.instructions
-        actions = np.zeros((env.num_envs, len(ACTION_NAMES)))
-        actions[ids] = self.actor.act(observation, [instructions[i] for i in ids], uniform, ids)
-        return actions
-
-    def _record(self, step: ChainStep, running: np.ndarray) -> Iterable[int]:
-        """Note what a step did; returns the indices of the chains that ended."""
-        ended = []
-        for i in map(int, running):
-            run = self._runs[i]
-            run.record(int(step.position[i]), bool(step.task_success[i]), bool(step.is_grasped[i]))
-            self._keep_state(i)
-            if step.switched[i]:
-                self._begin_task(i)
-            if self.env.done[i]:
-                self._results[run.index] = self._runs.pop(i).result(int(self.env.chain_length[i]))
-                ended.append(run.index)
-        return ended
+            into[name][rows] = value

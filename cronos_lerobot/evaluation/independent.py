@@ -1,29 +1,28 @@
-"""The independent suite of a policy that is at hand: what `cronos-train` asks every now and then.
+"""The independent suite of a policy that is at hand: the periodic evaluation of `cronos-train`.
 
-The same chains, random numbers and actors as `cronos-eval`'s.
+Its chains, random numbers and actors are those of `cronos-eval`.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from lerobot.utils.random_utils import get_rng_state, set_rng_state
-from lerobot_env_cronos import SequentialVectorEnv
+import torch
+from lerobot.utils.random_utils import get_rng_state, serialize_rng_state, set_rng_state
 
 from cronos_lerobot.agents.base import samples
 from cronos_lerobot.agents.processing import PolicyProcessors
-from cronos_lerobot.evaluation.actors import NOT_REPEATED, make_actor
+from cronos_lerobot.evaluation.actors import make_actor
 from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
-from cronos_lerobot.evaluation.plan import make_parts
-from cronos_lerobot.evaluation.results import Record, independent_results
-from cronos_lerobot.evaluation.store import chain_records
+from cronos_lerobot.evaluation.results import Episode, describe_episodes, independent_results
+from cronos_lerobot.evaluation.suites import INDEPENDENT, make_chains, sampling_seed
 from cronos_lerobot.processes import Processes
 
 
 def run_independent(
-    env: SequentialVectorEnv,
+    env: Any,
     policy: Any,
     processors: PolicyProcessors,
     *,
@@ -34,86 +33,83 @@ def run_independent(
     processes: Processes | None = None,
     keeps_states: bool = False,
 ) -> tuple[list[ChainResult], bool]:
-    """Run every task of the environments' benchmark with a policy, and leave everything else as it was.
+    """Run every task of the environment's benchmark with a policy, and leave everything else as it was.
 
-    An episode's random numbers are those of the episode and the step. If the policy takes them (`uniform`, see
-    `TrainablePolicy`), its episodes do not depend on the number of environments and processes. One that draws from
-    a generator gives the same result at the same number of both.
+    If the policy takes `uniform` (see `TrainablePolicy`), its episodes do not depend on the number of environments
+    and processes. A policy that draws from a generator gives the same result with the same number of both.
 
     Args:
-        env: environments of the evaluation's own, never those of a training stream.
-        policy: a LeRobot policy on its device, or what acts in its place by `sample_actions`.
+        env: environments of the evaluation's own, never those of a training.
+        policy: a LeRobot policy on its device, or what acts instead of it by `sample_actions`.
         processors: between `env` and `policy`.
-        n_episodes: configurations of every task, the first ones.
+        n_episodes: the first N configurations of every task.
         split: `train` or `held_out`.
         temperature: of the sampling, 0 for the likeliest action.
         seed: of the sampling.
-        processes: that share out the episodes; all call this and get the whole result.
+        processes: that share the episodes; all of them call this and get the whole result.
         keeps_states: return the trajectories, too.
 
     Returns:
-        The episodes, task by task, and whether any randomness was drawn for them: if not, another seed would give
-        the same ones.
+        The episodes, task by task, and whether any randomness was drawn: otherwise all seeds give the same ones.
     """
     processes = processes or Processes()
-    (part,) = make_parts(env.benchmark, ["independent"], [split], n_episodes, 0)
-    env.split = split
-    # What acts in a policy's place may have no modes.
+    chains = make_chains(env.benchmark, INDEPENDENT, split, n_episodes)
+    # What acts instead of a policy may have no modes.
     was_training, rng_state = getattr(policy, "training", None), get_rng_state()
     try:
         actor = make_actor(policy, processors, temperature)
         actor.seed(processes.own_seed(seed))
-        own = part.chains[processes.rank :: processes.count]
-        results = ChainRunner(env, actor, keeps_states=keeps_states).run(own, part.noise(seed))
-        # Before the global generators are set back.
-        drew = actor.drew
+        seeded = serialize_rng_state()
+        own = chains[processes.rank :: processes.count]
+        runner = ChainRunner(env, actor, keeps_states=keeps_states)
+        results = runner.run(own, split, sampling_seed(seed, INDEPENDENT, split)) if own else []
+        drawn = serialize_rng_state()
+        drew = bool(actor.temperature) or any(not torch.equal(drawn[name], seeded[name]) for name in seeded)
     finally:
         if was_training is not None:
             policy.train(was_training)
         set_rng_state(rng_state)
     gathered = processes.gather((results, drew))
     by_chain = {result.chain: result for some, _ in gathered for result in some}
-    return [by_chain[chain] for chain in part.chains], any(has_drawn for _, has_drawn in gathered)
+    return [by_chain[chain] for chain in chains], any(has_drawn for _, has_drawn in gathered)
 
 
-def episode_lists(by_seed: Mapping[int, Sequence[Record]]) -> list[list[int]]:
-    """Every episode in short, for comparisons in pairs: [seed, task, configuration, success]."""
-    return [
-        [seed, record["number"], record["configuration"], record["length"]]
-        for seed, records in by_seed.items()
-        for record in records
-    ]
+def episode_lists(episodes: Sequence[Episode]) -> list[list[int]]:
+    """Every episode in short, for paired comparisons: [seed, task, configuration, success]."""
+    return [[e["seed"], e["number"], e["configuration"], e["length"]] for e in episodes]
 
 
 def evaluate_independent(
-    env: SequentialVectorEnv, policy: Any, *args: Any, seed: int, repetitions: int = 1, **options: Any
+    env: Any, policy: Any, *args: Any, seed: int, repetitions: int = 1, **options: Any
 ) -> dict[str, Any]:
     """The episodes of `run_independent` in numbers.
 
-    Of a policy that draws nothing, as ACT, an episode is not repeated: it would be the same one.
+    A policy that draws nothing, such as ACT, is not repeated: its interval would be too narrow.
 
     Args:
         env: as there, and so are the others.
         policy: as there.
         args: as there.
-        seed: of the sampling; a repetition has the next one.
+        seed: of the sampling; each repetition has the next one.
         repetitions: episodes of each task and configuration.
         options: as there.
 
     Returns:
-        `split`, `temperature` (None of a policy that has none), `steps` (control steps of all episodes),
-        `episodes` (see `episode_lists`) and `independent_results`.
+        `split`, `temperature` (None for a policy without), `steps` (control steps of all episodes), `episodes`
+        (see `episode_lists`) and `independent_results`.
     """
-    by_seed = {}
+    episodes = []
     for s in range(seed, seed + repetitions):
         results, drew = run_independent(env, policy, *args, seed=s, **options)
-        by_seed[s] = chain_records(results)
+        episodes += describe_episodes(results, s)
         if not drew and repetitions > 1:
-            logging.warning(NOT_REPEATED, repetitions)
+            logging.warning("--eval.repetitions: the policy draws nothing, so every episode is run once.")
             break
-    records = [record for some in by_seed.values() for record in some]
-    groups = env.benchmark.groups("independent", options["split"])
-    temperature = options["temperature"] if samples(policy) else None
-    header = {"split": options["split"], "temperature": temperature}
-    header |= {"steps": sum(record["steps"] for record in records), "episodes": episode_lists(by_seed)}
-    return header | independent_results(records, [group.tasks[0] for group in groups])
+    groups = env.benchmark.groups(INDEPENDENT, options["split"])
+    header = {
+        "split": options["split"],
+        "temperature": options["temperature"] if samples(policy) else None,
+        "steps": sum(episode["steps"] for episode in episodes),
+        "episodes": episode_lists(episodes),
+    }
+    return header | independent_results(episodes, [group.tasks[0] for group in groups])

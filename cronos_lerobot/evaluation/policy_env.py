@@ -14,7 +14,14 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.datasets import CODEBASE_VERSION
 from lerobot.datasets.utils import INFO_PATH
-from lerobot.utils.constants import HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import (
+    ACTION,
+    HF_LEROBOT_HOME,
+    HF_LEROBOT_HUB_CACHE,
+    OBS_ENV_STATE,
+    OBS_IMAGES,
+    OBS_STATE,
+)
 from lerobot_env_cronos import CronosEnvConfig
 from lerobot_env_cronos.scene.model import CAMERAS
 from lerobot_env_cronos.scene.scenes import SCENES, get_scene
@@ -23,7 +30,28 @@ from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS
 from cronos_lerobot.agents.processing import EMPTY_CAMERA
 from cronos_lerobot.data.origin import Origin, read_origin
 
+WITHOUT_LANGUAGE = ("act", "diffusion", "gaussian_actor", "tdmpc", "vqbet")
+"""LeRobot's policies that read no instruction."""
+
 Features = Mapping[str, PolicyFeature]
+
+
+def expected_env(policy: PreTrainedConfig, scene: str | None = None) -> CronosEnvConfig:
+    """Return the environment that a checkpoint expects.
+
+    Args:
+        policy: its config, with its folder as `pretrained_path`.
+        scene: instead of the one of its training.
+
+    Raises:
+        ValueError: no environment of the scene shows what the policy takes.
+    """
+    features, path = policy.input_features or {}, policy.pretrained_path
+    where = {"scene": scene} if scene else trained_scene(path)
+    env = CronosEnvConfig(**trained_observations(features, path), **where)
+    env = replace(env, task_observation=task_observation_of(features, env))
+    check_observations(policy, env)
+    return env
 
 
 def observations_of(features: Features) -> dict[str, Any]:
@@ -33,8 +61,7 @@ def observations_of(features: Features) -> dict[str, Any]:
     if not images:
         return {"obs_type": "environment_state_agent_pos"} if takes_state else {}
     derived: dict[str, Any] = {"obs_type": "pixels_agent_pos", "privileged_state": takes_state}
-    cameras = [name for name in CAMERAS if f"{OBS_IMAGES}.{name}" in images]
-    if cameras:
+    if cameras := [name for name in CAMERAS if f"{OBS_IMAGES}.{name}" in images]:
         derived["camera_name"] = ",".join(cameras)
     # LeRobot passes images of another size on without a word.
     _, height, width = next(iter(images.values())).shape
@@ -44,31 +71,37 @@ def observations_of(features: Features) -> dict[str, Any]:
 def reads_privileged_state(config: PreTrainedConfig) -> bool:
     """Whether a policy acts on the bodies' poses beside its pictures, which no robot has.
 
-    LeRobot makes an input of all that a dataset has. A policy with a critic of its own on them, PocketVLA, has
-    them among its inputs for that alone.
+    LeRobot makes an input of all that a dataset has. A policy whose critic reads the poses, such as PocketVLA, has
+    them among its inputs for the critic alone.
     """
     inputs = config.input_features or {}
     has_pictures = any(feature.type is FeatureType.VISUAL for feature in inputs.values())
     return has_pictures and OBS_ENV_STATE in inputs and not hasattr(config, "critic_observation")
 
 
-def warn_of_privileged_state(config: PreTrainedConfig) -> None:
-    """Log that a policy reads what no robot has, if it does."""
+def warn_of_inputs(config: PreTrainedConfig, env: CronosEnvConfig) -> None:
+    """Log if a policy cannot know its task, or reads what no robot has."""
+    num_tasks = len(get_scene(env.scene).tasks)
+    if config.type in WITHOUT_LANGUAGE and env.task_observation == "none" and num_tasks > 1:
+        logging.warning(
+            f"--policy.type={config.type} reads no instructions and is not told its task "
+            f"(--env.task_observation=one_hot): it cannot tell the {num_tasks} tasks apart."
+        )
     if reads_privileged_state(config):
         logging.warning(
-            "The policy reads %s beside its pictures, the poses of all bodies, which no robot has: it was cloned "
+            "The policy reads %s beside its pictures, the poses of all bodies. No robot has them: it was cloned "
             "from a dataset that shows them (--env.privileged_state=true).",
             OBS_ENV_STATE,
         )
 
 
 def trained_scene(path: Path | None) -> dict[str, str]:
-    """The scene that a checkpoint was trained in: by `cronos-train`, or by LeRobot on a dataset of a scene.
+    """The scene that a checkpoint was trained in, by `cronos-train` or by LeRobot on a dataset of a scene.
 
     Empty if it does not say, or if its dataset is not on this machine.
 
     Raises:
-        ValueError: its config is damaged, or `cronos-train` had a scene that is not registered here.
+        ValueError: its config is damaged, or its scene is not registered here.
     """
     config = _train_config(path)
     env = config.get("env") or {}
@@ -78,9 +111,8 @@ def trained_scene(path: Path | None) -> dict[str, str]:
             get_scene(scene)
         except ValueError as error:
             raise ValueError(f"the policy in {path} was trained in a scene that is not here: {error}") from error
-    dataset = config.get("dataset") or {}
-    if scene is None and isinstance(repo_id := dataset.get("repo_id"), str):
-        scene = scene_of_dataset(repo_id, dataset.get("root"), dataset.get("revision"))
+    if scene is None and (origin := _origin_of_training(config)):
+        scene = origin.scene
     return {"scene": scene} if scene in SCENES else {}
 
 
@@ -93,25 +125,29 @@ def trained_renderer(path: Path | None) -> dict[str, str]:
         ValueError: its config is damaged.
     """
     config = _train_config(path)
-    env, dataset = config.get("env") or {}, config.get("dataset") or {}
+    env = config.get("env") or {}
     renderer = env.get("renderer") if env.get("type", "cronos") == "cronos" else None
-    if isinstance(repo_id := dataset.get("repo_id"), str):
+    if origin := _origin_of_training(config):
         # The environment beside it is that of LeRobot's evaluations alone.
-        origin = _origin_of_dataset(repo_id, dataset.get("root"), dataset.get("revision"))
-        renderer = (origin.flags if origin else {}).get("env.renderer", renderer)
+        renderer = origin.flags.get("env.renderer", renderer)
     return {"renderer": renderer} if renderer else {}
 
 
 def trained_observations(features: Features, path: Path | None) -> dict[str, Any]:
-    """`observations_of`, and of a policy that takes pictures the renderer of those that it learned from."""
+    """`observations_of`, and for a policy that takes pictures the renderer of those that it learned from."""
     observations = observations_of(features)
-    # Of one that takes none it would draw the videos alone.
     return observations | (trained_renderer(path) if "observation_height" in observations else {})
 
 
 def _train_config(path: Path | None) -> dict[str, Any]:
     file = Path(path or "") / TRAIN_CONFIG_NAME
     return json.loads(file.read_text()) if file.is_file() else {}
+
+
+def _origin_of_training(config: Mapping[str, Any]) -> Origin | None:
+    dataset = config.get("dataset") or {}
+    repo_id = dataset.get("repo_id")
+    return _origin_of(repo_id, dataset.get("root"), dataset.get("revision")) if isinstance(repo_id, str) else None
 
 
 def scene_of_dataset(repo_id: str, root: Path | str | None, revision: str | None = None) -> str | None:
@@ -122,11 +158,11 @@ def scene_of_dataset(repo_id: str, root: Path | str | None, revision: str | None
         root: its folder; None looks where LeRobot keeps its datasets, then among those that it has downloaded.
         revision: of a downloaded one; None is that of LeRobot's format.
     """
-    origin = _origin_of_dataset(repo_id, root, revision)
+    origin = _origin_of(repo_id, root, revision)
     return origin.scene if origin else None
 
 
-def _origin_of_dataset(repo_id: str, root: Path | str | None, revision: str | None = None) -> Origin | None:
+def _origin_of(repo_id: str, root: Path | str | None, revision: str | None) -> Origin | None:
     try:
         folder = Path(root) if root else _find_dataset(repo_id, revision)
         features = json.loads((folder / INFO_PATH).read_text())["features"]
@@ -147,32 +183,47 @@ def _find_dataset(repo_id: str, revision: str | None) -> Path:
     return Path(info).parents[1] if isinstance(info, str) else folder
 
 
-def check_observations(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
-    """Check that an environment shows a policy what it takes, of the size that it takes.
+def check_observations(
+    policy: PreTrainedConfig, env: CronosEnvConfig, rename_map: Mapping[str, str] | None = None
+) -> None:
+    """Check that an environment shows a policy what it takes, and takes its actions, of the right sizes.
 
-    Images may have another size: what does not scale them was trained with those that it gets.
+    Images may have another size: a policy that does not scale them was trained with those that it gets.
+
+    Args:
+        policy: its config.
+        env: of the environment.
+        rename_map: the policy's names of observations, by the environment's.
 
     Raises:
-        ValueError: it does not; the sentence has the flag that would.
+        ValueError: it does not; names the flag that would.
     """
     check_task_observation(policy, env)
-    given = {env.features_map[name]: feature for name, feature in env.features.items()}
-    for name, taken in (policy.input_features or {}).items():
+    names = {key: name for key, name in env.features_map.items() if key in env.features}
+    given = {(rename_map or {}).get(name, name): env.features[key] for key, name in names.items()}
+    for name, taken in ((policy.input_features or {}) | (policy.output_features or {})).items():
         feature = given.get(name)
         if feature is None and name.startswith(EMPTY_CAMERA):
             continue
         if feature is None:
             flags = {OBS_ENV_STATE: "--env.obs_type=environment_state_agent_pos"}
             flag = flags.get(name, "--env.obs_type=pixels_agent_pos with --env.camera_name=<its cameras>")
-            raise ValueError(f"the policy takes {name}, which the environment does not give: {flag} does")
+            raise ValueError(
+                f"the policy takes {name}, which the environment does not give: {flag} does, or --rename_map"
+            )
         if taken.type is FeatureType.VISUAL or tuple(taken.shape) == tuple(feature.shape):
             continue
-        sizes = {scene: _state_size(name, scene, env, env.task_observation) for scene in SCENES}
-        fitting = [f"--env.scene={scene}" for scene, size in sizes.items() if (size,) == tuple(taken.shape)]
+        fitting = [f"--env.scene={scene}" for scene in SCENES if _fits(name, taken, scene, env)]
+        why = "in another scene; " + " or ".join(fitting) + " fits" if fitting else "with other options"
         raise ValueError(
-            f"the policy takes {name} of {taken.shape[0]} numbers, {env.scene} gives {feature.shape[0]}: it was "
-            f"trained {'in another scene; ' + ' or '.join(fitting) + ' fits' if fitting else 'with other options'}"
+            f"the policy was made for {name} of {taken.shape[0]} numbers, {env.scene} has {feature.shape[0]}: "
+            f"it was trained {why}"
         )
+
+
+def _fits(name: str, taken: PolicyFeature, scene: str, env: CronosEnvConfig) -> bool:
+    """Whether a vector observation has the size in another scene that a policy takes."""
+    return name != ACTION and (_state_size(name, scene, env, env.task_observation),) == tuple(taken.shape)
 
 
 def task_observation_of(features: Features, env: CronosEnvConfig) -> str:
@@ -191,14 +242,13 @@ def check_task_observation(policy: PreTrainedConfig, env: CronosEnvConfig) -> No
     """Check that a policy is told its task in the state if it was so in training, and only then.
 
     Raises:
-        ValueError: it is not so; the sentence has the flag.
+        ValueError: it is not so; names the flag.
     """
     told = task_observation_of(policy.input_features or {}, env)
     if told != env.task_observation:
         raise ValueError(
             f"the policy takes {OBS_STATE} of {_state_size(OBS_STATE, env.scene, env, told)} numbers, as with "
-            f"--env.task_observation={told}: give it here, too; the environment has "
-            f"--env.task_observation={env.task_observation}"
+            f"--env.task_observation={told}; the environment has --env.task_observation={env.task_observation}"
         )
 
 

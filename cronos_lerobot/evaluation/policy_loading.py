@@ -18,7 +18,7 @@ from cronos_lerobot.evaluation.policy_source import find_base
 def load_policy(config: PreTrainedConfig, env: CronosEnvConfig, rename_map: dict[str, str] | None = None) -> Any:
     """Return the policy of a config on its device, from scratch if the config has no `pretrained_path`.
 
-    What PEFT's adapters go onto may be named from where a training ran: it is looked for above them, too.
+    PEFT's adapters may name the policy below them as seen from where they were trained (see `find_base`).
 
     Args:
         config: the policy's; LeRobot fills its features in.
@@ -26,27 +26,27 @@ def load_policy(config: PreTrainedConfig, env: CronosEnvConfig, rename_map: dict
         rename_map: observations to rename for the policy.
 
     Raises:
-        ValueError: adapters name a policy that is neither a folder nor of the Hub.
+        ValueError: adapters name a policy that is neither a folder nor on the Hub.
     """
     folder = Path(str(config.pretrained_path or ""))
     name, base = find_base(folder) if config.use_peft and config.pretrained_path else (None, None)
-    if name is None or (base is not None and Path(name).is_dir() and base.samefile(name)):
-        return make_policy(config, env_cfg=env, rename_map=rename_map)
     if base is not None:
         return _with_adapters(config, base, env, rename_map)
     try:
         return make_policy(config, env_cfg=env, rename_map=rename_map)
     except (OSError, HTTPError, HFValidationError) as error:
+        if name is None:
+            raise
         raise ValueError(
-            f"the adapters in {folder} go onto {name}, which is no folder, seen from here or from above them, and "
-            f"the Hub did not give it: {error}"
+            f"the adapters in {folder} go onto {name}, which is no folder here or in a folder above them, and the "
+            f"Hub did not give it: {error}"
         ) from error
 
 
 def _with_adapters(
     config: PreTrainedConfig, base: Path, env: CronosEnvConfig, rename_map: dict[str, str] | None
 ) -> Any:
-    """What `make_policy` does of adapters, with the policy in `base` below them."""
+    """What `make_policy` does for adapters, with the policy in `base` below them."""
     from peft import PeftConfig, PeftModel
 
     logging.info(f"The adapters in {config.pretrained_path} go onto the policy in {base}.")

@@ -28,12 +28,12 @@ FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 PUSHED = ("push_to_hub", "repo_id", "private", "tags", "license")
 """Fields of a policy's config that say where it is pushed to, and how."""
 PINNED = "pretrained_revision"
-"""Field of a policy's config that says which commit of the Hub's it is."""
+"""Field of a policy's config with its commit on the Hub."""
 UNDECISIVE = ("pretrained_path", PINNED, *PUSHED)
-"""Fields of a policy's config that say where it is and not what it does."""
+"""Fields of a policy's config that say where it is, not what it does."""
 
 ADAPTER_CONFIG, BASE, REVISION = "adapter_config.json", "base_model_name_or_path", "revision"
-"""PEFT's file beside adapters, and what it says of the policy that they go onto."""
+"""PEFT's file beside adapters, and its fields about the policy that they go onto."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,10 @@ class PolicySource:
     """A checkpoint as it was when it was looked up."""
 
     name: str
-    """As it was given: a folder, or `<owner>/<repository>[@<revision>]` on the Hub; of a run's last checkpoint the
-    one that it was then."""
+    """As it was given: a folder, or `<owner>/<repository>[@<revision>]` on the Hub. A run's last checkpoint has
+    the name that it had then."""
     folder: Path
-    """Its files; of the Hub's, those of one commit in the cache."""
+    """Its files; those of the Hub in the cache, all of one commit."""
     revision: str | None = None
     """The Hub's commit."""
 
@@ -58,8 +58,8 @@ def find_policy(name: str) -> PolicySource:
     """
     folder = Path(name)
     if folder.is_dir():
-        if not (folder / "config.json").is_file():
-            raise ValueError(f"{name} is no checkpoint of a policy: it has no config.json")
+        if not (folder / CONFIG_NAME).is_file():
+            raise ValueError(f"{name} is no checkpoint of a policy: it has no {CONFIG_NAME}")
         followed = follow_last(folder)
         return PolicySource(name if followed == folder else str(followed), followed)
     repository, _, revision = name.partition("@")
@@ -127,12 +127,9 @@ def load_policy_config(path: str, overrides: list[str], revision: str | None = N
     Raises:
         ValueError: there is no such folder or repository, or what it has is damaged.
     """
-    folder = Path(path)
-    if folder.is_dir() and not (folder / CONFIG_NAME).is_file():
-        raise ValueError(f"--policy.path={path} has no {CONFIG_NAME}: give a checkpoint's pretrained_model.")
-    said = io.StringIO()
+    folder, said = Path(path), io.StringIO()
     try:
-        # What argparse says of a flag that the policy does not have is its whole usage.
+        # argparse prints its whole usage for a flag that the policy does not have.
         with redirect_stderr(said):
             config = PreTrainedConfig.from_pretrained(path, revision=revision, cli_overrides=overrides)
     except SystemExit as error:
@@ -155,26 +152,19 @@ def load_policy_config(path: str, overrides: list[str], revision: str | None = N
 def fingerprint(policy: PreTrainedConfig) -> str:
     """A short hash of all that decides a policy's actions: its config, its weights and its processors.
 
-    Weights that the config names (`checkpoint`, `adapter`) count too: by their files, or the Hub's commit. It
-    is the same on every device.
+    Weights that the config names (`checkpoint`, `adapter`) count too: by their files, or the Hub's commit. It is
+    the same on every device.
     """
-    config = {name: value for name, value in draccus.encode(policy).items() if name not in UNDECISIVE}
-    if "device" in config:
-        # Policies have been hashed with it, nearly all on the CPU.
-        config["device"] = "cpu"
-    digest = hashlib.sha256(json.dumps(config, sort_keys=True, default=str).encode())
+    config = {name: value for name, value in draccus.encode(policy).items() if name not in (*UNDECISIVE, "device")}
     folder = Path(policy.pretrained_path or "")
-    for content in (*_weights_and_processors(folder), *_base_of_adapters(folder)):
-        digest.update(content)
-    for field in ("checkpoint", "adapter"):
-        if name := getattr(policy, field, None):
-            # As OpenVLA finds it: from here, or from where the training ran.
-            places = (Path(name), *(parent / name for parent in folder.absolute().parents))
-            files = next((sorted(place.glob("*.safetensors")) for place in places if place.is_dir()), [])
-            revision = getattr(policy, f"{field}_revision", None)
-            for content in [_hash(file) for file in files] or [_commit(name, revision).encode()]:
-                digest.update(content)
-    return digest.hexdigest()[:16]
+    named = [
+        content
+        for field in ("checkpoint", "adapter")
+        if (name := getattr(policy, field, None))
+        for content in _named_weights(name, folder, getattr(policy, f"{field}_revision", None))
+    ]
+    flags = json.dumps(config, sort_keys=True, default=str).encode()
+    return _digest(flags, *_files(folder, with_base=True), *named)
 
 
 def files_fingerprint(folder: Path, *, with_base: bool = True) -> str:
@@ -182,44 +172,51 @@ def files_fingerprint(folder: Path, *, with_base: bool = True) -> str:
 
     Args:
         folder: the checkpoint.
-        with_base: of PEFT's adapters with the policy that they go onto, which is called otherwise where they are
-            published.
+        with_base: include the policy that PEFT's adapters go onto, which has another name once published.
     """
+    return _digest(*_files(folder, with_base))
+
+
+def _digest(*contents: bytes) -> str:
     digest = hashlib.sha256()
-    for content in (*_weights_and_processors(folder), *(_base_of_adapters(folder) if with_base else ())):
+    for content in contents:
         digest.update(content)
     return digest.hexdigest()[:16]
 
 
-def _weights_and_processors(folder: Path) -> Iterator[bytes]:
-    """Not config.json, of which flags may have another mind, nor train_config.json, which says how it was made."""
+def _files(folder: Path, with_base: bool) -> Iterator[bytes]:
+    """Weights and processors; not config.json, which flags may change, nor how it was made (train_config.json)."""
     for pattern in ("*.safetensors", "policy_*.json"):
-        for file in sorted(folder.glob(pattern)):
-            yield file.name.encode() + _hash(file)
+        yield from (file.name.encode() + _hash(file) for file in sorted(folder.glob(pattern)))
     if adapters := _adapter_config(folder):
         settings = {name: value for name, value in adapters.items() if name not in (BASE, REVISION)}
         yield json.dumps(settings, sort_keys=True).encode()
+    name, base = find_base(folder)
+    if with_base and base is not None:
+        yield from (file.name.encode() + _hash(file) for file in sorted(base.glob("*.safetensors")))
+    elif with_base and name is not None:
+        yield f"{name} {adapters.get(REVISION)}".encode()
 
 
 def find_base(folder: Path) -> tuple[str | None, Path | None]:
-    """Of PEFT's adapters in `folder` the policy that they go onto: as they name it, and its folder if it has one.
+    """The policy that PEFT's adapters in `folder` go onto: as they name it, and its folder if it has one.
 
-    The folder may have been named from where the training ran, such as outputs/clone. None, None without adapters.
+    The name may be relative to where the training ran, such as outputs/clone. None, None without adapters.
     """
     name = _adapter_config(folder).get(BASE)
-    if not name:
-        return None, None
+    return (name, _find_weights(name, folder)) if name else (None, None)
+
+
+def _find_weights(name: str, folder: Path) -> Path | None:
+    """The folder with weights that a checkpoint names, seen from the folders above it or from here."""
     places = (*(parent / name for parent in folder.absolute().parents), Path(name))
-    return name, next((place for place in places if any(place.glob("*.safetensors"))), None)
+    return next((place for place in places if any(place.glob("*.safetensors"))), None)
 
 
-def _base_of_adapters(folder: Path) -> Iterator[bytes]:
-    """Of PEFT's adapters the policy that they go onto: its weights in a folder, its name on the Hub."""
-    name, base = find_base(folder)
-    if base is not None:
-        yield from (file.name.encode() + _hash(file) for file in sorted(base.glob("*.safetensors")))
-    elif name is not None:
-        yield f"{name} {_adapter_config(folder).get(REVISION)}".encode()
+def _named_weights(name: str, folder: Path, revision: str | None) -> list[bytes]:
+    if place := _find_weights(name, folder):
+        return [_hash(file) for file in sorted(place.glob("*.safetensors"))]
+    return [_commit(name, revision).encode()]
 
 
 def _adapter_config(folder: Path) -> dict[str, Any]:

@@ -1,169 +1,252 @@
-"""Numbers of an evaluation, from the outcomes of its chains."""
+"""results.json of a suite and split: its numbers from the outcomes of its chains, and how it is found and read."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lerobot_env_cronos import check_environment_id
+from lerobot_env_cronos.benchmark.configurations import SPLITS
 from lerobot_env_cronos.benchmark.orderings import Ordering, is_training_cycle
 from lerobot_env_cronos.scene.scenes import Scene, Task
-from rich.table import Table
 
-from cronos_lerobot.evaluation.rates import SuccessRate, cluster_interval, effective_trials
+from cronos_lerobot.evaluation.chains import ChainResult
+from cronos_lerobot.evaluation.suites import STREAM, SUITES, Start
+from cronos_lerobot.statistics import cluster_interval, effective_trials
+from cronos_lerobot.whole_files import written_whole
 
-Record = dict[str, Any]
-"""Outcome of a chain, see `store.chain_records`."""
+RESULTS = "results.json"
+VIDEOS = "videos"
+"""Folder beside it."""
+FORMAT = 3
+"""Version of results.json."""
+MAX_BYTES = 50_000_000
+"""Of a results.json that is read; a full evaluation has 200 kB."""
+REQUIRED = {"policy": str, "policy_fingerprint": str, "scene": str, "benchmark": dict, "episodes": list, "n": int}
+"""Fields of every results.json, with their types."""
+
+Episode = Mapping[str, Any]
+"""Outcome of a chain: `number` (task, ordering, or first task of the stream), `configuration`, `seed` (of the
+action sampling), `length` (tasks completed), `steps`, `found_complete` and `never_grasped` (positions, see
+`ChainResult`). Of a stream also `success` and `starts` (by segment)."""
 
 
-def independent_results(records: Sequence[Record], tasks: Sequence[Task]) -> dict[str, Any]:
-    """Success of all tasks together and of each, with n and a 95 % Wilson interval."""
-    by_task = {
-        task.instruction: SuccessRate.of(r for r in records if r["number"] == i) for i, task in enumerate(tasks)
+def folder_name(suite: str, split: str) -> str:
+    """Where a suite and split lies in the output folder."""
+    return f"{suite}_{split}"
+
+
+FOLDERS = tuple(folder_name(suite, split) for suite in SUITES for split in SPLITS)
+
+
+def result_files(output_dir: Path) -> list[Path]:
+    """Where `cronos-eval` writes the results of each suite and split."""
+    return [output_dir / name / RESULTS for name in FOLDERS]
+
+
+def find_results(folder: Path) -> list[Path]:
+    """Return every results.json of `cronos-eval` in a folder or anywhere below it."""
+    files = [file for file in folder.rglob(RESULTS) if file.parent.absolute().name in FOLDERS]
+    return sorted(files, key=lambda file: (file.parent.parent, FOLDERS.index(file.parent.absolute().name)))
+
+
+def read_evaluation(path: Path) -> list[dict[str, Any]]:
+    """Read a results.json, or all of them in an output folder of `cronos-eval`; see `read_results`.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    files = [path] if path.is_file() else find_results(path)
+    if not files:
+        raise FileNotFoundError(f"no {RESULTS} of cronos-eval at {path}")
+    return [read_results(file) for file in files]
+
+
+def find_videos(results: Path) -> list[Path]:
+    """Return the videos beside a results.json. Paths inside the file are never followed."""
+    return sorted(path for path in (results.parent / VIDEOS).glob("*.mp4") if not path.is_symlink())
+
+
+def read_results(file: Path) -> dict[str, Any]:
+    """Read a results.json, also one of a stranger.
+
+    Raises:
+        FileNotFoundError: it is not there.
+        ValueError: it is too large, damaged, something else, or of another version of the environments.
+    """
+    if not file.is_file():
+        raise FileNotFoundError(f"no {RESULTS} of cronos-eval at {file}")
+    if file.stat().st_size > MAX_BYTES:
+        raise ValueError(f"{file} has more than {MAX_BYTES // 10**6} MB")
+    try:
+        results = json.loads(file.read_text())
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{file} is damaged: {error}") from error
+    if not isinstance(results, dict) or results.get("suite") not in SUITES or results.get("split") not in SPLITS:
+        raise ValueError(f"{file} is no {RESULTS} of cronos-eval")
+    check_environment_id(results.get("environment"), str(file), "evaluate again with another --output_dir")
+    if results.get("format") != FORMAT:
+        raise ValueError(f"{file} has another format than {FORMAT}: evaluate again with another --output_dir")
+    if wrong := [name for name, kind in REQUIRED.items() if not isinstance(results.get(name), kind)]:
+        raise ValueError(f"{file} is damaged: {', '.join(wrong)}")
+    return results
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write a file as a whole or not at all."""
+    with written_whole(path) as file:
+        file.write(json.dumps(content, indent=1) + "\n")
+
+
+def describe_episodes(results: Sequence[ChainResult], seed: int) -> list[dict[str, Any]]:
+    """Outcomes as JSON values, see `Episode`."""
+    episodes = []
+    for r in results:
+        episode: dict[str, Any] = {"number": r.chain.number, "configuration": r.chain.configuration, "seed": seed}
+        episode |= {"length": r.length, "steps": r.steps}
+        episode |= {"found_complete": list(r.found_complete), "never_grasped": list(r.never_grasped)}
+        if r.starts:
+            episode |= {"success": list(r.success), "starts": list(r.starts)}
+        episodes.append(episode)
+    return episodes
+
+
+def success_rate(episodes: Sequence[Episode], position: int = 0) -> dict[str, Any]:
+    """Success of the tasks at a position of some chains, with its interval.
+
+    Every chain counts: a task after a failed one is a failure. Chains of one configuration are correlated, so the
+    interval is clustered by configuration.
+
+    Returns:
+        `success`, `n`, `ci95`, `effective_n`, and the counts `found_complete` and `never_grasped`.
+    """
+    success = np.array([e["length"] > position for e in episodes])
+    return _rate(success, np.array([e["configuration"] for e in episodes])) | {
+        name: sum(position in e[name] for e in episodes) for name in ("found_complete", "never_grasped")
     }
-    overall = SuccessRate.of(records)
-    return overall.to_dict() | {"per_task": {text: rate.to_dict() for text, rate in by_task.items()}}
 
 
-def sequential_results(records: Sequence[Record], orderings: Sequence[Ordering], scene: Scene) -> dict[str, Any]:
+def _rate(success: np.ndarray, configurations: np.ndarray) -> dict[str, Any]:
+    """Rate, n and interval of successes (n,) bool, clustered by configuration (n,)."""
+    interval = list(cluster_interval(success, configurations))
+    rate = {"success": float(success.mean()), "n": len(success), "ci95": interval}
+    return rate | {"effective_n": effective_trials(success, configurations)}
+
+
+def independent_results(episodes: Sequence[Episode], tasks: Sequence[Task]) -> dict[str, Any]:
+    """Success of all tasks together, and `per_task` by instruction."""
+    by_task = {task.instruction: [e for e in episodes if e["number"] == i] for i, task in enumerate(tasks)}
+    return success_rate(episodes) | {"per_task": {text: success_rate(some) for text, some in by_task.items()}}
+
+
+def sequential_results(episodes: Sequence[Episode], orderings: Sequence[Ordering], scene: Scene) -> dict[str, Any]:
     """Success by position and the average chain length: of all orderings, and apart for those seen in training.
 
     Args:
-        records: of the chains of whole orderings.
-        orderings: of the scene; those without a record are left out.
-        scene: in whose training cycle streams run its tasks without end; an ordering is `seen` if it is a piece of
-            that (`is_training_cycle`).
+        episodes: of the chains of whole orderings.
+        orderings: of the scene; those without an episode are left out.
+        scene: an ordering is `seen` if it is a piece of the scene's training cycle (`is_training_cycle`).
     """
-    numbers = sorted({r["number"] for r in records})
+    numbers = sorted({e["number"] for e in episodes})
     seen = [i for i in numbers if is_training_cycle(orderings[i], scene)]
-    unseen = [i for i in numbers if i not in seen]
     num_tasks = len(orderings[0])
     kinds = {
-        name: _summary([r for r in records if r["number"] in some], num_tasks) if some else None
-        for name, some in (("seen", seen), ("unseen", unseen))
+        name: _summary([e for e in episodes if e["number"] in some], num_tasks) if some else None
+        for name, some in (("seen", seen), ("unseen", [i for i in numbers if i not in seen]))
     }
     per_ordering = []
     for i in numbers:
-        lengths = np.array([r["length"] for r in records if r["number"] == i])
-        per_ordering.append(
-            {
-                "ordering": i,
-                "tasks": [task.instruction for task in orderings[i]],
-                "seen": i in seen,
-                "n": len(lengths),
-                "positions": [float((lengths > k).mean()) for k in range(num_tasks)],
-                "average_chain_length": float(lengths.mean()),
-            }
-        )
-    return _summary(records, num_tasks) | kinds | {"per_ordering": per_ordering}
+        lengths = np.array([e["length"] for e in episodes if e["number"] == i])
+        tasks = [task.instruction for task in orderings[i]]
+        row = {"ordering": i, "tasks": tasks, "seen": i in seen, "n": len(lengths)}
+        row |= {"positions": [float((lengths > k).mean()) for k in range(num_tasks)]}
+        per_ordering.append(row | {"average_chain_length": float(lengths.mean())})
+    return _summary(episodes, num_tasks) | kinds | {"per_ordering": per_ordering}
 
 
-def _summary(records: Sequence[Record], num_tasks: int) -> dict[str, Any]:
+def _summary(episodes: Sequence[Episode], num_tasks: int) -> dict[str, Any]:
     """Success at each position and the chain length of some orderings' chains.
 
-    A task counts as a failure where an earlier one of its chain failed, so every position has all chains. The
-    chains of a configuration go together in all orderings, so intervals are by configuration (`cluster_interval`).
-    `std` is the sample standard deviation over the orderings, each of them first averaged over its configurations;
-    null for a single ordering. The interval of the chain length, which is the sum of the positions' rates, is the
-    sum of theirs: positions of one chain go together, and this assumes that they do so completely.
+    `std` is the sample standard deviation over the orderings, each first averaged over its configurations; None
+    for one ordering. The chain length is the sum of the positions' rates. Its interval is the sum of their
+    intervals, as if the positions of a chain were fully correlated.
     """
-    lengths, numbers, configurations = (
-        np.array([r[name] for r in records]) for name in ("length", "number", "configuration")
-    )
+    lengths, numbers = (np.array([e[name] for e in episodes]) for name in ("length", "number"))
     orderings = np.unique(numbers)
-    positions = []
-    for k in range(num_tasks):
-        success = lengths > k
-        spread = _std(np.array([success[numbers == i].mean() for i in orderings]))
-        by_cluster = {
-            "ci95": list(cluster_interval(success, configurations)),
-            "effective_n": effective_trials(success, configurations),
-        }
-        positions.append(SuccessRate.of(records, k).to_dict() | by_cluster | {"std": spread})
+
+    def spread(values: np.ndarray) -> float | None:
+        means = [values[numbers == i].mean() for i in orderings]
+        return float(np.std(means, ddof=1)) if len(means) > 1 else None
+
+    positions = [success_rate(episodes, k) | {"std": spread(lengths > k)} for k in range(num_tasks)]
+    ci95 = np.sum([position["ci95"] for position in positions], axis=0).tolist()
     return {
-        "n": len(records),
+        "n": len(episodes),
         "orderings": len(orderings),
-        "configurations": len(np.unique(configurations)),
+        "configurations": len({e["configuration"] for e in episodes}),
         "positions": positions,
-        "average_chain_length": {
-            "mean": float(lengths.mean()),
-            "std": _std(np.array([lengths[numbers == i].mean() for i in orderings])),
-            "ci95": np.sum([position["ci95"] for position in positions], axis=0).tolist(),
-        },
+        "average_chain_length": {"mean": float(lengths.mean()), "std": spread(lengths), "ci95": ci95},
     }
 
 
-def _std(values: np.ndarray) -> float | None:
-    return float(values.std(ddof=1)) if len(values) > 1 else None
+def stream_results(episodes: Sequence[Episode], cycle: int) -> dict[str, Any]:
+    """Success by segment, by how the segments began, and what streams get stuck on.
+
+    A stream is stuck if the policy completed no task in its last `cycle` segments, in which it was given every
+    task once. Tasks that were found complete do not count. Its cause is how most of these segments began.
+
+    Args:
+        episodes: of streams of one length.
+        cycle: tasks of the scene.
+
+    Returns:
+        `success`, `n` (streams), `ci95`, `effective_n` of all segments; `done` (success without the segments found
+        complete); `share_found_complete`; `by_segment`; `by_start`, with each `share`; `stuck`.
+    """
+    success, starts = (np.array([e[name] for e in episodes]) for name in ("success", "starts"))
+    num_streams, length = success.shape
+    configurations = np.repeat([[e["configuration"]] for e in episodes], length, axis=1)
+    found = starts == Start.COMPLETE
+
+    def rate(mask: np.ndarray) -> dict[str, Any] | None:
+        return _rate(success[mask], configurations[mask]) if mask.any() else None
+
+    by_start = {start.value: rate(starts == start) for start in Start}
+    segments = [
+        _rate(success[:, k], configurations[:, k])
+        | {"share_found_complete": float(found[:, k].mean())}
+        | {"starts": {name.value: int((starts[:, k] == name).sum()) for name in Start}}
+        for k in range(length)
+    ]
+    shares = {name: {"share": r["n"] / success.size} for name, r in by_start.items() if r}
+    return (rate(np.ones_like(success)) or {}) | {
+        "n": num_streams,
+        "segments": length,
+        "done": rate(~found),
+        "share_found_complete": float(found.mean()),
+        "never_grasped": sum(len(e["never_grasped"]) for e in episodes),
+        "by_segment": segments,
+        "by_start": {name: r | shares[name] for name, r in by_start.items() if r},
+        "stuck": _stuck(success & ~found, starts, min(cycle, length)),
+    }
 
 
-def make_tables(results: dict[str, Any]) -> list[Table]:
-    """One table for each suite, a column for each split."""
-    tables = []
-    if independent := results.get("independent"):
-        table = _table("Independent: success of single tasks, 80 steps", independent, "task")
-        for text in next(iter(independent.values()))["per_task"]:
-            table.add_row(text, *(_rate(split["per_task"][text]) for split in independent.values()))
-        table.add_section()
-        table.add_row("all tasks", *(_rate(split) for split in independent.values()), style="bold")
-        table.add_section()
-        _add_apart(table, list(independent.values()))
-        tables.append(table)
-    if sequential := results.get("sequential"):
-        options = f"advance={results['advance']}, end_effector_reset={str(results['end_effector_reset']).lower()}"
-        table = _table(f"Sequential: chains without a reset ({options})", sequential, "position")
-        for title, kind in CHAIN_KINDS.items():
-            parts = [split[kind] if kind else split for split in sequential.values()]
-            if any(parts):
-                _add_chains(table, title, parts)
-        found = [split["positions"] for split in sequential.values()]
-        _add_apart(table, [{name: sum(p[name] for p in ps) for name in APART} for ps in found])
-        tables.append(table)
-    return tables
+def _stuck(done: np.ndarray, starts: np.ndarray, last: int) -> dict[str, Any]:
+    """Streams in which the policy did no task in the last segments, and their causes; see `stream_results`."""
+    stuck = np.flatnonzero(~done[:, -last:].any(axis=1))
+    causes = Counter(Counter(starts[i, -last:].tolist()).most_common(1)[0][0] for i in stuck)
+    return {"streams": len(stuck), "share": len(stuck) / len(done), "causes": dict(causes.most_common())}
 
 
-CHAIN_KINDS = {"all orderings": None, "seen in training": "seen", "unseen": "unseen"}
-APART = {"found_complete": "found complete", "never_grasped": "never grasped"}
-"""Successes for which nothing was picked up."""
-
-
-def _add_chains(table: Table, title: str, parts: Sequence[dict[str, Any] | None]) -> None:
-    """SEQ 0, 1, ... and the chain length of some orderings, a column for each split; None has no chains."""
-
-    def row(name: str, cell: Callable[[dict[str, Any]], str], style: str | None = None) -> None:
-        table.add_row(name, *("" if part is None else cell(part) for part in parts), style=style)
-
-    row(title, lambda part: f"n={part['n']}", "bold")
-    num_tasks = next(len(part["positions"]) for part in parts if part)
-    for k in range(num_tasks):
-        row(f"SEQ {k}", lambda part, k=k: _rate(part["positions"][k]))
-    row("chain length", lambda part: _number(part["average_chain_length"]["mean"], part["average_chain_length"]))
-    table.add_section()
-
-
-def _add_apart(table: Table, counts: Sequence[dict[str, int]]) -> None:
-    """Of all successes, those that were found complete and those without a grasp."""
-    for name, text in APART.items():
-        table.add_row(f"{text} [count]", *(str(count[name]) for count in counts))
-
-
-def _table(title: str, splits: dict[str, Any], first: str) -> Table:
-    spread = " ± std over orderings" if first == "position" else ""
-    caption = f"mean{spread} [95 % interval]"
-    if first == "position":
-        caption += "; intervals by configuration, as its chains go together"
-    table = Table(title=title, caption=caption, title_justify="left", caption_justify="left")
-    table.add_column(first)
-    for name, split in splits.items():
-        table.add_column(f"{name} (n={split['n']})", justify="right", no_wrap=True)
-    return table
-
-
-def _rate(rate: dict[str, Any]) -> str:
-    return _number(rate["success"], rate)
-
-
-def _number(mean: float, spread: dict[str, Any]) -> str:
-    low, high = spread["ci95"]
-    std = spread.get("std")
-    return f"{mean:.3f}" + (f" ± {std:.3f}" if std is not None else "") + f" [{low:.3f}, {high:.3f}]"
+def numbers_of(suite: str, episodes: Sequence[Episode], benchmark: Any, split: str) -> dict[str, Any]:
+    """The numbers of a suite and split."""
+    if suite == STREAM:
+        return stream_results(episodes, len(benchmark.scene.tasks))
+    groups = benchmark.groups(suite, split)
+    if suite == SUITES[0]:
+        return independent_results(episodes, [group.tasks[0] for group in groups])
+    return sequential_results(episodes, [group.tasks for group in groups], benchmark.scene)

@@ -1,1 +1,13 @@
-"""Drawing and encoding of pictures and videos."""
+"""Drawing of pictures and videos."""
+
+from cronos_lerobot.lazy import lazy_exports
+
+__getattr__, __all__ = lazy_exports(
+    __name__,
+    {
+        "encode": "write_gif write_mp4",
+        "overlay": "Status draw_status",
+        "stream_video": "film_stream",
+        "suites": "draw_suite",
+    },
+)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cache
-from pathlib import Path
 
-import matplotlib
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
+from cronos_lerobot.film.sheets import caption_font
 from cronos_lerobot.protocol.interventions import Intervention
 
 WHITE, BAR = (255, 255, 255), (20, 22, 28, 190)
@@ -41,9 +39,9 @@ class Status:
     outcomes: list[bool] = field(default_factory=list)
     """Success of the segments that are over."""
     caption: str | None = None
-    """In place of the number of the segment and of the interventions."""
+    """Instead of the number of the segment and of the interventions."""
     message: str = ""
-    """In place of `notice`."""
+    """Instead of `notice`."""
 
 
 def draw_status(frame: np.ndarray, status: Status) -> np.ndarray:
@@ -56,7 +54,7 @@ def draw_status(frame: np.ndarray, status: Status) -> np.ndarray:
     bar, margin = round(40 * unit), round(14 * unit)
     draw.rectangle((0, 0, width, bar), fill=BAR)
     draw.rectangle((0, height - bar, width, height), fill=BAR)
-    large, small = _font(round(19 * unit)), _font(round(15 * unit))
+    large, small = caption_font(round(19 * unit)), caption_font(round(15 * unit))
     draw.text((margin, bar / 2), status.instruction, WHITE, large, anchor="lm")
     if status.succeeded:
         _draw_check(draw, width - margin - 20 * unit, bar / 2, unit)
@@ -95,8 +93,3 @@ def _draw_outcomes(draw: ImageDraw.ImageDraw, status: Status, right: float, y: f
         else:
             outline = WHITE if i == status.segment else PENDING
             draw.rectangle(box, outline=outline, width=max(1, round(1.5 * unit)))
-
-
-@cache
-def _font(size: int) -> ImageFont.FreeTypeFont:
-    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"), size)

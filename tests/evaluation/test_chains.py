@@ -1,47 +1,13 @@
-"""Chains in slots: the order of work, refilling, what actors are told, and that batches do not matter."""
+"""Chains in streams: the order of work, refilling, what actors are told, and that batches do not matter."""
 
 import numpy as np
 import pytest
 from lerobot_env_cronos import get_scene
-from scripted_env import ScriptedEnv
 
-from cronos_lerobot.evaluation.chains import Chain, ChainRunner, chain_noise
+from cronos_lerobot.agents.base import ActionSample
+from cronos_lerobot.evaluation.chains import Chain, ChainRunner, Rules
 
 TASKS = get_scene("kitchen_2x2").tasks
-
-
-class ConfigurationEnv(ScriptedEnv):
-    """Task j of the chain of configuration c is complete `by_configuration[c][j]` steps after it begins."""
-
-    def __init__(self, num_envs, by_configuration, **kwargs):
-        self.by_configuration = by_configuration
-        super().__init__([[NEVER] * 4] * num_envs, **kwargs)
-
-    def start(self, ids, orderings, configurations):
-        for i, configuration in zip(ids, configurations, strict=True):
-            self.script[i] = self.by_configuration[configuration]
-        super().start(ids, orderings, configurations)
-
-
-class Actor:
-    """Does nothing, and keeps what it was told."""
-
-    def __init__(self, is_per_environment=True):
-        self.is_per_environment, self.begun, self.asked, self.uniform = is_per_environment, [], [], []
-
-    def seed(self, seed):
-        pass
-
-    def begin(self, ids):
-        self.begun.append(ids.tolist())
-
-    def act(self, observation, instructions, uniform, ids):
-        assert len(observation["agent_pos"]) == len(instructions) == len(uniform) == len(ids)
-        self.asked.append(ids.tolist())
-        self.uniform.append(uniform)
-        return np.zeros((len(ids), 7))
-
-
 NEVER = 81
 SCRIPT = {
     0: [10, 20, 30, 40],  # all four tasks
@@ -58,97 +24,117 @@ STEPS = {
 CHAINS = [Chain(0, TASKS, configuration) for configuration in SCRIPT]
 
 
-def no_noise(chain):
-    return np.zeros((320, 7), np.float32)
+class ScriptedStreams:
+    """Only what an evaluation needs: task j of configuration c is complete after `SCRIPT[c][j]` steps."""
+
+    def __init__(self, num_envs, diverge_at=()):
+        self.num_envs, self.diverge_at = num_envs, diverge_at
+        self.configuration, self.position, self.elapsed = (np.zeros(num_envs, int) for _ in range(3))
+        self.homed, self.clock = [], 0
+
+    def scene_reset(self, ids, configurations, split):
+        assert split == "train"
+        self.configuration[ids] = configurations
+
+    def set_task(self, ids, tasks):
+        self.position[ids] = [TASKS.index(task) for task in tasks]
+        self.elapsed[ids] = 0
+
+    def end_effector_reset(self, ids):
+        self.homed.append((self.clock, ids.tolist()))
+
+    def observe(self, ids=None):
+        numbers = np.stack([self.configuration, self.position, self.elapsed], axis=1)
+        return {"agent_pos": numbers if ids is None else numbers[ids]}
+
+    def step(self, actions):
+        assert actions.shape == (self.num_envs, 7)
+        self.clock += 1
+        self.elapsed += 1
+        due = [SCRIPT[c][j] for c, j in zip(self.configuration, self.position, strict=True)]
+        diverged = np.array([(self.clock, i) in self.diverge_at for i in range(self.num_envs)])
+        # Held for this one step only: that is enough.
+        info = {"is_success": self.elapsed == due, "diverged": diverged}
+        return self.observe(), np.zeros(self.num_envs), None, None, info
 
 
-def run(num_envs, actor=None, chains=CHAINS, noise=no_noise, **kwargs):
-    env = ConfigurationEnv(num_envs, SCRIPT, **kwargs)
-    return ChainRunner(env, actor or Actor()).run(chains, noise), env
+class Idle:
+    """Does nothing, and keeps what it was told."""
+
+    temperature = None
+
+    def __init__(self, is_per_stream=True):
+        self.is_per_stream, self.begun, self.seeds, self.asked = is_per_stream, [], [], []
+
+    def begin(self, ids, seeds=None):
+        self.begun.append((len(self.asked), ids.tolist()))
+        self.seeds += list(seeds or [])
+
+    def act(self, observation, instructions, ids):
+        self.asked.append(ids.tolist())
+        seen = observation["agent_pos"]
+        if self.is_per_stream:
+            # Fresh and of the task at hand, also in the first step after a switch or a start.
+            assert [TASKS[j].instruction for j in seen[:, 1]] == instructions
+            assert (seen[:, 2] < 80).all()
+        return ActionSample(np.zeros((len(ids), 7), np.float32))
+
+
+def run(num_envs, actor=None, chains=CHAINS, diverge_at=(), **rules):
+    env = ScriptedStreams(num_envs, diverge_at)
+    return ChainRunner(env, actor or Idle(), Rules(**rules)).run(chains, "train", (7, 1, 0)), env
 
 
 @pytest.mark.parametrize("advance", ["window", "on_success"])
-@pytest.mark.parametrize("is_per_environment", [True, False])
-@pytest.mark.parametrize("num_envs", [1, 2, 3, 5, 7])
-def test_lengths_and_steps_by_hand_whatever_the_batch(num_envs, is_per_environment, advance):
-    results, _ = run(num_envs, Actor(is_per_environment), advance=advance)
+@pytest.mark.parametrize("is_per_stream", [True, False])
+@pytest.mark.parametrize("num_envs", [1, 3, 7])
+def test_lengths_and_steps_by_hand_whatever_the_batch(num_envs, is_per_stream, advance):
+    results, _ = run(num_envs, Idle(is_per_stream), advance=advance)
     assert [r.chain for r in results] == CHAINS
     assert [r.length for r in results] == LENGTHS
     assert [r.steps for r in results] == STEPS[advance]
-    assert [r.is_success for r in results] == [True, False, False, False, True]
 
 
-def test_a_failed_chain_makes_room_at_once_and_costs_nothing_any_more():
-    actor = Actor()
-    _, env = run(2, actor, advance="on_success")
-    # Slot 0: chains 0 (100 steps), 3 (83) to 183. Slot 1: chains 1 (90), 2 (80) to 170, then 4 (320) to 490.
-    expected = [[0, 1]] * 183 + [[1]] * (490 - 183)
-    assert actor.asked == env.stepped == expected
-    begun = [(step, ids) for step, ids in enumerate(actor.begun) if ids]
-    assert [step for step, ids in begun if 0 in ids] == [0, 10, 30, 60, 100, 101, 102, 103]
-    assert [step for step, ids in begun if 1 in ids] == [0, 10, 90, 170, 250, 330, 410]
+def test_a_stream_goes_on_after_failures_for_as_many_windows_as_tasks():
+    results, env = run(2, stops=False, end_effector_reset=True, chains=CHAINS[:4])
+    assert [r.steps for r in results] == [320] * 4
+    assert [list(r.success) for r in results] == [[when < NEVER for when in SCRIPT[c]] for c in range(4)]
+    # At every switch, and not where a chain starts.
+    assert env.homed == [(clock, [0, 1]) for clock in (80, 160, 240, 400, 480, 560)]
 
 
-def test_a_policy_with_a_memory_is_started_for_all_at_once_and_always_asked_for_all():
-    actor = Actor(is_per_environment=False)
+def test_a_failed_chain_makes_room_at_once():
+    actor = Idle()
+    run(2, actor, advance="on_success")
+    # Stream 0: chains 0 (100 steps), 3 (83) to 183. Stream 1: chains 1 (90), 2 (80) to 170, then 4 (320) to 490.
+    assert actor.asked == [[0, 1]] * 183 + [[1]] * (490 - 183)
+    assert [step for step, ids in actor.begun if 0 in ids] == [0, 10, 30, 60, 100, 101, 102, 103]
+    assert [step for step, ids in actor.begun if 1 in ids] == [0, 10, 90, 170, 250, 330, 410]
+
+
+def test_a_policy_with_one_memory_is_started_for_all_at_once_and_always_asked_for_all():
+    actor = Idle(is_per_stream=False)
     run(2, actor)
     # Batches of chains (0, 1), (2, 3) and (4): as long as the longest of each.
-    assert len(actor.asked) == 280 + 320 + 320
-    assert actor.asked == [[0, 1]] * len(actor.asked)
-    # At the start, and at every switch of windows: the task is new for all that run.
-    assert [step for step, ids in enumerate(actor.begun) if ids] == [
-        0,
-        80,
-        160,
-        240,
-        280,
-        360,
-        440,
-        520,
-        600,
-        680,
-        760,
-        840,
-    ]
+    assert actor.asked == [[0, 1]] * (280 + 320 + 320)
+    starts = [step for step, ids in actor.begun if len(ids) == 2 or step >= 600]
+    assert starts[0] == 0
+    assert {280, 600} <= {step for step, _ in actor.begun}
 
 
-def test_every_chain_gets_its_own_noise_step_by_step():
-    seen = {}
+def test_a_chain_has_its_own_seed_in_whatever_stream_it_runs():
     for num_envs in (1, 5):
-        actor, noise = Actor(), chain_noise(80, 7, 1, 0)
-        run(num_envs, actor, noise=noise)
-        rows = [u for uniform in actor.uniform for u in uniform]
-        assert len(rows) == sum(STEPS["window"])
-        seen[num_envs] = sorted(map(tuple, rows))
-        if num_envs == 1:
-            drawn = [noise(chain)[:steps] for chain, steps in zip(CHAINS, STEPS["window"], strict=True)]
-            np.testing.assert_array_equal(np.concatenate(drawn), rows)
-    assert seen[1] == seen[5]
+        actor = Idle()
+        run(num_envs, actor)
+        assert sorted(actor.seeds) == [(7, 1, 0, 0, configuration) for configuration in SCRIPT]
 
 
-def test_noise_differs_by_seed_suite_split_number_and_configuration_and_lies_in_the_unit_interval():
-    chain = Chain(3, TASKS, 5)
-    draws = [chain_noise(80, 7, 1, 0)(chain)]
-    assert draws[0].shape == (320, 7)
-    assert 0 <= draws[0].min() < draws[0].max() < 1
-    np.testing.assert_array_equal(draws[0], chain_noise(80, 7, 1, 0)(chain))
-    draws += [chain_noise(80, *key)(chain) for key in ((8, 1, 0), (7, 0, 0), (7, 1, 1))]
-    draws += [chain_noise(80, 7, 1, 0)(other) for other in (Chain(4, TASKS, 5), Chain(3, TASKS, 6))]
-    assert len({draw.tobytes() for draw in draws}) == len(draws)
-
-
-def test_trajectories_tell_what_happened():
-    results, env = run(2)
-    for result in results:
-        trajectory = result.trajectory
-        assert trajectory.qpos.shape == (result.steps + 1, env.simulation.model.nq)
-        assert trajectory.position[0] == 0
-        assert not trajectory.is_complete[0]
-    first = results[0].trajectory
-    # Complete from the step on which it was, until the window is over.
-    assert np.flatnonzero(np.diff(first.is_complete.astype(int)) == 1).tolist() == [9, 99, 189, 279]
-    assert np.flatnonzero(np.diff(first.is_complete.astype(int)) == -1).tolist() == [80, 160, 240]
-    assert np.flatnonzero(np.diff(first.position)).tolist() == [80, 160, 240]
+def test_a_broken_simulation_ends_a_chain_as_a_failure_and_a_stream_not():
+    # Task 0 of configuration 0 would be complete in step 10.
+    (chain,), _ = run(1, chains=CHAINS[:1], diverge_at={(10, 0)})
+    assert (chain.length, chain.steps) == (0, 10)
+    (stream,), _ = run(1, chains=CHAINS[:1], diverge_at={(10, 0)}, stops=False)
+    assert (stream.success, stream.steps) == ((False, True, True, True), 320)
 
 
 def test_chains_of_one_task_are_independent_episodes():
@@ -159,8 +145,30 @@ def test_chains_of_one_task_are_independent_episodes():
     assert [r.steps for r in results] == [10, 1, 80, 1, 1, 1, 1, 80]
 
 
-def test_results_are_reported_as_they_come_in():
-    came = []
-    env = ConfigurationEnv(5, SCRIPT)
-    ChainRunner(env, Actor()).run(CHAINS, no_noise, lambda result: came.append(result.chain.configuration))
-    assert came == [2, 1, 0, 3, 4]
+def test_found_and_ungrasped_successes_and_trajectories():
+    class Known(ScriptedStreams):
+        """Task 1 is complete when it is given, task 2's object is grasped in step 5 of its window."""
+
+        is_success = property(lambda self: self.position == 1)
+        is_grasped = property(lambda self: np.zeros(self.num_envs, bool))
+
+        def step(self, actions):
+            observation, reward, _, _, info = super().step(actions)
+            return (
+                observation,
+                reward,
+                None,
+                None,
+                info | {"is_grasped": (self.position == 2) & (self.elapsed == 5)},
+            )
+
+        def positions(self, ids):
+            return np.stack([self.position, self.elapsed], axis=1)[ids].astype(float)
+
+    (result,) = ChainRunner(Known(1), Idle(), keeps_states=True).run(CHAINS[:1], "train", (0,))
+    assert (result.found_complete, result.never_grasped) == ((1,), (0, 3))
+    trajectory = result.trajectory
+    assert trajectory.qpos.shape == (result.steps + 1, 2)
+    # Complete from the step on which it was, until the window is over.
+    assert np.flatnonzero(np.diff(trajectory.is_complete.astype(int)) == 1).tolist() == [9, 99, 189, 279]
+    assert np.flatnonzero(np.diff(trajectory.position)).tolist() == [80, 160, 240]

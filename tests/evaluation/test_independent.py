@@ -1,4 +1,4 @@
-"""The evaluation while training: every episode once, as long as it lasts, and like `cronos-eval`'s."""
+"""The evaluation while training: every episode once, as long as it lasts, and actors by themselves."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import torch
 from dummies import TASKS, DummyEnv, DummyPolicy, identity_processors
 
 from cronos_lerobot.agents.processing import PolicyProcessors
-from cronos_lerobot.evaluation.actors import SamplingPolicy
+from cronos_lerobot.evaluation.actors import SamplingPolicy, Spectator
 from cronos_lerobot.evaluation.independent import evaluate_independent
 
 PROCESSORS = PolicyProcessors(*identity_processors())
@@ -30,7 +30,7 @@ def evaluate(env, policy, **options):
     return evaluate_independent(env, policy, PROCESSORS, **OPTIONS | options)
 
 
-@pytest.mark.parametrize("num_envs", [1, 5, 16, 64])
+@pytest.mark.parametrize("num_envs", [1, 5, 64])
 def test_every_task_from_every_configuration_and_not_a_step_more(num_envs):
     env, policy = DummyEnv(num_envs), ScriptedPolicy()
     result = evaluate(env, policy)
@@ -40,23 +40,10 @@ def test_every_task_from_every_configuration_and_not_a_step_more(num_envs):
     assert (result["success"], result["n"], result["split"], result["temperature"]) == (0.5, 24, "train", 0.6)
     # From -0.5, -0.375, ... 0.125 in steps of 0.2 to within 0.3 of 1 and of 2; two tasks for 80 steps.
     to_one, to_two = [7, 6, 5, 5, 4, 3], [12, 11, 10, 10, 9, 8]
-    assert result["steps"] == sum(to_one) + sum(to_two) + 2 * 6 * 80
-    assert policy.rows == env.moved == result["steps"]
+    assert policy.rows == result["steps"] == sum(to_one) + sum(to_two) + 2 * 6 * 80
     assert result["episodes"] == [
         [1000, task, configuration, int(task in (0, 2))] for task in range(4) for configuration in range(6)
     ]
-
-
-def test_the_split_reaches_the_environment_and_only_configurations_that_are_asked_for():
-    seen = []
-
-    class Env(DummyEnv):
-        def scene_reset(self, ids, configurations, split="train"):
-            seen.append((np.asarray(configurations).tolist(), split))
-            super().scene_reset(ids, configurations, split)
-
-    evaluate(Env(8), ScriptedPolicy(), n_episodes=2, split="held_out")
-    assert seen == [([0, 1] * 4, "held_out")]
 
 
 def test_repetitions_are_as_many_episodes_with_random_numbers_of_their_own():
@@ -91,17 +78,11 @@ class Noisy(Selecting):
     noise = 1.0
 
 
-def test_what_draws_nothing_is_not_repeated(caplog):
-    """Its repetitions would be the same episodes, and more of them no more of a sample."""
-    result = evaluate(DummyEnv(4), Selecting(), n_episodes=1, repetitions=3)
-    assert (result["n"], result["temperature"]) == (4, None)
-    assert [episode[0] for episode in result["episodes"]] == [1000] * 4
-    assert "eval.repetitions=3: the policy draws nothing" in caplog.text
-    caplog.clear()
-    result = evaluate(DummyEnv(4), Noisy(), n_episodes=1, repetitions=3)
-    assert (result["n"], caplog.text) == (12, "")
-    assert evaluate(DummyEnv(4), Selecting(), n_episodes=1)["n"] == 4
-    assert not caplog.text
+@pytest.mark.parametrize(("policy", "n"), [(Selecting, 4), (Noisy, 12)])
+def test_what_draws_nothing_is_not_repeated(policy, n):
+    result = evaluate(DummyEnv(4), policy(), n_episodes=1, repetitions=3)
+    assert (result["n"], result["temperature"]) == (n, None)
+    assert sorted({episode[0] for episode in result["episodes"]}) == [1000, 1001, 1002][: n // 4]
 
 
 def test_it_leaves_the_global_generators_and_the_policys_mode_alone():
@@ -137,25 +118,62 @@ def test_a_broken_simulation_ends_its_episode_and_is_no_success():
     assert broken["steps"] == whole["steps"] - 5
 
 
-def test_decisions_of_several_actions_are_played_by_each_environment_for_itself():
-    class Counting:
-        """Decides on the next three whole numbers after what it sees."""
+class Counting:
+    """Decides on the next three whole numbers after what it sees."""
 
-        def sample_actions(self, batch, *, temperature=1.0, generator=None):
-            first = batch["observation.state"][:, :1]
-            return {"actions": (first + torch.arange(3.0))[..., None].repeat(1, 1, 7)}
+    def sample_actions(self, batch, *, temperature=1.0, generator=None):
+        first = batch["observation.state"][:, :1]
+        return {"actions": (first + torch.arange(3.0))[..., None].repeat(1, 1, 7)}
 
-    actor = SamplingPolicy(Counting(), PolicyProcessors(lambda batch: batch, lambda action: action), 1.0)
 
-    def act(ids, seen):
-        columns = {"agent_pos": np.array(seen, np.float32)[:, None]}
-        return actor.act(columns, [""] * len(ids), np.zeros((len(ids), 7), np.float32), np.array(ids))[
-            :, 0
-        ].tolist()
+def make_actor(policy):
+    return SamplingPolicy(policy, PolicyProcessors(lambda batch: batch, lambda action: action), 1.0)
 
-    assert act([0, 1, 2], [0, 10, 20]) == [0, 10, 20]
-    assert act([0, 2], [5, 25]) == [1, 21]
+
+def act(actor, ids, seen):
+    columns = {"agent_pos": np.array(seen, np.float32)[:, None]}
+    return actor.act(columns, [""] * len(ids), np.array(ids)).action[:, 0].tolist()
+
+
+def test_decisions_of_several_actions_are_played_by_each_stream_for_itself():
+    actor = make_actor(Counting())
+    assert act(actor, [0, 1, 2], [0, 10, 20]) == [0, 10, 20]
+    assert act(actor, [0, 2], [5, 25]) == [1, 21]
     # A new task begins in 2 and 1 has been waiting; 0 plays on.
     actor.begin(np.array([2]))
-    assert act([0, 1, 2], [6, 16, 26]) == [2, 11, 26]
-    assert act([0, 1, 2], [7, 17, 27]) == [7, 12, 27]
+    assert act(actor, [0, 1, 2], [6, 16, 26]) == [2, 11, 26]
+    assert act(actor, [0, 1, 2], [7, 17, 27]) == [7, 12, 27]
+
+
+def test_a_streams_randomness_is_its_own_whatever_streams_are_beside_it():
+    class Uniform:
+        """Plays its random numbers, each decision twice."""
+
+        def sample_actions(self, batch, *, temperature=1.0, generator=None, uniform):
+            return {"actions": uniform[:, None].repeat(1, 2, 1)}
+
+    seeds = {0: (7, 0), 1: (7, 1)}
+    rows = {i: np.random.default_rng(seed).random((6, 7), dtype=np.float32) for i, seed in seeds.items()}
+    expected = {i: [row[0] for row in (r[0], r[0], r[2], r[2], r[4], r[4])] for i, r in rows.items()}
+    both = make_actor(Uniform())
+    both.begin(np.arange(2), [seeds[0], seeds[1]])
+    played = [act(both, [0, 1], [0, 0]) for _ in range(6)]
+    assert played == [[expected[0][t], expected[1][t]] for t in range(6)]
+    # Stream 1 alone, in another place.
+    alone = make_actor(Uniform())
+    alone.begin(np.array([5]), [seeds[1]])
+    assert [act(alone, [5], [0])[0] for _ in range(6)] == expected[1]
+
+
+def test_a_spectator_forgets_where_a_trace_is_cut():
+    agent = Spectator(make_actor(Counting()), 2)
+
+    def play(seen, cut):
+        observation = {"agent_pos": np.array(seen, np.float32)[:, None]}
+        sample = agent.act(observation, ["", ""])
+        agent.store(observation, ["", ""], sample, np.zeros(2), observation, np.array(cut), np.zeros(2, bool))
+        return sample.action[:, 0].tolist()
+
+    assert play([0, 10], [False, True]) == [0, 10]
+    assert play([5, 15], [False, False]) == [1, 15]
+    assert play([6, 16], [False, False]) == [2, 16]

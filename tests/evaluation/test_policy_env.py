@@ -1,4 +1,4 @@
-"""The renderer of the pictures that a policy learned from is the one that it is evaluated with."""
+"""A policy is evaluated in the environment that it expects: what it observes, and where it was trained."""
 
 import sys
 
@@ -9,26 +9,24 @@ from lerobot.envs.utils import env_to_policy_features
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot_env_cronos import CronosEnvConfig
 from lerobot_policy_pocketvla import PocketVLAConfig
-from tiny_checkpoints import STATE, record_one, save_policy, write_train_config
+from tiny_checkpoints import STATE, TINY_ACT, TOLD, record_one, save_policy, write_train_config
 
 from cronos_lerobot.evaluation.config import CronosEvalConfig
-from cronos_lerobot.evaluation.policy_env import (
-    reads_privileged_state,
-    trained_renderer,
-    warn_of_privileged_state,
-)
-from cronos_lerobot.scripts.errors import parse_command_line
+from cronos_lerobot.evaluation.policy_env import expected_env, reads_privileged_state, trained_renderer
+from cronos_lerobot.scripts.eval import read_command_line
 
 FILAMENT = {"renderer": "filament"}
 
 
-@pytest.fixture(scope="module")
-def demos(tmp_path_factory):
-    """Demonstrations that say that Filament was asked for; without pictures it is not needed here."""
-    return record_one(tmp_path_factory.mktemp("demos") / "demos", **FILAMENT)
+def config_of(folder):
+    config = PreTrainedConfig.from_pretrained(folder)
+    config.pretrained_path = folder
+    return config
 
 
-def test_the_renderer_is_the_runs_or_that_of_the_cloned_demonstrations(demos, tmp_path):
+def test_the_renderer_is_the_runs_or_that_of_the_cloned_demonstrations(tmp_path):
+    # Demonstrations that say that Filament was asked for; without pictures it is not needed here.
+    demos = record_one(tmp_path / "demos", **FILAMENT)
     dataset = {"repo_id": "me/demos", "root": str(demos)}
     assert trained_renderer(write_train_config(tmp_path, env={"type": "cronos"} | FILAMENT)) == FILAMENT
     assert trained_renderer(write_train_config(tmp_path, env=None, dataset=dataset)) == FILAMENT
@@ -37,14 +35,12 @@ def test_the_renderer_is_the_runs_or_that_of_the_cloned_demonstrations(demos, tm
     assert trained_renderer(write_train_config(tmp_path, env=classic, dataset=dataset)) == FILAMENT
     elsewhere = dataset | {"root": str(tmp_path)}
     assert trained_renderer(write_train_config(tmp_path, env=None, dataset=elsewhere)) == {}
-    # Of runs of before there was a choice, of other packages, and of nothing.
-    assert trained_renderer(write_train_config(tmp_path, env={"type": "cronos"})) == {}
     assert trained_renderer(write_train_config(tmp_path, env={"type": "libero"} | FILAMENT)) == {}
     assert trained_renderer(tmp_path / "none") == {}
 
 
 @pytest.mark.parametrize(
-    ("make", "shown", "is_told"),
+    ("make", "shown", "reads"),
     [
         (ACTConfig, {"privileged_state": True}, True),
         (ACTConfig, {}, False),
@@ -54,35 +50,11 @@ def test_the_renderer_is_the_runs_or_that_of_the_cloned_demonstrations(demos, tm
         (PocketVLAConfig, {"privileged_state": True}, False),
     ],
 )
-def test_a_policy_that_reads_the_poses_beside_pictures_is_told_of(make, shown, is_told, caplog):
+def test_whether_a_policy_reads_the_poses_beside_pictures(make, shown, reads):
     """LeRobot makes an input of all that a dataset has."""
     features = env_to_policy_features(CronosEnvConfig(**shown))
     config = make(device="cpu", input_features={key: f for key, f in features.items() if key != "action"})
-    assert reads_privileged_state(config) is is_told
-    warn_of_privileged_state(config)
-    assert ("reads observation.environment_state beside its pictures" in caplog.text) is is_told
-
-
-@pytest.mark.parametrize(
-    ("observation", "flags", "renderer"),
-    [
-        ({}, [], "filament"),
-        ({}, ["--env.renderer=classic"], "classic"),
-        # It would draw the videos alone.
-        (STATE, [], "classic"),
-    ],
-)
-def test_an_evaluation_draws_as_the_training_did_unless_it_is_told(
-    observation, flags, renderer, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(sys, "argv", ["cronos-eval", *flags])
-    folder = save_policy(tmp_path, "pocketvla", observation, hidden_width=16, hidden_depth=1)
-    policy = PreTrainedConfig.from_pretrained(write_train_config(folder, env={"type": "cronos"} | FILAMENT))
-    policy.pretrained_path = folder
-    config = CronosEvalConfig(policy=policy)
-    config.validate()
-    assert config.env.renderer == renderer
-    assert config.identity().get("renderer", "classic") == renderer
+    assert reads_privileged_state(config) is reads
 
 
 @pytest.fixture(scope="module")
@@ -94,34 +66,53 @@ def of_playroom(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("env", "scene", "height", "renderer"),
+    ("env", "flag", "scene", "height", "renderer"),
     [
-        (None, "playroom_2x2", 64, "filament"),
-        ({"type": "cronos", "renderer": "classic"}, "playroom_2x2", 64, "classic"),
-        ({"type": "cronos", "scene": "kitchen_2x2", "observation_height": 128}, "kitchen_2x2", 128, "filament"),
+        (None, None, "playroom_2x2", 64, "filament"),
+        ({"type": "cronos", "renderer": "classic"}, None, "playroom_2x2", 64, "classic"),
+        (None, "--env.renderer=classic", "playroom_2x2", 64, "classic"),
+        (
+            {"type": "cronos", "scene": "kitchen_2x2", "observation_height": 128},
+            None,
+            "kitchen_2x2",
+            128,
+            "filament",
+        ),
     ],
 )
-def test_what_a_config_file_leaves_open_follows_from_the_policy(
-    env, scene, height, renderer, of_playroom, tmp_path, monkeypatch
+def test_what_flags_and_file_leave_open_follows_from_the_policy(
+    env, flag, scene, height, renderer, of_playroom, tmp_path, monkeypatch
 ):
+    """A default that is given counts as given."""
     file = tmp_path / "eval.yaml"
     file.write_text(yaml.safe_dump({"seed": 3} | ({} if env is None else {"env": env})))
-    monkeypatch.setattr(sys, "argv", ["cronos-eval", f"--config_path={file}", f"--policy.path={of_playroom}"])
-    config = parse_command_line(CronosEvalConfig)
-    config.validate()
-    assert (config.seed, config.env.scene, config.env.observation_height) == (3, scene, height)
+    given = [flag, "--env.type=cronos"] if flag else [f"--config_path={file}"]
+    monkeypatch.setattr(sys, "argv", ["cronos-eval", f"--policy.path={of_playroom}", *given])
+    config = read_command_line()
+    assert (config.env.scene, config.env.observation_height) == (scene, height)
     assert (config.env.observation_width, config.env.renderer) == (96, renderer)
+    assert config.seed == (1000 if flag else 3)
 
 
-def test_an_environment_given_in_python_is_kept(of_playroom, monkeypatch):
-    """As far as it is no default, which says nothing."""
-    monkeypatch.setattr(sys, "argv", ["script.py"])
-    policy = PreTrainedConfig.from_pretrained(of_playroom)
-    policy.pretrained_path = of_playroom
-    config = CronosEvalConfig(env=CronosEnvConfig(scene="kitchen_3x3", observation_height=32), policy=policy)
-    config.validate()
-    assert (config.env.scene, config.env.observation_height) == ("kitchen_3x3", 32)
-    assert (config.env.observation_width, config.env.renderer) == (96, "filament")
+def test_an_environment_given_in_python_is_kept_and_flags_of_another_program_are_not_read(
+    of_playroom, monkeypatch
+):
+    monkeypatch.setattr(sys, "argv", ["script.py", "--env.scene=kitchen_2x2"])
+    env = CronosEnvConfig(scene="kitchen_3x3", observation_height=32)
+    config = CronosEvalConfig(env=env, policy=config_of(of_playroom))
     # Looking again changes nothing.
-    config.validate()
-    assert (config.env.scene, config.env.observation_height) == ("kitchen_3x3", 32)
+    for _ in range(2):
+        config.resolve()
+        assert (config.env.scene, config.env.observation_height) == ("kitchen_3x3", 32)
+        assert (config.env.observation_width, config.env.renderer) == (96, "filament")
+
+
+def test_the_environment_of_a_checkpoint(of_playroom, tmp_path):
+    env = expected_env(config_of(of_playroom))
+    assert (env.scene, env.obs_type, env.observation_height) == ("playroom_2x2", "pixels_agent_pos", 64)
+    assert expected_env(config_of(of_playroom), "kitchen_3x3").scene == "kitchen_3x3"
+    told = config_of(save_policy(tmp_path, "act", TOLD, **TINY_ACT))
+    env = expected_env(told)
+    assert (env.task_observation, env.obs_type) == ("one_hot", STATE["obs_type"])
+    with pytest.raises(ValueError, match=r"observation\.state.*kitchen_3x3"):
+        expected_env(told, "kitchen_3x3")

@@ -1,0 +1,173 @@
+"""Videos and pictures of an evaluation: chains that went well, some that did not, and streams that got stuck."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from cronos_lerobot.evaluation.chains import ChainResult
+from cronos_lerobot.evaluation.results import VIDEOS
+from cronos_lerobot.evaluation.suites import INDEPENDENT, SEQUENTIAL, STREAM, Start
+from cronos_lerobot.film.encode import write_mp4
+from cronos_lerobot.film.overlay import Status, draw_status
+from cronos_lerobot.film.png import encode_palette_png, to_png
+from cronos_lerobot.film.sheets import draw_grid
+
+FPS = 20
+"""Four times as fast as it happened."""
+LAST_FRAMES = 30
+"""For how long the outcome stays on the screen [frames]."""
+NUMBERED = {INDEPENDENT: "task", SEQUENTIAL: "ordering", STREAM: "first_task"}
+"""What a chain's number is of."""
+PICTURED = 4
+"""Stuck streams on the sheet, and segments of each."""
+COLORS = {
+    Start.FREE: "#cfe1f2", Start.RECEPTACLE_OCCUPIED: "#93c4de", Start.ON_OTHER_RECEPTACLE: "#4a97c9",
+    Start.OUT_OF_REACH: "#08306b", Start.FALLEN: "#7a0177", Start.COMPLETE: "#d9d9d9",
+}  # fmt: skip
+
+Render = Callable[[np.ndarray], np.ndarray]
+"""Frames (k, H, W, 3) uint8 of joint positions (k, nq)."""
+
+
+def draw_suite(
+    folder: Path, numbers: dict[str, Any], ended: Sequence[ChainResult], render: Render, count: int
+) -> None:
+    """Film some chains of a suite and split; of streams also draw `stream.png` and `stuck.png`.
+
+    Args:
+        folder: of its results.json.
+        numbers: its results.
+        ended: its chains, with their trajectories.
+        render: draws joint positions.
+        count: good chains to film at most, and bad ones.
+    """
+    good, bad = choose(ended, count)
+    films = [("good", result) for result in good] + [("bad", result) for result in bad]
+    for kind, result in tqdm(films, unit="video", disable=None):
+        number = f"{NUMBERED[numbers['suite']]}{result.chain.number}"
+        name = f"{kind}_{number}_configuration{result.chain.configuration}.mp4"
+        where = f"{numbers['split'].replace('_', '-')} {result.chain.configuration}, {number.replace('_', ' ')}"
+        film_chain(folder / VIDEOS / name, result, render, where)
+    if numbers["suite"] == STREAM:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "stream.png").write_bytes(to_png(draw_streams(numbers), 150))
+        (folder / "stuck.png").write_bytes(encode_palette_png(draw_stuck(ended, render)))
+
+
+def choose(ended: Sequence[ChainResult], count: int) -> tuple[list[ChainResult], list[ChainResult]]:
+    """Choose the chains to film, of equals the first configurations.
+
+    Returns:
+        Up to `count` chains with a success, longest first, and up to `count` others that failed, shortest first.
+    """
+
+    def rank(result: ChainResult, sign: int) -> tuple[int, int, int]:
+        return sign * result.length, result.chain.configuration, result.chain.number
+
+    good = sorted((r for r in ended if r.length > 0), key=lambda r: rank(r, -1))[:count]
+    failed = [r for r in ended if r.length < len(r.chain.tasks) and not any(r is other for other in good)]
+    return good, sorted(failed, key=lambda r: rank(r, 1))[:count]
+
+
+def film_chain(path: Path, result: ChainResult, render: Render, where: str) -> None:
+    """Write the MP4 of a chain, with its tasks and outcomes on it.
+
+    Args:
+        path: of the file.
+        result: with its trajectory.
+        render: draws joint positions.
+        where: what the chain is of, for the line at the bottom.
+    """
+    assert result.trajectory is not None
+    statuses, frames = list(_statuses(result, where)), []
+    # Some at a time: all frames of a long chain without their overlay would double the memory.
+    for start in range(0, len(statuses), 64):
+        some = slice(start, start + 64)
+        drawn = render(result.trajectory.qpos[some].astype(np.float64))
+        frames += [draw_status(frame, status) for frame, status in zip(drawn, statuses[some], strict=True)]
+    write_mp4(path, frames + frames[-1:] * LAST_FRAMES, FPS)
+
+
+def _statuses(result: ChainResult, where: str) -> Iterator[Status]:
+    trajectory, tasks = result.trajectory, result.chain.tasks
+    assert trajectory is not None
+    last = len(trajectory.qpos) - 1
+    for t in range(last + 1):
+        position = int(trajectory.position[t])
+        status = Status(
+            tasks[position].instruction,
+            position,
+            len(tasks),
+            succeeded=bool(trajectory.is_complete[t]),
+            interventions=0,
+            outcomes=list(result.success[:position]),
+            caption=f"{where}   task {position + 1}/{len(tasks)}   step {t}",
+        )
+        if t == last:
+            outcome = "complete" if result.length == len(tasks) else "failed"
+            status.message = f"{outcome}: {result.length} of {len(tasks)} tasks"
+            status.outcomes = list(result.success)
+        yield status
+
+
+def draw_stuck(ended: Sequence[ChainResult], render: Render) -> Any:
+    """The streams with the fewest tasks done in their second half, a row each: the ends of the last segments."""
+    half = len(ended[0].success) // 2
+
+    def done(result: ChainResult) -> int:
+        found = set(result.found_complete)
+        return sum(success and k not in found for k, success in enumerate(result.success) if k >= half)
+
+    return draw_grid([_last_segments(result, render) for result in sorted(ended, key=done)[:PICTURED]])
+
+
+def _last_segments(result: ChainResult, render: Render) -> list[np.ndarray]:
+    trajectory, length = result.trajectory, len(result.success)
+    assert trajectory is not None
+    segments = range(length)[-PICTURED:]
+    ends = [int(np.flatnonzero(trajectory.position == k)[-1]) for k in segments]
+    statuses = [
+        Status(
+            result.chain.tasks[k].instruction,
+            k,
+            length,
+            succeeded=result.success[k],
+            interventions=0,
+            outcomes=list(result.success[: k + 1]),
+            caption=f"configuration {result.chain.configuration}",
+            message=f"began {result.starts[k].replace('_', ' ')}",
+        )
+        for k in segments
+    ]
+    drawn = render(trajectory.qpos[ends].astype(np.float64))
+    return [draw_status(frame, status) for frame, status in zip(drawn, statuses, strict=True)]
+
+
+def draw_streams(numbers: dict[str, Any]) -> Figure:
+    """Success by segment with its interval, above how the segments began."""
+    segments = numbers["by_segment"]
+    x = np.arange(1, len(segments) + 1)
+    figure = Figure(figsize=(7, 5), layout="constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    low, high = np.array([segment["ci95"] for segment in segments]).T
+    top.fill_between(x, low, high, alpha=0.2, lw=0)
+    top.plot(x, [segment["success"] for segment in segments], "o-", ms=4)
+    top.set(ylim=(0, 1.02), ylabel="success")
+    arm = "the arm goes home at every switch" if numbers["end_effector_reset"] else "the arm stays where it is"
+    top.set_title(
+        f"{numbers['n']} streams, {numbers['split'].replace('_', '-')}: nobody resets, {arm}", fontsize=10
+    )
+    bottom_edge = np.zeros(len(segments))
+    for start, color in COLORS.items():
+        share = np.array([segment["starts"][start.value] for segment in segments]) / numbers["n"]
+        bottom.bar(x, share, 0.9, bottom_edge, color=color, label=start.value.replace("_", " "))
+        bottom_edge += share
+    bottom.set(xlabel="segment since the placement", ylabel="how it began", ylim=(0, 1))
+    figure.legend(loc="outside lower center", ncols=len(COLORS), fontsize=7, frameon=False)
+    return figure
