@@ -1,119 +1,147 @@
-"""The figures of a report, each a matplotlib Figure."""
+"""The figures of a report, from the tables that `load` reads; None if there is nothing to draw."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from cronos_lerobot.report.runs import Group, agent_metrics
-from cronos_lerobot.report.series import (
-    SINGLE,
-    Curve,
-    evaluation_curve,
-    segment_history,
-    segment_rates,
-    segment_spans,
-    update_curve,
-)
-from cronos_lerobot.report.statistics import Rate
+from cronos_lerobot.report.load import CRONOS_EVAL
+from cronos_lerobot.report.tables import rates_by_part, training_curves
+from cronos_lerobot.statistics import interpolate
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")
-"""Okabe and Ito's palette: told apart by the colour-blind too."""
-Line = str | tuple[int, tuple[float, ...]]
-"""By matplotlib's name, or an offset and lengths of dashes and gaps [line widths]."""
-LINES_AND_HATCHES: tuple[tuple[Line, str], ...] = (
-    ("-", ""),
-    ("--", "////"),
-    (":", "...."),
-    ("-.", "xxxx"),
-    ((0, (8, 1.5, 1, 1.5, 1, 1.5)), "\\\\\\\\"),
-    ((0, (9, 4)), "||||"),
-    ((0, (6, 1.5, 2, 1.5)), "----"),
-    ((0, (1, 4)), "oooo"),
-)
-"""Of lines and bars, for each time that the colours begin anew."""
+"""Okabe and Ito's palette, which the colour-blind can tell apart."""
+LINES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (8, 1.5, 1, 1.5, 1, 1.5)), (0, (9, 4)))
+HATCHES = ("", "////", "....", "xxxx", "\\\\\\\\", "||||")
+"""Of lines and bars, for each time that the colours start again."""
 SPLIT_LABELS = {"train": "training configurations", "held_out": "held-out configurations"}
 INK, GRID = "#333333", "#e4e4e4"
-AGENT_PANELS = (
-    ("KL divergence per update [nats]", "approx_kl"),
-    ("entropy [nats; steering: per dimension]", "entropy"),
-    ("explained variance of the value", "explained_variance"),
-    ("clip fraction", "clip_fraction"),
-    ("learning rate of the policy", "policy_lr"),
-    ("loss", "loss"),
-    ("gradient norm", "grad_norm"),
-    ("successful segments remembered", "segments"),
-    ("failed segments remembered", "failed_segments"),
-    ("frames remembered", "frames"),
-    ("effective share of the weighted frames", "effective_share"),
-    ("decisions remembered", "decisions"),
-    ("loss of the critics", "critic_loss"),
-    ("gradient norm of the critics", "critic_grad_norm"),
-    ("value of remembered decisions", "value"),
-    ("loss of the actor", "actor_loss"),
-    ("gradient norm of the actor", "actor_grad_norm"),
-    ("alpha, the price of the entropy", "alpha"),
-    ("size of the chosen noise (1: the bound)", "choice_abs"),
-)
-"""Title and name of what agents say of an update: PPO's, imitation's, steering's."""
+SINGLE = 16
+"""Segments since a scene reset that are drawn one by one; later ones are joined in spans that double."""
+HISTORY_COLUMNS = 12
+AGENT_PANELS = {
+    "agent/approx_kl": "KL divergence per update [nats]",
+    "agent/entropy": "entropy [nats; steering: per dimension]",
+    "agent/explained_variance": "explained variance of the value",
+    "agent/clip_fraction": "clip fraction",
+    "agent/policy_lr": "learning rate of the policy",
+    "agent/loss": "loss",
+    "agent/grad_norm": "gradient norm",
+    "agent/segments": "successful segments in memory",
+    "agent/failed_segments": "failed segments in memory",
+    "agent/frames": "frames in memory",
+    "agent/effective_share": "effective share of the weighted frames",
+    "agent/decisions": "decisions in memory",
+    "agent/critic_loss": "loss of the critics",
+    "agent/critic_grad_norm": "gradient norm of the critics",
+    "agent/value": "value of decisions in memory",
+    "agent/actor_loss": "loss of the actor",
+    "agent/actor_grad_norm": "gradient norm of the actor",
+    "agent/alpha": "alpha, the weight of the entropy",
+    "agent/choice_abs": "size of the chosen noise (1: the bound)",
+    "reward_per_segment": "reward per segment",
+}
+"""Titles of the columns of updates that have a panel."""
 
 
-def evaluation_figure(groups: list[Group]) -> Figure | None:
-    """Evaluation success against interaction steps and against interventions."""
-    if not any(run.evaluations for group in groups for run in group.runs):
-        return None
+class Curve(NamedTuple):
+    """A line with a band around it, all (points,)."""
+
+    x: np.ndarray
+    y: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def mean_curve(curves: Sequence[tuple[Any, Any]]) -> Curve:
+    """Mean and standard deviation (ddof = 1) of (x, y) curves, over the range of x that all of them have.
+
+    A curve that has several evaluations at one x is vertical there, as in `performance_gap`.
+    """
+    xs = [np.asarray(x, float) for x, _ in curves]
+    places = np.unique(np.concatenate(xs))
+    places = places[(places >= max(x.min() for x in xs)) & (places <= min(x.max() for x in xs))]
+    ends = [[interpolate(x, y, places, is_first=is_first) for x, y in curves] for is_first in (True, False)]
+    # (curves, 2 places): the first value at each place, then the last.
+    values = np.stack(ends, axis=-1).reshape(len(curves), -1)
+    spread = values.std(axis=0, ddof=1) if len(values) > 1 else np.zeros(values.shape[1])
+    mean = values.mean(axis=0)
+    return Curve(np.repeat(places, 2), mean, mean - spread, mean + spread)
+
+
+def evaluation_curve(curves: Sequence[pd.DataFrame], axis: str) -> Curve:
+    """Evaluation success of some runs against `axis`, `steps` or `interventions`; of one with its interval."""
+    if len(curves) > 1:
+        return mean_curve([(curve[axis], curve["success"]) for curve in curves])
+    columns = (curves[0][name].to_numpy(float) for name in (axis, "success", "ci95_low", "ci95_high"))
+    return Curve(*columns)
+
+
+def evaluation_figure(evaluations: pd.DataFrame) -> Figure | None:
+    """Success of the periodic evaluations against interaction steps and against interventions."""
+    groups = training_curves(evaluations)
     figure = Figure(figsize=(10, 3.8), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
-    for ax, axis in zip(axes, ("interaction_steps", "interventions"), strict=True):
-        for i, group in enumerate(groups):
-            draw_curve(ax, evaluation_curve(group, axis), i, _label(group), marker="o")
-        style_axes(ax, f"{axis.replace('_', ' ')}, all streams")
+    for ax, axis in zip(axes, ("steps", "interventions"), strict=True):
+        for i, (label, curves) in enumerate(groups.items()):
+            draw_curve(ax, evaluation_curve(curves, axis), i, _label(label, len(curves)), marker="o")
+        style_axes(ax, f"{'interaction ' * (axis == 'steps')}{axis}, all streams")
         ax.set_ylim(0, 1.02)
     axes[0].set_ylabel("evaluation success")
-    _legend(figure, [axes[0]], groups)
-    return figure
+    return _finished(figure)
 
 
-def training_figure(groups: list[Group]) -> Figure | None:
+def training_figure(updates: pd.DataFrame) -> Figure | None:
     """Success of the streams' segments, by policy update."""
     figure = Figure(figsize=(10, 3.2), layout="constrained")
     ax = figure.subplots()
-    for i, group in enumerate(groups):
-        draw_curve(ax, update_curve(group, lambda update: update["rollout"]["success"]), i, _label(group))
+    _draw_updates(ax, updates, "success", 1.6)
     style_axes(ax, "interaction steps, all streams")
     ax.set(ylabel="success of training segments", ylim=(0, 1.02))
-    _legend(figure, [ax], groups)
-    return figure if ax.lines else None
+    return _finished(figure)
 
 
-def segments_figure(groups: list[Group]) -> Figure | None:
-    """Success by segment since the last scene reset, at the end of the runs."""
+def _draw_updates(ax: Axes, updates: pd.DataFrame, name: str, width: float) -> None:
+    for i, (label, some) in enumerate(_by_row(updates)):
+        runs = [run.dropna(subset=name) for _, run in some.groupby("folder", sort=False)]
+        curves = [(run["steps"], run[name]) for run in runs if len(run)]
+        if curves:
+            draw_curve(ax, mean_curve(curves), i, _label(label, some["folder"].nunique()), width=width)
+
+
+def segments_figure(segments: pd.DataFrame) -> Figure | None:
+    """Training success by segment since the last scene reset, at the end of the runs."""
     figure = Figure(figsize=(10, 3.2), layout="constrained")
     ax = figure.subplots()
-    for i, group in enumerate(groups):
-        if rates := segment_rates(group):
-            draw_curve(ax, segment_curve(rates), i, _label(group), marker="o")
+    for i, (label, some) in enumerate(_by_row(segments)):
+        if (curve := segment_curve(some)) is not None:
+            draw_curve(ax, curve, i, _label(label, some["folder"].nunique()), marker="o")
     style_segment_axis(ax)
     ax.set(ylabel="success of training segments", ylim=(0, 1.02))
-    _legend(figure, [ax], groups)
-    return figure if ax.lines else None
+    return _finished(figure)
 
 
-def segment_curve(rates: Mapping[int, Rate]) -> Curve:
-    """Success by segment, a point for each of `segment_spans`."""
-    spans = segment_spans(rates)
-    ends = np.array([rate.interval for rate in spans.values()])
-    x, y = np.array([np.mean(span) for span in spans]), np.array([rate.value for rate in spans.values()])
-    return Curve(x, y, ends[:, 0], ends[:, 1], is_band_over_seeds=False)
+def segment_curve(segments: pd.DataFrame) -> Curve | None:
+    """Training success by segment since the last scene reset, from 1, at the end of some runs."""
+    late = segments[(segments["kind"] == "segment") & segments["is_late"]]
+    if late.empty:
+        return None
+    number = late["part"].astype(int) + 1
+    first = 2 ** np.floor(np.log2(np.maximum(number - 1, 1))).astype(int)
+    middle = np.where(number <= SINGLE, number, 1.5 * first + 0.5)
+    rates = rates_by_part(late.assign(x=middle), ["x"]).sort_values("x")
+    low, high = (rates[name].fillna(rates["success"]) for name in ("ci95_low", "ci95_high"))
+    return Curve(*(column.to_numpy(float) for column in (rates["x"], rates["success"], low, high)))
 
 
 def style_segment_axis(ax: Axes) -> None:
-    """The axis of a `segment_curve`: by doublings where spans double."""
+    """The axis of a `segment_curve`, logarithmic if its spans double."""
     style_axes(ax, "segment since the last scene reset (1 is the first after it)")
     if ax.lines and ax.dataLim.xmax > SINGLE:
         ax.set_xscale("log", base=2)
@@ -122,84 +150,123 @@ def style_segment_axis(ax: Axes) -> None:
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
-def segment_history_figure(groups: list[Group]) -> Figure | None:
-    """Success by segment since the last scene reset, over the run: one heat map for each group."""
-    groups = [group for group in groups if segment_rates(group, 1.0)]
+def segment_history_figure(segments: pd.DataFrame) -> Figure | None:
+    """Training success by segment since the last scene reset, over the run: a heat map for each row."""
+    groups = [(label, some[some["kind"] == "segment"]) for label, some in _by_row(segments)]
+    groups = [(label, some) for label, some in groups if len(some)]
     if not groups:
         return None
     rows = -(-len(groups) // 2)
-    columns = min(2, len(groups))
     figure = Figure(figsize=(10, 3.2 * rows), layout="constrained")
-    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
-    for unused in axes[len(groups) :]:
-        unused.remove()
-    axes = axes[: len(groups)]
+    axes = list(figure.subplots(rows, min(2, len(groups)), squeeze=False).flat)
     mesh: Any = None
-    for ax, group in zip(axes, groups, strict=True):
-        edges, rates = segment_history(group)
+    for ax, (label, some) in zip(axes, groups, strict=False):
+        edges, rates = segment_history(some)
         mesh = ax.pcolormesh(edges, np.arange(len(rates) + 1) + 0.5, rates, vmin=0, vmax=1, cmap="viridis")
         style_axes(ax, "interaction steps, all streams", grid=False)
         ax.yaxis.set_major_locator(MaxNLocator(integer=True))
         ax.set_ylabel("segment since the reset")
-        ax.set_title(_label(group), fontsize=9, color=INK, loc="left")
+        ax.set_title(_label(label, some["folder"].nunique()), fontsize=9, color=INK, loc="left")
     figure.colorbar(mesh, ax=axes, label="success", shrink=0.9)
+    _remove(axes[len(groups) :])
     return figure
 
 
-def agent_figure(groups: list[Group]) -> Figure | None:
-    """The agents' diagnostics, one panel for each that some run has, by policy update."""
-    wanted = [*((title, _metric(name)) for title, name in AGENT_PANELS), ("reward per segment", _reward)]
-    panels = [(title, [update_curve(group, value) for group in groups]) for title, value in wanted]
-    panels = [(title, curves) for title, curves in panels if any(curves)]
+def segment_history(segments: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
+    """Success by segment over the run.
+
+    Returns:
+        edges (columns + 1,) in interaction steps, and rates (segments, columns), NaN where there is no episode.
+    """
+    end, cycle = int(segments["steps"].max()), int(segments["cycle"].max())
+    # A column has all segments between two scene resets.
+    columns = max(1, min(HISTORY_COLUMNS, end // cycle if cycle else HISTORY_COLUMNS))
+    place = ((segments["steps"] - 1) * columns // end).astype(int)
+    counts = np.zeros((2, int(segments["part"].max()) + 1, columns))
+    for row, name in zip(counts, ("successes", "n"), strict=True):
+        np.add.at(row, (segments["part"].to_numpy(int), place), segments[name].to_numpy(float))
+    with np.errstate(invalid="ignore"):
+        return np.linspace(0, end, columns + 1), counts[0] / counts[1]
+
+
+def agent_figure(updates: pd.DataFrame) -> Figure | None:
+    """The agents' diagnostics by policy update, one panel for each that some run has."""
+    panels = [
+        (name, title) for name, title in AGENT_PANELS.items() if name in updates and updates[name].notna().any()
+    ]
     if not panels:
         return None
     rows = -(-len(panels) // 3)
     figure = Figure(figsize=(10, 2.3 * rows), layout="constrained")
     axes = list(figure.subplots(rows, 3, squeeze=False).flat)
-    for unused in axes[len(panels) :]:
-        unused.remove()
-    for ax, (title, curves) in zip(axes, panels, strict=False):
-        for i, (group, curve) in enumerate(zip(groups, curves, strict=True)):
-            draw_curve(ax, curve, i, _label(group), width=1.2)
+    for ax, (name, title) in zip(axes, panels, strict=False):
+        _draw_updates(ax, updates, name, 1.2)
         style_axes(ax, "")
         ax.set_title(title, fontsize=9, color=INK, loc="left")
-    # Agents differ in their metrics: no panel need have a curve of every group.
-    _legend(figure, axes, groups)
-    return figure
+    _remove(axes[len(panels) :])
+    return _finished(figure)
 
 
-def _metric(name: str) -> Callable[[dict[str, Any]], float | None]:
-    return lambda update: agent_metrics(update).get(name)
+def part_figure(evaluations: pd.DataFrame, suite: str) -> Figure | None:
+    """Success by position of a chain or by segment of a stream, of cronos-eval: a panel for each split."""
+    drawn = evaluations[(evaluations["source"] == CRONOS_EVAL) & (evaluations["suite"] == suite)]
+    if drawn.empty:
+        return None
+    splits, policies = list(drawn["split"].unique()), list(drawn["policy"].unique())
+    figure = Figure(figsize=(10, 3.8), layout="constrained")
+    axes = figure.subplots(1, len(splits), squeeze=False, sharey=True)[0]
+    for ax, split in zip(axes, splits, strict=True):
+        for _, one in drawn[drawn["split"] == split].iterrows():
+            _draw_parts(ax, one["parts"], policies.index(one["policy"]), len(policies), one["policy"])
+        style_axes(ax, "task in the chain" if suite == "sequential" else "segment of the stream")
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        ax.set_ylim(0, 1.02)
+        ax.set_title(SPLIT_LABELS.get(split, split), fontsize=9, color=INK, loc="left")
+    axes[0].set_ylabel("success")
+    return _finished(figure)
 
 
-def _reward(update: dict[str, Any]) -> float | None:
-    return update["rollout"].get("reward_per_segment")
+def _draw_parts(ax: Axes, parts: Sequence[dict[str, Any]], i: int, number: int, label: str) -> None:
+    shown = [p for p in parts if p.get("orderings", "all") == "all" and p["part"] != "chain length"]
+    y = np.array([part["success"] for part in shown])
+    ends = np.array([(part["ci95_low"], part["ci95_high"]) for part in shown])
+    width = 0.8 / number
+    x = 1 + np.arange(len(y)) + (i - (number - 1) / 2) * width
+    color, _, hatch = style_of(i)
+    errors = np.abs(ends - y[:, None]).T
+    ax.bar(
+        x,
+        y,
+        0.92 * width,
+        yerr=errors,
+        ecolor=INK,
+        color=color,
+        hatch=hatch,
+        edgecolor="white",
+        label=_label(label),
+    )
 
 
-def _label(group: Group) -> str:
+def _by_row(table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    return iter(table.groupby("row", sort=False)) if len(table) else iter(())
+
+
+def _label(label: str, seeds: int = 1) -> str:
     # A $ would begin a formula.
-    label = group.label.replace("$", r"\$")
-    return label if len(group.runs) == 1 else f"{label} ({len(group.runs)} seeds)"
+    text = label.replace("$", r"\$")
+    return text if seeds == 1 else f"{text} ({seeds} seeds)"
 
 
-def style_of(i: int) -> tuple[str, Line, str]:
-    """The colour, the line and the hatch that tell row number `i` of a figure from the others."""
-    return (COLORS[i % len(COLORS)], *LINES_AND_HATCHES[i // len(COLORS) % len(LINES_AND_HATCHES)])
+def style_of(i: int) -> tuple[str, Any, str]:
+    """The colour, the line and the hatch of row number `i` of a figure."""
+    turn = i // len(COLORS) % len(LINES)
+    return COLORS[i % len(COLORS)], LINES[turn], HATCHES[turn]
 
 
 def draw_curve(
-    ax: Axes,
-    curve: Curve | None,
-    i: int,
-    label: str,
-    *,
-    marker: str = "",
-    width: float = 1.6,
-    marker_size: float = 4,
+    ax: Axes, curve: Curve, i: int, label: str, *, marker: str = "", width: float = 1.6, marker_size: float = 4
 ) -> None:
-    """Draw a line and its band in the style number `i`; nothing if there is no curve."""
-    if curve is None:
-        return
+    """Draw a line and its band in the style number `i`."""
     color, line, _ = style_of(i)
     ax.plot(curve.x, curve.y, linestyle=line, color=color, lw=width, marker=marker, ms=marker_size, label=label)
     ax.fill_between(curve.x, curve.low, curve.high, color=color, alpha=0.18, lw=0)
@@ -222,14 +289,21 @@ def _thousands(x: float, _: Any) -> str:
     return f"{x / 1e3:g}k" if abs(x) >= 1e4 else f"{x:g}"
 
 
-def _legend(figure: Figure, axes: Sequence[Axes], groups: list[Group]) -> None:
-    """A legend below the panels, where it covers nothing, if there is anything to tell apart."""
-    found = {(str(line.get_label()), line.get_color()): line for ax in axes for line in ax.lines}
-    keys = [(_label(group), COLORS[i % len(COLORS)]) for i, group in enumerate(groups)]
-    labels, handles = [key[0] for key in keys if key in found], [found[key] for key in keys if key in found]
-    if not handles or (len(groups) < 2 and len(groups[0].runs) < 2):
-        return
-    columns = 2 if len(labels) > 3 else max(1, len(labels))
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=8, frameon=False)
+def _remove(axes: Sequence[Axes]) -> None:
+    for ax in axes:
+        ax.remove()
+
+
+def _finished(figure: Figure) -> Figure | None:
+    """The figure with a legend below its panels, or None if nothing is drawn."""
+    entries: dict[str, Any] = {}
+    for ax in figure.axes:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    if not entries:
+        return None
+    columns = 2 if len(entries) > 3 else len(entries)
+    figure.legend(entries.values(), entries, loc="outside lower center", ncols=columns, fontsize=8, frameon=False)
     width, height = figure.get_size_inches()
-    figure.set_size_inches(width, height + 0.22 * -(-len(labels) // columns))
+    figure.set_size_inches(width, height + 0.22 * -(-len(entries) // columns))
+    return figure

@@ -2,177 +2,189 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import jinja2
+import pandas as pd
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from cronos_lerobot.report import clips, figures, suite_views, tables
-from cronos_lerobot.report.comparisons import Comparison, compare_evaluations, compare_training, titled
-from cronos_lerobot.report.lerobot_evaluations import EvaluationRun
-from cronos_lerobot.report.png import to_png
-from cronos_lerobot.report.runs import Group, TrainingRun, group_runs
-from cronos_lerobot.report.suites import SuiteRun
+from cronos_lerobot.film.png import to_png
+from cronos_lerobot.report import figures, tables
+from cronos_lerobot.report.load import CRONOS_EVAL, EVALUATIONS, LEROBOT_EVAL, TRAIN, Loaded, Video
 
 PAGE = "index.html"
 DPI = 150
-SEQUENTIAL = "sequential.png"
-
-FIGURES: tuple[tuple[str, str, str, Callable[[list[Group]], Figure | None]], ...] = (
-    (
-        "evaluation",
+MAX_VIDEO_BYTES = 3_000_000
+"""A larger video stays a file beside the page."""
+MAX_TOTAL_BYTES = 30_000_000
+"""Of all embedded videos."""
+CAPTIONS = {
+    "evaluation": (
         "Evaluation during training",
-        "Every task from benchmark configurations, on environments of the evaluation's own. Left against the"
-        " experience gathered, right against the interventions it took (scene resets and the like; the arm going"
-        " home is free).",
-        figures.evaluation_figure,
+        "Success of single tasks against the experience gathered (left) and against the interventions it took"
+        " (right): scene resets and the like. The arm going home is free.",
     ),
-    (
-        "training",
+    "training": (
         "Success while training",
         "Share of the segments between two policy updates whose task was complete at any step.",
-        figures.training_figure,
     ),
-    (
-        "segments",
+    "segments": (
         "How success decays between scene resets",
         "Training segments by their number since the stream's last scene reset, in the last quarter of the run.",
-        figures.segments_figure,
     ),
-    (
-        "segment_history",
+    "segment_history": (
         "The same, over the run",
         "Bright is success. Rows further up are longer without a reset; time runs to the right.",
-        figures.segment_history_figure,
     ),
-    ("agent", "Agent's diagnostics", "One point for each policy update.", figures.agent_figure),
-)
+    "agent": ("Agent's diagnostics", "One point for each policy update."),
+    "sequential": ("Sequential suite", "Share of chains whose first k tasks all succeeded, with 95 % intervals."),
+    "stream": ("Stream suite", "Success by segment of a stream that is never reset, with 95 % intervals."),
+}
+"""Title and caption of each figure."""
+SHOWN = ("gains", "seeds", "independent", "stream", "lerobot_eval", "interventions", "speed")
+NAMES = (*SHOWN, "sequential", "evaluations", "updates", "segments")
+"""Of the tables: those that the page shows, and all that have a CSV file."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """What a report is drawn from."""
+    """What a report shows."""
 
-    training: list[TrainingRun]
-    evaluations: list[EvaluationRun]
-    """Those of `lerobot-eval` that are neither before nor after."""
-    before: list[EvaluationRun]
-    after: list[EvaluationRun]
-    videos: list[Path]
-    title: str
-    suites: list[SuiteRun] = field(default_factory=list)
-    """Those of `cronos-eval`."""
+    loaded: Loaded
+    before: Loaded | None = None
+    """Of the policy that a training began with."""
+    after: Loaded | None = None
+    """Of the policy that came out."""
+    videos: Sequence[Path] = ()
+    """More to show."""
+    title: str = "CRONOS report"
     left_out: list[str] = field(default_factory=list)
-    """What could not be read or is not shown, a sentence for each."""
 
     @property
-    def comparisons(self) -> list[Comparison]:
-        """`lerobot-eval` before and after first, then the trainings' own evaluations."""
-        return compare_evaluations(self.before, self.after) + compare_training(group_runs(self.training))
+    def gains(self) -> pd.DataFrame:
+        """Success before and after, by task."""
+        nothing = pd.DataFrame(columns=EVALUATIONS)
+        before, after = (one.evaluations if one else nothing for one in (self.before, self.after))
+        return tables.gain_table(self.loaded.evaluations, before, after)
+
+
+def make_tables(report: Report) -> dict[str, pd.DataFrame]:
+    """All tables of a report by name, without the empty ones."""
+    loaded = report.loaded
+    own = loaded.evaluations
+    measured = pd.concat([one.evaluations for one in (loaded, report.before, report.after) if one is not None])
+
+    def of(suite: str, **options: bool) -> pd.DataFrame:
+        some = own[(own["source"] == CRONOS_EVAL) & (own["suite"] == suite)]
+        return tables.part_table(some, ["policy", "split"], **options)
+
+    trained, lerobot = own[own["source"] == TRAIN], measured[measured["source"] == LEROBOT_EVAL]
+    made = {
+        "gains": report.gains,
+        "seeds": tables.seed_table(own),
+        "independent": of("independent"),
+        "sequential": of("sequential", with_all=False),
+        "stream": of("stream"),
+        "lerobot_eval": tables.part_table(lerobot, ["policy", "suite", "split"]),
+        "evaluations": tables.part_table(trained, ["row", "run", "seed", "steps", "interventions", "split"]),
+        "updates": loaded.updates,
+        "segments": loaded.segments,
+        "interventions": loaded.interventions,
+        "speed": tables.speed_table(loaded.updates),
+    }
+    return {name: table for name, table in made.items() if len(table)}
+
+
+def draw_figures(loaded: Loaded) -> dict[str, Figure]:
+    """All figures of a report by name, without the empty ones."""
+    drawn = {
+        "evaluation": figures.evaluation_figure(loaded.evaluations),
+        "training": figures.training_figure(loaded.updates),
+        "segments": figures.segments_figure(loaded.segments),
+        "segment_history": figures.segment_history_figure(loaded.segments),
+        "agent": figures.agent_figure(loaded.updates),
+    }
+    drawn |= {suite: figures.part_figure(loaded.evaluations, suite) for suite in ("sequential", "stream")}
+    return {name: figure for name, figure in drawn.items() if figure is not None}
 
 
 def write_report(report: Report, output: Path) -> Path:
     """Write the page, figures and tables into `output`; returns the page's path."""
     output.mkdir(parents=True, exist_ok=True)
-    groups = group_runs(report.training)
-    all_evaluations = report.before + report.after + report.evaluations
-    rows = {
-        "gains": tables.gain_rows(report.comparisons),
-        "seeds": tables.seed_rows(groups),
-        "independent": suite_views.independent_rows(report.suites),
-        "sequential": suite_views.sequential_rows(report.suites),
-        "lerobot_eval": tables.lerobot_eval_rows(all_evaluations),
-        "evaluations": tables.evaluation_rows(groups),
-        "updates": tables.update_rows(groups),
-        "segments": tables.segment_rows(groups),
-        "interventions": tables.intervention_rows(groups),
-        "resets": tables.reset_rows(groups),
-        "speed": tables.speed_rows(groups),
-    }
     # What another report left there is not of this one.
-    for file in (*(f"{name}.csv" for name in rows), *(f"{name}.png" for name, *_ in FIGURES), SEQUENTIAL):
+    for file in (*(f"{name}.csv" for name in NAMES), *(f"{name}.png" for name in CAPTIONS)):
         (output / file).unlink(missing_ok=True)
-    for name, table in rows.items():
-        if table:
-            tables.write_csv(output / f"{name}.csv", table)
+    made = make_tables(report)
+    for name, table in made.items():
+        table.to_csv(output / f"{name}.csv", index=False)
+    drawn = {name: to_png(figure, DPI) for name, figure in draw_figures(report.loaded).items()}
+    for name, png in drawn.items():
+        (output / f"{name}.png").write_bytes(png)
+    shown = {name: to_html(tables.merged(made[name])) for name in SHOWN if name in made}
+    if "sequential" in made:
+        shown["sequential"] = to_html(tables.chain_table(made["sequential"]))
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("cronos_lerobot.report", "."), autoescape=True, trim_blocks=True
     )
-    environment.filters |= {
-        "cell": _cell,
-        "titled": titled,
-        "percent": lambda x: f"{100 * x:.1f}",
-        "merged": tables.merge_statistics,
-        "columns": tables.column_names,
-    }
     page = environment.get_template("page.html.j2").render(
         title=report.title,
         time=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
-        comparisons=report.comparisons,
-        figures=_draw_figures(groups, output),
-        suite_figures=_draw_suites(report.suites, output),
-        tables={name: table for name, table in rows.items() if table},
-        clip_rows=_clip_rows(report, output),
-        manifests=[(run.name, json.dumps(run.starts, indent=2)) for run in report.training if run.starts],
-        runs=[(group, run) for group in groups for run in group.runs],
+        cards=_cards(made.get("gains")),
+        figures=[(*CAPTIONS[name], data_url(png, "image/png")) for name, png in drawn.items()],
+        tables=shown,
+        videos=list(_embedded(report, output)),
+        manifests=[(run.name, json.dumps(run.starts, indent=2)) for run in report.loaded.runs],
         left_out=report.left_out,
-        headline=_headline(report.comparisons),
     )
     (output / PAGE).write_text(page)
     return output / PAGE
 
 
-def _headline(comparisons: list[Comparison]) -> list[Comparison]:
-    """The comparisons that open the page: those of `lerobot-eval` if there are any."""
-    measured = [comparison for comparison in comparisons if comparison.label == "lerobot-eval"]
-    return measured or comparisons[:4]
+def _cards(gains: pd.DataFrame | None) -> list[dict[str, Any]]:
+    """The gains of all tasks that open the page: those of --after if there are any."""
+    if gains is None:
+        return []
+    overall = gains[gains["task"] == tables.ALL]
+    measured = overall[overall["runs"] == "--after"]
+    return (measured if len(measured) else overall[:4]).to_dict("records")
 
 
-def _draw_figures(groups: list[Group], output: Path) -> list[dict[str, str]]:
-    drawn = []
-    for name, title, caption, draw in FIGURES if groups else ():
-        figure = draw(groups)
-        if figure is None:
-            continue
-        drawn.append({"title": title, "caption": caption, "url": _write_png(figure, output / f"{name}.png")})
-    return drawn
-
-
-def _draw_suites(suites: list[SuiteRun], output: Path) -> list[str]:
-    figure = suite_views.sequential_figure(suites)
-    return [] if figure is None else [_write_png(figure, output / SEQUENTIAL)]
-
-
-def _write_png(figure: Figure, path: Path) -> str:
-    """Write a figure; returns it as a data URL."""
-    png = to_png(figure, DPI)
-    path.write_bytes(png)
-    return clips.data_url(png, "image/png")
-
-
-def _clip_rows(report: Report, output: Path) -> list[list[dict[str, Any]]]:
-    """Rows of videos, each with a data URL, or with the path of the file if it is too large."""
-    singles = clips.file_clips(report.videos) + clips.evaluation_clips(report.evaluations)
-    singles += suite_views.suite_clips(report.suites)
-    pairs = clips.comparison_clips(report.before, report.after)
-    rows = [*((clip,) for clip in singles), *pairs]
-    embedder = clips.Embedder()
-    return [[_embed(clip, embedder, output) for clip in row] for row in rows]
-
-
-def _embed(clip: clips.Clip, embedder: clips.Embedder, output: Path) -> dict[str, Any]:
-    url = embedder.video(clip.path)
-    link = clip.path.resolve().relative_to(output.resolve(), walk_up=True).as_posix()
-    return {"title": clip.title, "caption": clip.caption, "url": url, "link": quote(link)}
+def to_html(table: pd.DataFrame) -> Markup:
+    """A table as HTML. All its text is escaped."""
+    shown = table.convert_dtypes().astype(object).map(_cell)
+    shown.columns = [str(name).replace("_", " ") for name in shown]
+    return Markup(shown.to_html(index=False, border=0, escape=True))
 
 
 def _cell(value: Any) -> str:
-    if value is None:
+    if pd.isna(value):
         return ""
     return f"{value:.4g}" if isinstance(value, float) else f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def _embedded(report: Report, output: Path) -> list[dict[str, str | None]]:
+    """The videos of a page: as data URLs, or as links if they are too large."""
+    named = [Video(path, path.stem.replace("_", " "), "") for path in report.videos]
+    some = [one.videos for one in (report.loaded, report.before, report.after) if one is not None]
+    shown, left = [], MAX_TOTAL_BYTES
+    for video in (*named, *(video for videos in some for video in videos)):
+        size, url = video.path.stat().st_size, None
+        if size <= min(MAX_VIDEO_BYTES, left):
+            left -= size
+            url = data_url(video.path.read_bytes(), "video/mp4")
+        link = video.path.resolve().relative_to(output.resolve(), walk_up=True).as_posix()
+        shown.append({"title": video.title, "caption": video.caption, "url": url, "link": quote(link)})
+    return shown
+
+
+def data_url(content: bytes, mime_type: str) -> str:
+    """`content` inside a URL."""
+    return f"data:{mime_type};base64,{base64.b64encode(content).decode()}"

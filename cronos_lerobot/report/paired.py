@@ -1,34 +1,34 @@
 """The difference of two policies, or of two ways to train them, on the same episodes.
 
-What is done on the same episodes goes together: the difference of each pair says more than the two rates apart.
-The episodes of one configuration go together, too, as they begin in one scene, so errors are by configuration
-(Miller 2024, "Adding error bars to evals", arXiv:2411.00640, has both for language models).
+Outcomes of the same episode are correlated, so the difference of each pair says more than the two rates alone.
+Episodes from one configuration are correlated too, so errors are clustered by configuration (Miller 2024, "Adding
+error bars to evals", arXiv:2411.00640).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
-from lerobot_env_cronos.statistics import Z_95, wilson_interval
-from scipy.optimize import brentq
+import pandas as pd
 from scipy.stats import t as student_t
 
-from cronos_lerobot.evaluation.outcomes import Episode
-from cronos_lerobot.evaluation.sign_flip import sign_flip_p
+from cronos_lerobot.statistics import (
+    FEWEST_SEEDS,
+    cluster_variance,
+    effective_trials,
+    sign_flip_p,
+    wilson_interval,
+)
 
 ALPHA = 0.05
-"""Of all intervals, and of the decision for which `needed` episodes are counted."""
-FEWEST = 6
-"""Configurations with which p of the sign-flip test, at least 2 / 2**k, can come below ALPHA."""
-FEW = 2
-"""Trainings of a side of which Satterthwaite's degrees of freedom make too much."""
-LEAST = 1e-300
-"""A probability below which nobody would ask."""
-MOST = 10**7
-"""Configurations or trainings beyond which nobody would count."""
+"""Level of intervals and decisions."""
+POWER = 0.8
+"""With which `Difference.detectable` would be found."""
+KEYS = ["number", "configuration", "seed"]
+"""What identifies an episode of a suite and split: task or ordering, configuration, seed of the sampling."""
 
 
 @dataclass(frozen=True)
@@ -39,20 +39,12 @@ class Pairs:
     """(policies of A, episodes) int."""
     b: np.ndarray
     """(policies of B, episodes) int."""
-    configurations: np.ndarray
-    """(episodes,) the configuration, a cluster of episodes."""
+    clusters: np.ndarray
+    """(episodes,) int, from 0: episodes of one cluster are correlated."""
     unit: str = "configuration"
-    """What a cluster is, in words."""
+    """What a cluster is."""
     are_chains: bool = False
-    """Whether these are lengths, even if all of them are 0 or 1."""
-
-    @classmethod
-    def of(cls, a: np.ndarray, b: np.ndarray, episodes: Sequence[Episode]) -> Pairs:
-        """Pairs by configuration; where all episodes are of one, by repetition, with draws of its own each."""
-        configurations = np.array([episode.configuration for episode in episodes])
-        if len(np.unique(configurations)) > 1:
-            return cls(a, b, configurations)
-        return cls(a, b, np.array([episode.seed for episode in episodes]), "repetition of one configuration")
+    """Whether these are lengths of chains, even if all of them are 0 or 1."""
 
     @property
     def differences(self) -> np.ndarray:
@@ -60,33 +52,60 @@ class Pairs:
         return self.b.mean(axis=0) - self.a.mean(axis=0)
 
     @property
-    def whole_differences(self) -> np.ndarray:
-        """(clusters,) sum of the differences of each, times the policies of both sides: whole numbers."""
+    def k(self) -> int:
+        """Clusters."""
+        return int(self.clusters.max()) + 1
+
+    def p(self) -> float:
+        """Exact sign-flip p-value of these policies, over the clusters."""
         whole = self.b.sum(axis=0) * len(self.a) - self.a.sum(axis=0) * len(self.b)
-        return np.bincount(self.clusters, weights=whole).round().astype(int)
+        return sign_flip_p(np.bincount(self.clusters, weights=whole).round().astype(int))
 
-    @property
-    def units(self) -> str:
-        """What the clusters are, in words that follow their number."""
-        first, *rest = self.unit.split()
-        if len(np.unique(self.configurations)) == 1:
-            return self.unit
-        return " ".join([f"{first}s", *rest])
+    def part(self, mask: np.ndarray) -> Pairs:
+        """The pairs of some episodes; `mask` is (episodes,) bool."""
+        clusters = np.unique(self.clusters[mask], return_inverse=True)[1]
+        return Pairs(self.a[:, mask], self.b[:, mask], clusters, self.unit, self.are_chains)
 
-    @property
-    def clusters(self) -> np.ndarray:
-        """(episodes,) the number of its configuration, from 0."""
-        return np.unique(self.configurations, return_inverse=True)[1]
+    def reached(self, position: int) -> Pairs:
+        """Whether chains came beyond a position, as successes."""
+        a, b = ((lengths > position).astype(int) for lengths in (self.a, self.b))
+        return Pairs(a, b, self.clusters, self.unit)
 
-    @property
-    def is_binary(self) -> bool:
-        """Whether the successes of one policy are compared with those of one other."""
-        return self.is_one_each and not self.are_chains and max(self.a.max(), self.b.max()) <= 1
+    def gains(self) -> Pairs:
+        """The gain of each policy of B over the policy of A with its number, against 0."""
+        return Pairs(np.zeros_like(self.a[:1]), self.b - self.a, self.clusters, self.unit, are_chains=True)
 
-    @property
-    def is_one_each(self) -> bool:
-        """Whether one policy is compared with one other."""
-        return len(self.a) == len(self.b) == 1
+
+def pair(
+    a: Sequence[np.ndarray], b: Sequence[np.ndarray], *, are_chains: bool = False
+) -> tuple[Pairs, np.ndarray]:
+    """Pair the episodes that all policies of both sides have, sorted.
+
+    Episodes from one configuration are one cluster. If there is only one configuration, each repetition is one.
+
+    Args:
+        a: for each policy of A, its episodes (n, 4) int: seed, number, configuration, length.
+        b: the same of B.
+        are_chains: see `Pairs`.
+
+    Returns:
+        the pairs, and the `number` of each (task or ordering), (episodes,).
+
+    Raises:
+        ValueError: there is no shared episode, or a policy has two outcomes of one.
+    """
+    frames = [pd.DataFrame(one, columns=["seed", "number", "configuration", "length"]) for one in (*a, *b)]
+    columns = [frame.set_index(KEYS)["length"] for frame in frames]
+    if any(column.index.has_duplicates for column in columns):
+        raise ValueError("a policy has two evaluations of the same episodes: name the folder of one")
+    table = pd.concat(columns, axis=1, join="inner").sort_index()
+    if table.empty:
+        raise ValueError("no episode (task or ordering, configuration, sampling seed) was run by all policies")
+    keys, lengths = table.index.to_frame(index=False), table.to_numpy().T
+    is_one = keys["configuration"].nunique() == 1
+    clusters = np.unique(keys["seed" if is_one else "configuration"], return_inverse=True)[1]
+    unit = "repetition" if is_one else "configuration"
+    return Pairs(lengths[: len(a)], lengths[len(a) :], clusters, unit, are_chains), keys["number"].to_numpy()
 
 
 @dataclass(frozen=True)
@@ -95,169 +114,87 @@ class Difference:
 
     value: float
     ci95: tuple[float, float] | None
-    """None where no two outcomes say how much they vary."""
-    p: float | None
+    """None if the outcomes do not show how much they vary."""
+    p: float
     """Two-sided, of no difference."""
     method: str
     """Of the interval and of p."""
-    needed: int | None
-    """Configurations, or trainings of each side, with which a difference of this size is found with the power that
-    is asked for; None if there is no difference, or nothing to tell it from."""
-    detectable: float | None
-    """The difference that would have been found with that power, about: by a t-test."""
-
-    @property
-    def is_separated(self) -> bool:
-        """Whether p is below ALPHA."""
-        return self.p is not None and self.p < ALPHA
+    detectable: float | None = None
+    """The difference that a t-test would find with `POWER`, about; None if outcomes do not vary."""
 
 
-def compare_policies(pairs: Pairs, power: float) -> Difference:
-    """These very policies, on configurations like these.
+def compare_policies(pairs: Pairs) -> Difference:
+    """The difference of these very policies, on configurations like these.
 
-    p is that of the exact sign-flip test over the configurations (McNemar's where each has one episode). The
-    interval of a difference of two policies' success rates is `newcombe_paired_interval`, of `effective_pairs`;
-    any other is Student's, over the configurations.
+    p is that of the exact sign-flip test over the clusters: McNemar's if each has one episode. The interval of two
+    policies' success rates is Newcombe's, with `effective_trials`. Any other interval is Student's over clusters.
     """
-    value, k = float(pairs.differences.mean()), int(pairs.clusters.max()) + 1
-    spread = sqrt(k * cluster_variance(pairs.differences, pairs.clusters)) if k > 1 else 0.0
-    if pairs.is_binary:
-        interval, name = _newcombe(pairs), f"Newcombe's paired interval by {pairs.unit}"
+    value, k = float(pairs.differences.mean()), pairs.k
+    error = sqrt(cluster_variance(pairs.differences, pairs.clusters)) if k > 1 else 0.0
+    if len(pairs.a) == len(pairs.b) == 1 and not pairs.are_chains:
+        interval, name = _newcombe(pairs), "Newcombe's paired interval"
     else:
-        half = float(student_t.ppf(1 - ALPHA / 2, k - 1)) * spread / sqrt(k) if k > 1 else 0.0
-        interval = (value - half, value + half) if half else None
-        name = f"t-interval by {pairs.unit}"
-    needed = samples_needed(spread, value, power, lambda n: n - 1)
-    return Difference(
-        value,
-        interval,
-        sign_flip_p(pairs.whole_differences),
-        f"{name}, exact sign-flip p over {k} {pairs.units}",
-        None if needed is None else max(needed, FEWEST),
-        detectable(spread, k, power, k - 1) if k >= FEWEST else None,
-    )
+        half = float(student_t.ppf(1 - ALPHA / 2, k - 1)) * error if error else 0.0
+        interval, name = ((value - half, value + half) if half else None), "t-interval"
+    method = f"{name} by {pairs.unit}, exact sign-flip p over {k} {pairs.unit}s"
+    return Difference(value, interval, pairs.p(), method, _detectable(error, k - 1) if error else None)
 
 
-def compare_trainings(pairs: Pairs, power: float) -> Difference | None:
-    """Trainings like these, on configurations like these; None if neither side has two.
+def compare_trainings(pairs: Pairs) -> Difference | None:
+    """The difference of trainings like these, on configurations like these.
 
-    The variance is that of two crossed factors, training and configuration, both drawn at random (Searle, Casella
-    and McCulloch 1992, "Variance Components", chapter 4): that between the trainings of each side, plus that
-    between the configurations, less the interaction, which both of them have in them. A side of one policy, and
-    what trainings have in common, such as the base that they begin with, is taken as it is: where the trainings
-    are of several bases, it does not count how those differ. The t-interval has Satterthwaite's degrees of
-    freedom, or where FEW trainings stand against another number Cochran's quantile, and is no narrower than that
-    of the configurations alone where trainings differ less than chance has it.
+    The variance has two crossed random factors, training and configuration (Searle, Casella and McCulloch 1992,
+    "Variance Components", chapter 4): that between the trainings of each side, plus that between configurations,
+    less the interaction, which both contain. A side of one policy is taken as it is, and so is what all trainings
+    share, such as their base. The t-interval has Satterthwaite's degrees of freedom. If trainings vary less than
+    chance, it is at least as wide as that of the configurations alone.
+
+    Returns:
+        None if no side has several policies, or one has fewer than `FEWEST_SEEDS`.
     """
     sides = [side for side in (pairs.a, pairs.b) if len(side) > 1]
-    if not sides:
+    if not sides or min(map(len, sides)) < FEWEST_SEEDS:
         return None
-    k = int(pairs.clusters.max()) + 1
     value = float(pairs.differences.mean())
     of_side = [float(side.mean(axis=1).var(ddof=1)) / len(side) for side in sides]
-    trainings = sum(of_side)
-    both = sum(_interaction(side, pairs.clusters) for side in sides) if k > 1 else 0.0
-    configurations = cluster_variance(pairs.differences, pairs.clusters) if k > 1 else 0.0
+    both = sum(_interaction(side, pairs.clusters) for side in sides) if pairs.k > 1 else 0.0
+    configurations = cluster_variance(pairs.differences, pairs.clusters) if pairs.k > 1 else 0.0
     more = max(0.0, configurations - both)
-    variance = trainings + more
-    spread = sqrt(sum(v * len(side) for v, side in zip(of_side, sides, strict=True)))
-    counts = f"{len(pairs.a)} against {len(pairs.b)} trainings"
-    method = f"t-interval and p by training and {pairs.unit} ({counts}, {k} {pairs.units})"
-    per_side = len(sides)
-    needed = samples_needed(spread, value, power, lambda n: per_side * (n - 1))
-    parts = [(v, len(side) - 1) for v, side in zip(of_side, sides, strict=True)] + [(more, k - 1)] * (more > 0)
-    estimates = [parts] if variance else []
+    parts = [*zip(of_side, [len(side) - 1 for side in sides], strict=True), (more, pairs.k - 1)]
+    estimates = [_satterthwaite([part for part in parts if part[0] > 0])] if sum(of_side) + more else []
     # A variance between trainings that is estimated below 0 is none: no surer than of these policies alone.
-    if configurations and trainings < both * (1 - 1e-9):
-        estimates.append([(configurations, k - 1)])
+    if configurations and sum(of_side) < both * (1 - 1e-9):
+        estimates.append((sqrt(configurations), pairs.k - 1))
+    method = f"t-interval and p by training and {pairs.unit} ({len(pairs.a)} against {len(pairs.b)} trainings)"
     if not estimates:
-        if value:
-            method += ": nothing varies, so p is of these policies"
-        return Difference(value, None, sign_flip_p(pairs.whole_differences) if value else None, method, None, None)
-    are_few = len(pairs.a) != len(pairs.b) and min(map(len, sides)) == FEW
-    method += " with Cochran's quantile" * are_few
-    tests = [_t_test(value, StudentSum(one, are_few), power) for one in estimates]
-    half, p, found = map(max, zip(*tests, strict=True))
-    return Difference(value, (value - half, value + half), p, method, needed, found)
+        return Difference(value, None, pairs.p(), f"{method}: nothing varies, so p is of these policies")
+    half = max(float(student_t.ppf(1 - ALPHA / 2, df)) * error for error, df in estimates)
+    p = max(2 * float(student_t.sf(abs(value) / error, df)) for error, df in estimates)
+    return Difference(value, (value - half, value + half), p, method, max(_detectable(*one) for one in estimates))
 
 
-class StudentSum:
-    """About how an estimate is distributed whose variance is a sum of independent ones.
-
-    Args:
-        parts: variance, above 0 in all, and degrees of freedom of each.
-        is_weighted: with the mean of Student's quantiles, weighted by the variances (Cochran 1964, "Approximate
-            significance levels of the Behrens-Fisher test"), which is never too sure; else with Satterthwaite's
-            degrees of freedom, which takes a part of one degree of freedom that is small by chance for sure.
-    """
-
-    def __init__(self, parts: Sequence[tuple[float, int]], is_weighted: bool) -> None:
-        variance = sum(v for v, _ in parts)
-        self.error = sqrt(variance)
-        self._weights, self._dfs = np.array(parts, float).T
-        if not is_weighted:
-            satterthwaite = variance**2 / sum(v * v / df for v, df in parts)
-            self._weights, self._dfs = np.ones(1), np.array([satterthwaite])
-
-    def quantile(self, tail: float) -> float:
-        """The deviation, in its standard errors, beyond which this much of it lies on one side."""
-        if len(self._dfs) == 1:
-            return float(student_t.ppf(1 - tail, self._dfs[0]))
-        return float(np.average(student_t.isf(tail, self._dfs), weights=self._weights))
-
-    def p(self, deviation: float) -> float:
-        """Two-sided, of a deviation in standard errors."""
-        tails = student_t.sf(abs(deviation), self._dfs)
-        if len(tails) == 1:
-            return 2 * float(tails[0])
-        # Between that of the part with the fewest and that of the one with the most degrees of freedom; rounded.
-        low, high = max(float(tails.min()) * 0.999, LEAST), max(float(tails.max()) * 1.001, 2 * LEAST)
-        return 2 * float(brentq(lambda tail: self.quantile(tail) - abs(deviation), low, high, xtol=LEAST))
+def _satterthwaite(parts: Sequence[tuple[float, int]]) -> tuple[float, float]:
+    """Standard error and degrees of freedom of a sum of independent variances with theirs."""
+    variance = sum(v for v, _ in parts)
+    return sqrt(variance), variance**2 / sum(v * v / df for v, df in parts)
 
 
-def _t_test(value: float, estimate: StudentSum, power: float) -> tuple[float, float, float]:
-    """Half of the interval around a difference, p, and the difference that is found with that power."""
-    quantile = estimate.quantile(ALPHA / 2)
-    found = (quantile + estimate.quantile(1 - power)) * estimate.error
-    return quantile * estimate.error, estimate.p(value / estimate.error), found
-
-
-def cluster_variance(values: np.ndarray, clusters: np.ndarray) -> float:
-    """Variance of the mean of values that go together by cluster, of which there are at least two."""
-    k = int(clusters.max()) + 1
-    sums = np.bincount(clusters, weights=values - values.mean(), minlength=k)
-    return float(np.sum(sums**2)) * k / (k - 1) / len(values) ** 2
+def _detectable(error: float, df: float) -> float:
+    return float(student_t.ppf(1 - ALPHA / 2, df) + student_t.ppf(POWER, df)) * error
 
 
 def _interaction(side: np.ndarray, clusters: np.ndarray) -> float:
-    """The part of the variance of a side's mean that is of neither its trainings nor its configurations alone.
-
-    What is the same in all trainings, such as the noise of one base that each is compared with, is not in it.
-    """
+    """The part of the variance of a side's mean that is neither of its trainings nor of its clusters alone."""
     n, k = len(side), int(clusters.max()) + 1
     sums = np.stack([np.bincount(clusters, weights=row) for row in side - side.mean()])
     rest = sums - sums.mean(axis=0) - sums.mean(axis=1, keepdims=True) + sums.mean()
     return float(np.sum(rest**2)) * n * k / ((n - 1) * (k - 1)) / side.size**2
 
 
-def effective_pairs(differences: np.ndarray, clusters: np.ndarray) -> float:
-    """How many independent pairs would say as much as these, of which those of one cluster go together.
-
-    As `evaluation.rates.effective_trials`, of differences: n over the design effect, at least 1, with Student's
-    quantile; where no pair differs, as if clusters went together completely.
-    """
-    n, k = len(differences), int(clusters.max()) + 1
-    variance = float(differences.var())
-    if k in (1, n) or variance == 0:
-        return float(k)
-    design_effect = max(1.0, cluster_variance(differences, clusters) / (variance / n))
-    return n / design_effect * (Z_95 / float(student_t.ppf(0.975, k - 1))) ** 2
-
-
 def _newcombe(pairs: Pairs) -> tuple[float, float]:
     a, b = pairs.a[0].astype(bool), pairs.b[0].astype(bool)
     counts = np.array([(b & a).sum(), (b & ~a).sum(), (~b & a).sum(), (~b & ~a).sum()])
-    n = effective_pairs(pairs.differences, pairs.clusters)
+    n = effective_trials(pairs.differences, pairs.clusters)
     return newcombe_paired_interval(*(counts / len(a) * n).tolist())
 
 
@@ -265,11 +202,10 @@ def newcombe_paired_interval(both: float, first: float, second: float, neither: 
     """95 % interval of the difference of two success rates on the same pairs, first minus second.
 
     Newcombe 1998, "Improved confidence intervals for the difference between binomial proportions based on paired
-    data", method 10: the Wilson intervals of the two rates, put together with the correlation of the pairs,
-    continuity corrected.
+    data", method 10: the Wilson intervals of the two rates, joined by the correlation of the pairs.
 
     Args:
-        both: pairs in which both succeed; not necessarily a whole number, as the others.
+        both: pairs in which both succeed; an effective number, not necessarily whole, like the others.
         first: only the first.
         second: only the second.
         neither: none of them.
@@ -290,50 +226,10 @@ def newcombe_paired_interval(both: float, first: float, second: float, neither: 
     return difference - distance(p1 - low1, high2 - p2), difference + distance(high1 - p1, p2 - low2)
 
 
-def samples_needed(spread: float, difference: float, power: float, df: Callable[[int], int]) -> int | None:
-    """Samples for which a t-test at ALPHA finds a difference with a power, about.
-
-    The smallest n with (t_(1 - alpha/2) + t_power) spread / sqrt(n) <= |difference|.
-
-    Args:
-        spread: standard deviation of a sample.
-        difference: between the means.
-        power: 0.5 to 1.
-        df: the test's degrees of freedom of n samples.
-
-    Returns:
-        None if there is no difference, no spread, or if it is more than MOST.
-    """
-    if not spread or not difference:
-        return None
-
-    def is_enough(n: int) -> bool:
-        found = detectable(spread, n, power, df(n))
-        return found is not None and found <= abs(difference)
-
-    low, high = 1, 2
-    while not is_enough(high):
-        low, high = high, 2 * high
-        if high > MOST:
-            return None
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if is_enough(middle) else (middle, high)
-    return high
-
-
-def detectable(spread: float, n: int, power: float, df: int) -> float | None:
-    """The difference that a t-test of n samples at ALPHA finds with a power, about; None if they do not vary."""
-    if df < 1 or not spread:
-        return None
-    quantiles = float(student_t.ppf(1 - ALPHA / 2, df)) + float(student_t.ppf(power, df))
-    return quantiles * spread / sqrt(n)
-
-
-def holm(ps: list[float]) -> list[float]:
+def holm(ps: Sequence[float]) -> list[float]:
     """p-values of several tests, adjusted so that the chance of any false decision stays in bounds (Holm 1979)."""
-    adjusted, largest = [0.0] * len(ps), 0.0
-    for rank, i in enumerate(np.argsort(ps)):
-        largest = max(largest, min(1.0, (len(ps) - rank) * ps[i]))
-        adjusted[i] = largest
-    return adjusted
+    order = np.argsort(ps)
+    adjusted = np.empty(len(ps))
+    steps = np.arange(len(ps), 0, -1) * np.asarray(ps, float)[order]
+    adjusted[order] = np.minimum(1.0, np.maximum.accumulate(steps))
+    return adjusted.tolist()

@@ -1,243 +1,220 @@
-"""The tables of a report: what its page shows, and the CSV files beside it."""
+"""The tables of a report, from the tables that `load` reads."""
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-from cronos_lerobot.protocol.metrics import Summary, performance_gap, success_at, summarise, summarise_rates
-from cronos_lerobot.report.comparisons import Comparison, titled
-from cronos_lerobot.report.lerobot_evaluations import EvaluationRun
-from cronos_lerobot.report.runs import Group, TrainingRun, agent_metrics, evaluation_rates
-from cronos_lerobot.report.statistics import Gain, Rate
+import numpy as np
+import pandas as pd
 
-Row = dict[str, Any]
+from cronos_lerobot.report.load import APART, TRAIN
+from cronos_lerobot.report.paired import Pairs, compare_policies, compare_trainings, pair
+from cronos_lerobot.statistics import (
+    Summary,
+    cluster_interval,
+    performance_gap,
+    success_at,
+    summarise,
+    wilson_interval,
+)
+
 ALL = "all tasks"
-APART = ("found_complete", "never_grasped")
-"""Of the successes, those for which nothing had to be done, and others without a grasp."""
+Cells = dict[str, Any]
 
 
-def rate_columns(rate: Rate, prefix: str = "") -> Row:
-    """Columns of a success rate: successes, n, rate and the ends of its 95 % interval."""
-    low, high = rate.interval
-    columns = {"successes": rate.successes, "n": rate.n, "success": rate.value, "ci95_low": low, "ci95_high": high}
-    return {prefix + name: value for name, value in columns.items()}
+def seed_table(evaluations: pd.DataFrame) -> pd.DataFrame:
+    """Success, interventions, D and C of each row, over its seeds, at the last step that all of them have reached.
 
-
-def gain_rows(comparisons: Iterable[Comparison]) -> list[Row]:
-    """Before, after and gain, one row for all tasks and one for each."""
-    rows = []
-    for comparison in comparisons:
-        for task, gain in {ALL: comparison.overall, **comparison.tasks}.items():
-            rows.append({"runs": comparison.label, "suite": comparison.suite, "task": task} | _gain_columns(gain))
-    return rows
-
-
-def _gain_columns(gain: Gain) -> Row:
-    low, high = gain.interval
-    ends = {"gain": gain.value, "gain_ci95_low": low, "gain_ci95_high": high}
-    rates = rate_columns(gain.before, "before_") | rate_columns(gain.after, "after_")
-    # Of lerobot-eval there are folders and no seeds.
-    return rates | {"seeds": len(getattr(gain.after, "seeds", ())) or None} | ends
-
-
-def seed_rows(groups: Iterable[Group]) -> list[Row]:
-    """What the seeds of each group came to, up to the last step that all of them have reached.
-
-    Success, interventions, and the areas D and C divided by the lengths of their axes, of evaluations made alike:
-    without areas where those do not begin with the run.
+    D and C are divided by the length of their axes. They are NaN if a curve does not begin at step 0.
     """
     rows = []
-    for group in groups:
-        runs = [run for run in group.runs if len(run.alike) > 1]
-        curves = [run.alike for run in runs]
+    for label, curves in training_curves(evaluations).items():
+        curves = [curve for curve in curves if len(curve) > 1]
         if not curves:
             continue
-        end = min(curve[-1]["interaction_steps"] for curve in curves)
-        steps = [[e["interaction_steps"] for e in curve] for curve in curves]
-        success = [[e["success"] for e in curve] for curve in curves]
-        spent = [[e["interventions"] for e in curve] for curve in curves]
-        at_end = [success_at(x, y, end) for x, y in zip(steps, spent, strict=True)]
-        by_steps = [performance_gap(x, y, end).normalised for x, y in zip(steps, success, strict=True)]
-        by_resets = [
-            performance_gap(x, y, up_to).normalised for x, y, up_to in zip(spent, success, at_end, strict=True)
-        ]
-        row: Row = {"runs": group.label, "seeds": len(curves), "split": curves[0][-1]["split"]}
-        row |= {"n": curves[0][-1]["n"], "interaction_steps": end}
-        rates = [success_at(x, y, end) for x, y in zip(steps, success, strict=True)]
-        row |= _summary_columns("success", summarise_rates(rates))
-        last = [curve[-1] for curve in curves]
-        are_there = all(e["interaction_steps"] == end for e in last)
-        row |= {name: sum(e.get(name, 0) for e in last) if are_there else None for name in APART}
-        row |= _summary_columns("interventions", summarise(at_end))
-        are_whole = all(run.begins_alike for run in runs)
-        row |= _summary_columns("D / steps", summarise_rates(by_steps) if are_whole else None)
-        row |= _summary_columns("C / interventions", summarise_rates(by_resets) if are_whole else None)
-        rows.append(row)
-    return rows
+        end = min(curve["steps"].iloc[-1] for curve in curves)
+        spent = [success_at(curve["steps"], curve["interventions"], end) for curve in curves]
+        gaps = [_gaps(curve, end, spent_here) for curve, spent_here in zip(curves, spent, strict=True)]
+        last = curves[0].iloc[-1]
+        row: Cells = {
+            "runs": label,
+            "seeds": len(curves),
+            "split": last["split"],
+            "n": last["n"],
+            "steps": int(end),
+        }
+        row |= cells_of("success", summarise([success_at(c["steps"], c["success"], end) for c in curves], (0, 1)))
+        row |= cells_of("interventions", summarise(spent))
+        row |= cells_of("D / steps", summarise([d for d, _ in gaps], (0, 1)))
+        rows.append(row | cells_of("C / interventions", summarise([c for _, c in gaps], (0, 1))))
+    return pd.DataFrame(rows)
 
 
-def _summary_columns(name: str, summary: Summary | None) -> Row:
-    if summary is None:
-        return {name: None, f"{name} std": None, f"{name} ci95_low": None, f"{name} ci95_high": None}
-    low, high = summary.ci95 or (None, None)
-    return {name: summary.mean, f"{name} std": summary.std, f"{name} ci95_low": low, f"{name} ci95_high": high}
+def training_curves(evaluations: pd.DataFrame) -> dict[str, list[pd.DataFrame]]:
+    """The evaluations of each run that were made like its last one, by row."""
+    own = evaluations[(evaluations["source"] == TRAIN) & evaluations["is_alike"].astype(bool)]
+    return {
+        str(label): [curve for _, curve in some.groupby("folder", sort=False)]
+        for label, some in own.groupby("row", sort=False)
+    }
 
 
-def lerobot_eval_rows(runs: Iterable[EvaluationRun]) -> list[Row]:
-    """Success of every `lerobot-eval` folder, for all tasks and for each."""
-    return [
-        {"folder": run.name, "suite": run.suite, "task": task} | rate_columns(rate)
-        for run in runs
-        for task, rate in {ALL: run.overall, **run.tasks}.items()
-    ]
+def is_at_end(last: pd.DataFrame) -> pd.Series:
+    """Which runs of a row have come as far as the others, by their last evaluations, or spent their budget."""
+    return (last["steps"] == last["steps"].max()) | last["is_budget_spent"].astype(bool)
 
 
-def evaluation_rows(groups: Iterable[Group]) -> list[Row]:
-    """The periodic evaluations of the training runs."""
+def _gaps(curve: pd.DataFrame, end: float, spent: float) -> tuple[float, float]:
+    """D and C of a curve, divided by their axes."""
+    if curve["steps"].iloc[0]:
+        return np.nan, np.nan
+    axes = ((curve["steps"], end), (curve["interventions"], spent))
+    by_steps, by_resets = (performance_gap(x, curve["success"], up_to).normalised for x, up_to in axes)
+    return by_steps, by_resets
+
+
+def cells_of(name: str, summary: Summary | None) -> Cells:
+    """The cells of a summary: mean, standard deviation and ends of the interval."""
+    low, high = (summary.ci95 if summary else None) or (None, None)
+    mean, std = (summary.mean, summary.std) if summary else (None, None)
+    return {name: mean, f"{name} std": std, f"{name} ci95_low": low, f"{name} ci95_high": high}
+
+
+def gain_table(evaluations: pd.DataFrame, before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
+    """Success before and after, and the gain, of all tasks and of each.
+
+    Args:
+        evaluations: the first and last ones of each training are compared, if it came as far as the others.
+        before: evaluations of the policy that a training began with, compared by suite and split.
+        after: the same of the policies that came out.
+    """
     rows = []
-    for group in groups:
-        for run in group.runs:
-            for evaluation in run.evaluations:
-                counters = {name: evaluation[name] for name in ("interaction_steps", "interventions", "split")}
-                counters["temperature"] = evaluation.get("temperature")
-                rates = evaluation_rates(evaluation)
-                overall = Rate(round(evaluation["success"] * evaluation["n"]), evaluation["n"])
-                for task, rate in {ALL: overall, **rates}.items():
-                    found = evaluation if task == ALL else evaluation["per_task"][task]
-                    apart = {name: found.get(name) for name in APART}
-                    rows.append(_identity(group, run) | counters | {"task": task} | rate_columns(rate) | apart)
-    return rows
+    for key, new in after.groupby(["suite", "split"], sort=False):
+        old = before[(before["suite"] == key[0]) & (before["split"] == key[1])]
+        if len(old):
+            rows += _gain_rows("--after", "_".join(key), old, new)
+    for label, curves in training_curves(evaluations).items():
+        ended = is_at_end(pd.concat([curve.tail(1) for curve in curves]))
+        whole = [c for c, there in zip(curves, ended, strict=True) if there and len(c) > 1]
+        whole = [curve for curve in whole if curve["steps"].iloc[0] == 0]
+        if whole:
+            old, new = (pd.concat([curve.iloc[[place]] for curve in whole]) for place in (0, -1))
+            rows += _gain_rows(label, f"periodic evaluation, {new['split'].iloc[0]}", old, new)
+    return pd.DataFrame(rows)
 
 
-def update_rows(groups: Iterable[Group]) -> list[Row]:
-    """Every policy update: training success, the agent's diagnostics, speed."""
+def _gain_rows(runs: str, suite: str, old: pd.DataFrame, new: pd.DataFrame) -> Iterator[Cells]:
+    are_chains = new["suite"].iloc[0] != "independent"
+    try:
+        pairs, numbers = pair(list(old["episodes"]), list(new["episodes"]), are_chains=are_chains)
+    except ValueError:
+        # Of other episodes: there is nothing to compare.
+        return
+    names = [part["part"] for part in new["parts"].iloc[0]]
+    tasks = {} if are_chains else {name: numbers == i for i, name in enumerate(names)}
+    for task, mask in ({ALL: np.full(len(numbers), True)} | tasks).items():
+        if mask.any():
+            yield {"runs": runs, "suite": suite, "task": task} | _gain_cells(pairs.part(mask))
+
+
+def _gain_cells(pairs: Pairs) -> Cells:
+    seeds = len(pairs.b)
+    is_each_own = len(pairs.a) == seeds > 1
+    found = compare_trainings(pairs.gains() if is_each_own else pairs) if seeds > 1 else compare_policies(pairs)
+    low, high = (found.ci95 if found else None) or (None, None)
+    cells = {"n": pairs.b.shape[1], "seeds": seeds}
+    for name, lengths in (("before", pairs.a), ("after", pairs.b)):
+        ends = _interval(lengths, pairs)
+        cells |= {name: float(lengths.mean()), f"{name} ci95_low": ends[0], f"{name} ci95_high": ends[1]}
+    cells |= {"gain": float(pairs.differences.mean()), "gain ci95_low": low, "gain ci95_high": high}
+    return cells | {"p": found.p if found else None}
+
+
+def _interval(lengths: np.ndarray, pairs: Pairs) -> tuple[float | None, float | None]:
+    """Of one policy by configuration, of several over the trainings."""
+    if len(lengths) == 1 and not pairs.are_chains:
+        return cluster_interval(lengths[0] > 0, pairs.clusters)
+    summary = summarise(lengths.mean(axis=1))
+    return (summary.ci95 if summary else None) or (None, None)
+
+
+def part_table(evaluations: pd.DataFrame, columns: Sequence[str], *, with_all: bool = True) -> pd.DataFrame:
+    """Success of all tasks together and of each task, position or segment, one row for each.
+
+    Args:
+        evaluations: any of them.
+        columns: of theirs, repeated in each row.
+        with_all: whether to begin with a row of all.
+    """
     rows = []
-    for group in groups:
-        for run in group.runs:
-            for update in run.updates:
-                rollout = update["rollout"]
-                row = _identity(group, run) | {
-                    name: update[name] for name in ("interaction_steps", "interventions", "updates")
-                }
-                row |= {name: rollout[name] for name in ("success", "segments", "reward_per_segment", "diverged")}
-                row |= {name: (rollout.get(name) or [None])[0] for name in APART}
-                row |= {f"agent/{name}": value for name, value in agent_metrics(update).items()}
-                row |= {"steps_per_s": update["steps_per_s"]}
-                rows.append(row | {f"time/{name}": value for name, value in update["time_share"].items()})
-    return rows
+    rate = ["n", "success", "ci95_low", "ci95_high", *APART]
+    for _, one in evaluations.iterrows():
+        overall = [{"part": ALL} | one[rate].to_dict()] if with_all else []
+        rows += [one[list(columns)].to_dict() | cells for cells in (*overall, *one["parts"])]
+    table = pd.DataFrame(rows)
+    return table.rename(columns={"ci95_low": "success ci95_low", "ci95_high": "success ci95_high", "part": "task"})
 
 
-def segment_rows(groups: Iterable[Group]) -> list[Row]:
-    """Training success by segment since the last scene reset (0 is the first), for every update."""
+def chain_table(parts: pd.DataFrame) -> pd.DataFrame:
+    """The `part_table` of the sequential suite, to read: a column for each position."""
+    table = parts.rename(columns={"std": "success std"})
+    table = merged(table).pivot(index=["policy", "split", "orderings", "n"], columns="task", values="success")
+    return table.reset_index().rename_axis(columns=None)
+
+
+def speed_table(updates: pd.DataFrame) -> pd.DataFrame:
+    """Steps per second of every run, and the shares of its time, without evaluations and checkpoints."""
     rows = []
-    for group in groups:
-        for run in group.runs:
-            for update in run.updates:
-                for position, (successes, n) in update["rollout"]["success_by_segment"].items():
-                    counters = {"interaction_steps": update["interaction_steps"], "segment": int(position)}
-                    rows.append(_identity(group, run) | counters | rate_columns(Rate(successes, n)))
-    return rows
+    shares = [name for name in updates if name.startswith("time/")]
+    for (label, run, seed), some in updates.groupby(["row", "run", "seed"], sort=False, dropna=False):
+        steps = some["steps"].diff().fillna(some["steps"])
+        seconds = steps / some["steps_per_s"]
+        row = {"runs": label, "run": run, "seed": seed, "steps_per_s": steps.sum() / seconds.sum()}
+        row |= {"minutes": seconds.sum() / 60}
+        means = (some[shares].mul(seconds, axis=0)).sum() / seconds.sum()
+        rows.append(row | {f"{name.removeprefix('time/')} share": value for name, value in means.items()})
+    return pd.DataFrame(rows)
 
 
-def intervention_rows(groups: Iterable[Group]) -> list[Row]:
-    """Interventions of every run, in all, of single streams, and by kind."""
+def rates_by_part(segments: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+    """Training success by `by`: of one run with a Wilson interval, of several with Student's over the seeds.
+
+    Returns:
+        `by`, successes, n, success, ci95_low, ci95_high (NaN for two seeds). Of one run segments count as
+        independent.
+    """
     rows = []
-    for group in groups:
-        for run in group.runs:
-            last = run.last
-            counters = {name: last[name] for name in ("interaction_steps", "interventions")}
-            # Records of older runs do not have them.
-            streams = last.get("interventions_by_stream") or []
-            extremes = {"fewest of a stream": min(streams), "most of a stream": max(streams)} if streams else {}
-            by_kind = dict(last["interventions_by_kind"])
-            if by_kind.get("takeover"):
-                by_kind["takeover price"] = run.config["protocol"]["takeover_price"]
-            rows.append(_identity(group, run) | counters | extremes | by_kind)
-    return rows
+    for key, some in segments.groupby(list(by), sort=False):
+        counts = some.groupby("folder")[["successes", "n"]].sum()
+        successes, n = (int(count) for count in counts.sum())
+        if len(counts) == 1:
+            ends = wilson_interval(successes, n)
+        else:
+            summary = summarise(counts["successes"] / counts["n"], (0, 1))
+            ends = (summary.ci95 if summary else None) or (np.nan, np.nan)
+        rows.append(dict(zip(by, key, strict=True)) | _counts(successes, n, ends))
+    return pd.DataFrame(rows)
 
 
-def reset_rows(groups: Iterable[Group]) -> list[Row]:
-    """How runs whose values asked for scene resets spent them: by segments since the stream's last one."""
-    rows = []
-    for group in groups:
-        for run in group.runs:
-            resets = [reset for update in run.updates for reset in update.get("critic", {}).get("resets", [])]
-            for segments in sorted({reset["segments"] for reset in resets}):
-                values = [reset["value"] for reset in resets if reset["segments"] == segments]
-                row = {"segments": segments, "resets": len(values), "mean best value": sum(values) / len(values)}
-                rows.append(_identity(group, run) | row)
-    return rows
+def _counts(successes: int, n: int, ends: tuple[float, float]) -> Cells:
+    return {"successes": successes, "n": n, "success": successes / n, "ci95_low": ends[0], "ci95_high": ends[1]}
 
 
-def speed_rows(groups: Iterable[Group]) -> list[Row]:
-    """Steps per second of every run and where its time went, evaluations and checkpoints left out."""
-    rows = []
-    for group in groups:
-        for run in group.runs:
-            if not run.updates:
-                continue
-            steps = [
-                now["interaction_steps"] - before
-                for before, now in zip(
-                    [0, *(update["interaction_steps"] for update in run.updates)], run.updates, strict=False
-                )
-            ]
-            seconds = [n / update["steps_per_s"] for n, update in zip(steps, run.updates, strict=True)]
-            shares: Row = {}
-            for spent, update in zip(seconds, run.updates, strict=True):
-                for name, share in update["time_share"].items():
-                    shares[name] = shares.get(name, 0.0) + share * spent / sum(seconds)
-            rate = {"steps_per_s": sum(steps) / sum(seconds), "minutes": sum(seconds) / 60}
-            rows.append(_identity(group, run) | rate | {f"{name} share": share for name, share in shares.items()})
-    return rows
+def merged(table: pd.DataFrame) -> pd.DataFrame:
+    """For reading: a number with its `std`, `ci95_low` and `ci95_high` in one cell instead of four."""
+    parts = ("std", "ci95_low", "ci95_high")
+    shown = table.copy()
+    for name in table:
+        own = [f"{name} {part}" for part in parts]
+        if any(column in table for column in own):
+            columns = table.reindex(columns=[name, *own]).itertuples(index=False, name=None)
+            shown[name] = [_spread(*numbers) for numbers in columns]
+    return shown.drop(columns=[name for name in table if str(name).endswith(tuple(f" {part}" for part in parts))])
 
 
-def _identity(group: Group, run: TrainingRun) -> Row:
-    return {"runs": group.label, "run": run.name, "seed": run.seed}
-
-
-def merge_statistics(rows: list[Row]) -> list[Row]:
-    """For reading: a number, its `std` and its `ci95_low` and `ci95_high` in one cell instead of four."""
-    merged = []
-    for row in rows:
-        cells: Row = {}
-        for name, value in row.items():
-            if name.endswith((" std", " ci95_low", " ci95_high")):
-                continue
-            std, low, high = (row.get(f"{name} {part}") for part in ("std", "ci95_low", "ci95_high"))
-            if isinstance(value, float) and (std, low) != (None, None):
-                text = f"{value:.4g}" + (f" ± {std:.2g}" if std is not None else "")
-                value = text + (f" [{low:.4g}, {high:.4g}]" if low is not None and high is not None else "")
-            cells[name] = value
-        merged.append(cells)
-    return merged
-
-
-def column_names(rows: list[Row]) -> list[str]:
-    """The columns of rows that may have different ones, in the order in which they appear."""
-    return list(dict.fromkeys(name for row in rows for name in row))
-
-
-def write_csv(path: Path, rows: list[Row]) -> None:
-    """Write rows that may have different columns; a missing value is an empty cell."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, column_names(rows), restval="")
-        writer.writeheader()
-        writer.writerows(rows)
-
-
-def comparison_text(comparisons: Iterable[Comparison]) -> str:
-    """The before/after table for a terminal, all tasks and each, with n, 95 % intervals and the gain."""
-    header = ("", "before", "after", "gain")
-    lines: list[tuple[str, ...]] = [header]
-    for title, comparison in titled(comparisons):
-        lines.append((title, "", "", ""))
-        for task, gain in {ALL: comparison.overall, **comparison.tasks}.items():
-            lines.append((f"  {task}", str(gain.before), str(gain.after), str(gain)))
-    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
-    )
+def _spread(value: Any, std: Any, low: Any, high: Any) -> str:
+    if pd.isna(value):
+        return ""
+    text = f"{value:.4g}" + ("" if pd.isna(std) else f" ± {std:.2g}")
+    return text if pd.isna(low) or pd.isna(high) else f"{text} [{low:.4g}, {high:.4g}]"

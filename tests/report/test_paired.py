@@ -4,18 +4,15 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_1samp, ttest_ind, ttest_rel
 
-from cronos_lerobot.evaluation.outcomes import Episode
 from cronos_lerobot.report.paired import (
     Pairs,
-    StudentSum,
     compare_policies,
     compare_trainings,
-    detectable,
-    effective_pairs,
     holm,
     newcombe_paired_interval,
-    samples_needed,
+    pair,
 )
+from cronos_lerobot.statistics import effective_trials
 
 
 @pytest.mark.parametrize(
@@ -40,21 +37,18 @@ def one_each(counts):
 
 
 def test_one_episode_from_each_configuration():
-    found = compare_policies(one_each((20, 12, 2, 16)), power=0.8)
+    found = compare_policies(one_each((20, 12, 2, 16)))
     assert found.value == 0.2
     assert found.ci95 == pytest.approx((0.0562, 0.3292), abs=6e-5)
     # 14 pairs differ, 12 of them one way: 2 (1 + 14 + 91) / 2^14.
     assert found.p == 212 / 16384
-    assert found.is_separated
-    # The differences have variance 14/50 - .2^2 = .24, by n - 1 .24 x 50/49: spread .4949. With n = 50 and about
-    # (2.01 + .85) .4949 / sqrt(50) = .2001, just too much: it takes one more.
+    # The differences have variance 14/50 - .2^2 = .24, by n - 1 .24 x 50/49: (2.01 + .85) .4949 / sqrt(50).
     assert found.detectable == pytest.approx(0.2001, abs=1e-4)
-    assert found.needed == 51
 
 
 def test_no_pair_differs():
-    found = compare_policies(one_each((30, 0, 0, 20)), power=0.8)
-    assert (found.value, found.p, found.needed, found.detectable) == (0, 1, None, None)
+    found = compare_policies(one_each((30, 0, 0, 20)))
+    assert (found.value, found.p, found.detectable) == (0, 1, None)
     # Not certain to be alike; if A always fails where B succeeds, 0 of 50 has Wilson's [0, .0713].
     low, high = found.ci95
     assert low == pytest.approx(-high)
@@ -65,13 +59,13 @@ def test_episodes_of_a_configuration_that_go_together_count_as_one():
     # Ten configurations of four episodes that come out alike: as ten pairs, of which 8 and 2 differ.
     d = np.repeat([1] * 8 + [-1] * 2, 4)
     pairs = Pairs((d < 0).astype(int)[None], (d > 0).astype(int)[None], np.repeat(np.arange(10), 4))
-    found = compare_policies(pairs, power=0.8)
+    found = compare_policies(pairs)
     assert found.value == pytest.approx(0.6)
     # 2 (1 + 10 + 45) / 2^10, by configuration; by episode it would be 2e-5.
     assert found.p == 112 / 1024
     # The variance of the mean is that of ten numbers, .64 x 10/9 / 10, that of 40 alone .64 / 40: design effect
     # 40/9, so 9 pairs, and with (1.960 / 2.262)^2 for ten clusters 6.757.
-    assert effective_pairs(d.astype(float), pairs.clusters) == pytest.approx(6.757, abs=1e-3)
+    assert effective_trials(d.astype(float), pairs.clusters) == pytest.approx(6.757, abs=1e-3)
     theirs = ttest_1samp([1] * 8 + [-1] * 2, 0)
     assert found.detectable == pytest.approx((2.2622 + 0.8834) * theirs._standard_error, abs=1e-3)
 
@@ -79,14 +73,14 @@ def test_episodes_of_a_configuration_that_go_together_count_as_one():
 def test_chains_that_all_have_the_same_length_say_nothing_of_others():
     """As the lengths of chains of which none came to a task, which are no rates."""
     none = np.zeros((1, 8), int)
-    found = compare_policies(Pairs(none, none, np.arange(8), are_chains=True), power=0.8)
+    found = compare_policies(Pairs(none, none, np.arange(8), are_chains=True))
     assert (found.value, found.ci95) == (0, None)
-    assert compare_policies(Pairs(none, none, np.arange(8)), power=0.8).ci95 is not None
+    assert compare_policies(Pairs(none, none, np.arange(8))).ci95 is not None
 
 
 def test_chains_are_compared_by_their_lengths():
     a, b = np.array([[4, 1, 0, 2, 3, 1]]), np.array([[4, 2, 1, 4, 2, 4]])
-    found = compare_policies(Pairs(a, b, np.arange(6)), power=0.9)
+    found = compare_policies(Pairs(a, b, np.arange(6), are_chains=True))
     # Differences 0, 1, 1, 2, -1, 3: mean 1, standard deviation sqrt(2).
     assert found.value == 1
     half = 2.5706 * np.sqrt(2 / 6)
@@ -101,24 +95,21 @@ def test_trainings_where_configurations_make_no_difference_are_welchs_t_test():
     # Every configuration has the same number in a policy: nothing is between them.
     a, b = np.array([2, 3, 7]), np.array([6, 9, 9])
     sides = [np.repeat(side[:, None], 8, axis=1) for side in (a, b)]
-    found = compare_trainings(Pairs(*sides, np.arange(8)), power=0.8)
+    found = compare_trainings(Pairs(*sides, np.arange(8)))
     assert found is not None
     theirs = ttest_ind(b, a, equal_var=False)
     assert found.value == 4
     # Variances 7 and 3 of 3 trainings: (7 + 3) / 3; t = 4 / sqrt(10 / 3) = 2.19.
     assert found.p == pytest.approx(theirs.pvalue)
     assert found.ci95 == pytest.approx(tuple(theirs.confidence_interval()))
-    # With n each, 2 n - 2 degrees of freedom, (t_.975 + t_.8) sqrt(10 / n) <= 4: n = 6 has (2.228 + .879) 1.291 =
-    # 4.01, n = 7 (2.179 + .873) 1.195 = 3.65.
-    assert found.needed == 7
 
 
 def test_trainings_that_do_alike_vary_by_configuration():
-    # Two trainings each, all of A's alike and all of B's: only the configurations differ.
+    # Three trainings each, all of A's alike and all of B's: only the configurations differ.
     d = np.array([1, 1, 0, 1, -1, 1])
-    a = np.repeat((d < 0).astype(int)[None], 2, axis=0)
-    b = np.repeat((d > 0).astype(int)[None], 2, axis=0)
-    found = compare_trainings(Pairs(a, b, np.arange(6)), power=0.8)
+    a = np.repeat((d < 0).astype(int)[None], 3, axis=0)
+    b = np.repeat((d > 0).astype(int)[None], 3, axis=0)
+    found = compare_trainings(Pairs(a, b, np.arange(6)))
     assert found is not None
     # Nothing is between trainings, alone or in some of the configurations: a paired t-test of the configurations.
     theirs = ttest_rel(b[0], a[0])
@@ -129,7 +120,7 @@ def test_trainings_that_do_alike_vary_by_configuration():
 def test_variances_of_a_table_by_hand():
     # Three trainings (rows) in two configurations, against a policy that does nothing.
     after = np.array([[2, 0], [2, 1], [2, 2]])
-    found = compare_trainings(Pairs(np.zeros((1, 2), int), after, np.arange(2)), power=0.8)
+    found = compare_trainings(Pairs(np.zeros((1, 2), int), after, np.arange(2)))
     assert found is not None
     # Of the mean, between the means of rows, 1, 1.5, 2, it is .25 / 3; between those of columns, 2 and 1, .5 / 2.
     # Cells less both are +-.5 in two rows: 4 x .25 over 2 degrees of freedom, of the mean of six .5 / 6. In all
@@ -138,16 +129,14 @@ def test_variances_of_a_table_by_hand():
     assert found.ci95 == pytest.approx((1.5 - half, 1.5 + half), abs=1e-4)
 
 
-def test_trainings_that_differ_less_than_chance_has_it_are_no_surer_than_these_policies():
-    # Both trainings have 3 of 4; their columns .5, .5, 1, 1 vary by 1/12, the mean of the four by 1/48. Left over
-    # are four cells of +-.5, 1 over 3 degrees of freedom, of the mean of eight 1/24: between trainings is -1/24.
-    after = np.array([[1, 0, 1, 1], [0, 1, 1, 1]])
-    found = compare_trainings(Pairs(np.zeros((1, 4), int), after, np.arange(4)), power=0.8)
-    assert found is not None
-    half = 3.1824 * np.sqrt(1 / 48)
-    assert found.ci95 == pytest.approx((0.75 - half, 0.75 + half), abs=1e-4)
-    # A t-test of the columns.
-    assert found.p == pytest.approx(ttest_1samp([0.5, 0.5, 1, 1], 0).pvalue)
+def test_trainings_that_differ_less_than_chance_are_no_surer_than_these_policies():
+    # All trainings have 2 of 3; all columns have 2 of 3, too, and only the interaction varies.
+    after = np.array([[1, 0, 1, 1], [0, 1, 1, 1], [1, 1, 0, 1]])
+    found = compare_trainings(Pairs(np.zeros((1, 4), int), after, np.arange(4)))
+    # Columns 2/3, 2/3, 2/3, 1: a t-test of the columns.
+    theirs = ttest_1samp([2 / 3, 2 / 3, 2 / 3, 1], 0)
+    assert found.p == pytest.approx(theirs.pvalue)
+    assert found.ci95 == pytest.approx(tuple(theirs.confidence_interval()))
 
 
 def test_a_base_that_all_trainings_begin_with_is_one_policy():
@@ -155,8 +144,8 @@ def test_a_base_that_all_trainings_begin_with_is_one_policy():
     rng = np.random.default_rng(2)
     base, after = rng.integers(0, 2, (1, 64)), rng.integers(0, 2, (3, 64))
     scenes = np.arange(16).repeat(4)
-    gained = compare_trainings(Pairs(np.zeros_like(base), after - base, scenes), power=0.8)
-    against = compare_trainings(Pairs(base, after, scenes), power=0.8)
+    gained = compare_trainings(Pairs(np.zeros_like(base), after - base, scenes))
+    against = compare_trainings(Pairs(base, after, scenes))
     assert gained is not None
     assert against is not None
     assert gained.ci95 == pytest.approx(against.ci95)
@@ -164,8 +153,8 @@ def test_a_base_that_all_trainings_begin_with_is_one_policy():
 
 def test_one_training_each_says_nothing_of_trainings_and_a_fixed_base_is_none():
     lengths = np.array([[1, 0, 1, 1], [0, 0, 1, 1], [1, 1, 1, 1]])
-    assert compare_trainings(Pairs(lengths[:1], lengths[1:2], np.arange(4)), power=0.8) is None
-    against_base = compare_trainings(Pairs(lengths[:1], lengths, np.arange(4)), power=0.8)
+    assert compare_trainings(Pairs(lengths[:1], lengths[1:2], np.arange(4))) is None
+    against_base = compare_trainings(Pairs(lengths[:1], lengths, np.arange(4)))
     assert against_base is not None
     assert against_base.method.startswith("t-interval and p by training and configuration (1 against 3 trainings")
 
@@ -183,7 +172,7 @@ def test_intervals_cover_the_difference_as_often_as_they_say(by_configuration, b
             own = rng.normal(0, by_training, (3, 1)) + rng.normal(0, by_configuration, 24).repeat(4)
             p = 1 / (1 + np.exp(-(better + scenes + own)))
             sides.append((rng.random(episodes) < p).astype(int))
-        found = compare_trainings(Pairs(*sides, np.arange(24).repeat(4)), power=0.8)
+        found = compare_trainings(Pairs(*sides, np.arange(24).repeat(4)))
         assert found is not None
         assert found.ci95 is not None
         covered += found.ci95[0] < true < found.ci95[1]
@@ -191,24 +180,14 @@ def test_intervals_cover_the_difference_as_often_as_they_say(by_configuration, b
     assert covered >= 274
 
 
-def test_two_trainings_against_one_policy_have_cochrans_quantile():
-    # Between the two, .5 and 1, it is .125 / 2, with 1 degree of freedom; between their configurations, .5, 1, .5,
-    # 1, it is 1/12 / 4 with 3, less the interaction: all cells +-.25, .5 over 3, of the mean of eight 1/48.
-    after = np.array([[0, 1, 0, 1], [1, 1, 1, 1]])
-    found = compare_trainings(Pairs(np.zeros((1, 4), int), after, np.arange(4)), power=0.8)
-    assert found.ci95 == pytest.approx((0.75 - 12.7062 / 4, 0.75 + 12.7062 / 4), abs=1e-4)
-    # t = 3 of 1 degree of freedom: 1 - 2 arctan(3) / pi.
-    assert found.p == pytest.approx(1 - 2 * np.arctan(3) / np.pi)
-    assert found.method.endswith("with Cochran's quantile")
-    # A part of 2 and one of 63: a third and two thirds of their quantiles, and p goes back to where they meet.
-    parts = StudentSum([(1.0, 2), (2.0, 63)], is_weighted=True)
-    assert parts.quantile(0.025) == pytest.approx((4.3027 + 2 * 1.9983) / 3, abs=1e-4)
-    assert parts.p(-parts.quantile(0.025)) == pytest.approx(0.05)
-    assert parts.p(0.0) == pytest.approx(1)
+def test_two_trainings_say_nothing_of_others():
+    one, two, three = (np.eye(n, 4, dtype=int) for n in (1, 2, 3))
+    assert compare_trainings(Pairs(one, two, np.arange(4))) is None
+    assert compare_trainings(Pairs(three, two, np.arange(4))) is None
+    assert compare_trainings(Pairs(three, one, np.arange(4))) is not None
 
 
-@pytest.mark.parametrize(("trainings", "most"), [(2, 26), (3, 34)])
-def test_level_of_several_trainings_against_one_policy(trainings, most):
+def test_level_of_three_trainings_against_one_policy():
     """Nothing differs: the one succeeds as often as the others do on average, in each of 64 configurations."""
     rng, rejected, runs = np.random.default_rng(9), 0, 300
     scenes = np.arange(64).repeat(4)
@@ -216,21 +195,19 @@ def test_level_of_several_trainings_against_one_policy(trainings, most):
     for _ in range(runs):
         easy = rng.normal(0, 1, 64)[scenes]
         average = _logistic(easy + 0.5 * nodes[:, None]).T @ weights / weights.sum()
-        rates = _logistic(easy + rng.normal(0, 0.5, (trainings, 1)))
+        rates = _logistic(easy + rng.normal(0, 0.5, (3, 1)))
         sides = [(rng.random(p.shape) < p).astype(int) for p in (average[None], rates)]
-        rejected += compare_trainings(Pairs(*sides, scenes), power=0.8).is_separated
-    print(f"{trainings} trainings whose rates vary by some .1 against one policy: level {rejected / runs:.3f}")
+        rejected += compare_trainings(Pairs(*sides, scenes)).p < 0.05
     # Of 300 with 5 %, 3 standard deviations above 15 are 26.3; of three trainings the level is some .07: 34.
-    assert rejected <= most
+    assert rejected <= 34
 
 
 def test_where_nothing_varies_the_configurations_decide():
     worst, best = np.zeros((3, 64), int), np.ones((3, 64), int)
-    found = compare_trainings(Pairs(worst, best, np.arange(64)), power=0.8)
+    found = compare_trainings(Pairs(worst, best, np.arange(64)))
     # 64 configurations, all one way.
     assert (found.value, found.ci95, found.p) == (1, None, 2 / 2**64)
-    assert found.is_separated
-    assert compare_trainings(Pairs(best, best[:2], np.arange(64)), power=0.8).p is None
+    assert compare_trainings(Pairs(best, best, np.arange(64))).p == 1
 
 
 def _logistic(x):
@@ -248,29 +225,27 @@ def test_holms_adjustment():
     assert holm([0.6, 0.5]) == [1, 1]
 
 
-def test_how_many_it_takes():
-    # (t_.975 + t_.8) 1 / sqrt(n) <= .5: n = 34 has (2.0345 + .8530) / 5.831 = .4952, n = 33 .5028.
-    assert samples_needed(1.0, 0.5, 0.8, lambda n: n - 1) == 34
-    assert samples_needed(1.0, 0.0, 0.8, lambda n: n - 1) is None
-    assert detectable(1.0, 1, 0.8, 0) is None
+def test_pairs_are_the_episodes_that_all_ran_clustered_by_configuration():
+    # Columns seed, number, configuration, length.
+    a = np.array([[5, 1, 9, 1], [5, 0, 9, 0], [5, 0, 7, 1]])
+    b = np.array([[5, 0, 7, 0], [5, 0, 9, 1], [5, 1, 9, 1], [6, 1, 9, 1]])
+    pairs, numbers = pair([a], [b])
+    assert numbers.tolist() == [0, 0, 1]
+    assert (pairs.a.tolist(), pairs.b.tolist(), pairs.clusters.tolist()) == ([[1, 0, 1]], [[0, 1, 1]], [0, 1, 1])
+    with pytest.raises(ValueError, match="same episodes"):
+        pair([np.concatenate([a, a])], [b])
+    with pytest.raises(ValueError, match="sampling seed"):
+        pair([a], [b[3:]])
 
 
-def test_episodes_of_one_configuration_go_together_by_repetition():
+def test_episodes_of_one_configuration_are_clustered_by_repetition():
     """64 times four tasks from one start, each with other draws: of one cluster nothing would be known."""
-    episodes = [Episode("independent", "train", task, 0, seed) for task in range(4) for seed in range(64)]
-    some = np.array([[seed % 4 == 0 for _ in range(4) for seed in range(64)]], int)
-    every = np.ones_like(some)
-    pairs = Pairs.of(some, every, episodes)
-    assert len(pairs.whole_differences) == 64
-    found = compare_policies(pairs, power=0.8)
+    a, b = (
+        np.array([[seed, task, 0, int(seed % 4 == 0 or always)] for task in range(4) for seed in range(64)])
+        for always in (False, True)
+    )
+    found = compare_policies(pair([a], [b])[0])
     assert found.value == 0.75
     # 48 of 64 repetitions differ, all one way, and in all four tasks.
     assert found.p == pytest.approx(2 / 2**48)
-    low, high = found.ci95
-    assert 0.6 < low < 0.75 < high < 0.87
-    assert found.method.endswith("over 64 repetitions of one configuration")
-    many = [episode._replace(configuration=episode.seed % 16) for episode in episodes]
-    assert len(Pairs.of(some, every, many).whole_differences) == 16
-    once = [number for number, episode in enumerate(episodes) if episode.seed == 7]
-    alone = Pairs.of(some[:, once], every[:, once], [episodes[number] for number in once])
-    assert compare_policies(alone, power=0.8).method.endswith("over 1 repetition of one configuration")
+    assert found.method.endswith("over 64 repetitions")
