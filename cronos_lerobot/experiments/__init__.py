@@ -1,6 +1,5 @@
-"""The paper's tables and figures, and few resets, as named experiments: what to train, how to run and draw it."""
+"""The paper's tables and figures as experiments."""
 
-from cronos_lerobot.experiments import few_resets as few_resets
-from cronos_lerobot.experiments.definitions import CheckpointEvaluation, Experiment, Row, register_experiment
+from cronos_lerobot.experiments.definitions import Experiment, Row, register_experiment
 
-__all__ = ["CheckpointEvaluation", "Experiment", "Row", "register_experiment"]
+__all__ = ["Experiment", "Row", "register_experiment"]

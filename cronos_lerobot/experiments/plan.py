@@ -1,299 +1,214 @@
-"""Turns experiments into jobs: the base policy, the runs, and the evaluations of their checkpoints."""
+"""Turns experiments into pipelines: the base policy, the run, and the evaluations of its checkpoints."""
 
 from __future__ import annotations
 
-import json
+import re
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot.configs.train import TRAIN_CONFIG_NAME
-from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
-from lerobot_env_cronos import gymnasium_id
-from lerobot_env_cronos.benchmark.benchmark import SUITES
-from lerobot_env_cronos.benchmark.configurations import SPLITS
-
-from cronos_lerobot.experiments.definitions import (
-    CURRICULUM_INTERVAL,
-    Base,
-    CheckpointEvaluation,
-    Experiment,
-    Row,
-)
-from cronos_lerobot.experiments.flags import read_flags
-from cronos_lerobot.experiments.jobs import BASE, EVALUATION, PLUGIN_FLAG, Job
-from cronos_lerobot.experiments.progress import train_progress
-from cronos_lerobot.experiments.scales import ALGORITHM_FLAGS, OBS_NAMES
-from cronos_lerobot.experiments.specs import (
+from cronos_lerobot.experiments.definitions import Experiment, Row
+from cronos_lerobot.experiments.pipeline import Command, Pipeline
+from cronos_lerobot.experiments.scales import (
+    BASE_FLAGS,
+    DIVERSE_FLAGS,
+    OBS_TYPES,
+    PIXELS,
     UPDATE_INTERVAL,
-    Options,
-    RunSpec,
-    base_evaluation_folder,
-    base_folder,
-    base_policy,
-    run_specs,
+    Scale,
+    base_recipe,
 )
 
-LAST_POLICY = Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR)
+POLICY = Path("checkpoints", "last", "pretrained_model")
+PIXEL_FLAGS = ("--policy.freeze_encoder=true", "--algorithm.policy_lr=1e-4")
+"""Of `cronos-train` with PPO and PocketVLA."""
 
 
-def make_jobs(experiments: Iterable[tuple[Experiment, tuple[Row, ...]]], options: Options) -> list[Job]:
-    """All jobs of some experiments with their chosen rows, each once, in an order that runs.
+@dataclass(frozen=True)
+class Options:
+    """What the command line decides about every run."""
 
-    Raises:
-        ValueError: two of them are other commands with one name, and so with one folder.
-    """
-    jobs: dict[str, Job] = {}
+    scale: Scale
+    obs: str
+    """state or pixels."""
+    root: Path
+    """Holds `base/` and `runs/`, which all experiments share."""
+    threads: int = 1
+    """Threads of each run. Sums in another order give other runs."""
+    policy_path: str | None = None
+    """The base policy; made first if None."""
+    extra: tuple[str, ...] = ()
+    """More flags of `cronos-train`, which win over a row's."""
 
-    def add(job: Job) -> None:
-        there = jobs.setdefault(job.name, job)
-        if there.command != job.command:
-            one, other = (" ".join(each.command) for each in (there, job))
-            raise ValueError(f"two commands would share the folder of {job.name}: {one}; and {other}")
-
-    for experiment, rows in experiments:
-        for spec in run_specs(experiment, options, rows):
-            base = [] if options.policy_path else base_jobs(spec.base, options)
-            made = [*base, train_job(spec, base[-1].name if base else None)]
-            for evaluation in experiment.evaluations:
-                made += [*base_evaluation_jobs(spec, evaluation), *evaluation_jobs(spec, evaluation)]
-            for job in made:
-                add(job)
-    return list(jobs.values())
+    @property
+    def thread_flags(self) -> tuple[str, ...]:
+        """For `cronos-train` and `cronos-eval`."""
+        return (f"--env.num_threads={self.threads}", f"--torch_threads={self.threads}")
 
 
-def base_jobs(base: Base, options: Options) -> list[Job]:
-    """Demonstrations of the expert, and their cloning: two jobs."""
-    folder, recipe, scene = base_folder(base, options), options.recipes[base.recipe], base.scene
-    pixels = OBS_NAMES[options.obs_type] == "pixels"
-    dataset = (f"--dataset.repo_id=local/{folder.name}", f"--dataset.root={folder / 'demos'}")
-    record = ["cronos-record-demos", "--env.type=cronos", f"--env.scene={scene}", *dataset]
-    record += [f"--env.obs_type={options.obs_type}", f"--dataset.num_episodes={recipe.demos}", "--seed=1"]
-    record += recipe.demo_flags
-    record += [] if base.configurations == 64 else [f"--start.num_configurations={base.configurations}"]
-    clone = ["lerobot-train", "--policy.type=pocketvla", "--policy.device=cpu", "--policy.push_to_hub=false"]
-    clone += [*dataset, f"--batch_size={recipe.clone_batch}", f"--steps={recipe.clone_steps}"]
-    clone += [f"--save_freq={recipe.save_freq}", "--log_freq=40", "--wandb.enable=false", "--seed=1"]
-    clone += [f"--output_dir={folder / 'clone'}"]
-    if pixels:
+@dataclass(frozen=True)
+class Run:
+    """One training run of an experiment."""
+
+    experiment: Experiment
+    row: Row
+    seed: int
+    options: Options
+
+    @property
+    def steps(self) -> int:
+        """S [interaction steps, all streams together]."""
+        return self.options.scale.steps[self.experiment.steps]
+
+    @property
+    def name(self) -> str:
+        """Its folder below `runs/`, and its pipeline's name."""
+        scene = f"{self.experiment.scene}_{self.options.obs}_{self.options.scale.name}"
+        return f"{scene}/{self.row.name}_{self.steps // 1000}k/seed{self.seed}"
+
+    @property
+    def folder(self) -> Path:
+        """Holds `train/` and `eval/`."""
+        return self.options.root / "runs" / self.name
+
+    @property
+    def base_folder(self) -> Path:
+        """Holds demonstrations and clone of the base policy that it begins with."""
+        options = self.options
+        smoke = "_smoke" if options.scale.smoke else ""
+        return options.root / "base" / f"{self.experiment.scene}_{options.obs}_{self.row.base}{smoke}"
+
+    @property
+    def base_policy(self) -> str:
+        """`--policy.path` of the run."""
+        return self.options.policy_path or str(self.base_folder / "clone" / POLICY)
+
+
+def make_runs(experiment: Experiment, rows: Iterable[Row], seeds: Iterable[int], options: Options) -> list[Run]:
+    """The runs of an experiment: one seed of every row first, then the next seed."""
+    rows = tuple(rows)
+    return [Run(experiment, row, seed, options) for seed in seeds for row in rows]
+
+
+def make_pipelines(runs: Iterable[Run]) -> list[Pipeline]:
+    """The pipelines of some runs. Runs of one name are one run, with the evaluations of all."""
+    commands: dict[str, dict[Path, Command]] = {}
+    for run in runs:
+        base = [] if run.options.policy_path else base_commands(run)
+        made = [*base, train_command(run), *evaluation_commands(run)]
+        commands.setdefault(run.name, {}).update({command.output: command for command in made})
+    return [Pipeline(name, tuple(made.values())) for name, made in commands.items()]
+
+
+def base_commands(run: Run) -> list[Command]:
+    """Demonstrations of the expert, and their cloning."""
+    folder, options, scene = run.base_folder, run.options, run.experiment.scene
+    obs_type = OBS_TYPES[options.obs]
+    recipe = base_recipe(options.scale, scene, obs_type, run.row.base)
+    demos, clone = folder / "demos", folder / "clone"
+    dataset = (f"--dataset.repo_id=local/{folder.name}", f"--dataset.root={demos}")
+    record = (
+        "cronos-record-demos",
+        "--env.type=cronos",
+        f"--env.scene={scene}",
+        f"--env.obs_type={obs_type}",
+        *dataset,
+        f"--dataset.num_episodes={recipe.demos}",
+        "--seed=1",
+        *BASE_FLAGS[run.row.base],
+        *DIVERSE_FLAGS,
+    )
+    train = (
+        "lerobot-train",
+        "--policy.type=pocketvla",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        *dataset,
+        f"--batch_size={recipe.batch}",
+        f"--steps={recipe.clone_steps}",
+        f"--save_freq={recipe.clone_steps}",
+        "--log_freq=40",
+        "--wandb.enable=false",
+        "--seed=1",
+        f"--output_dir={clone}",
+    )
+    if obs_type == PIXELS:
         # PNG images and one worker that decodes them; the critic sees the privileged state.
-        record += ["--env.privileged_state=true", "--dataset.video=false", "--num_envs=64"]
-        clone += ["--policy.observation=image", "--policy.critic_observation=environment_state"]
-        clone += ["--num_workers=1", "--dataloader_multiprocessing_context=fork"]
+        record += ("--env.privileged_state=true", "--dataset.video=false", "--num_envs=64")
+        train += ("--policy.observation=image", "--policy.critic_observation=environment_state")
+        train += ("--num_workers=1", "--dataloader_multiprocessing_context=fork")
     else:
-        clone += ["--num_workers=0"]
-    name = f"base/{folder.name}"
-    demos = Job(f"{name}/demos", tuple(record), folder / "demos", stage=BASE)
-    # Evaluations may have come from another machine, without the clone that they are of.
-    pairs = [(suite, split) for suite in SUITES for split in SPLITS]
-    evaluations = {base_evaluation_folder(base, suite, split, options) for suite, split in pairs}
-    # Rows with an environment of their own have theirs beside them.
-    evaluations |= {there for suite in SUITES for there in folder.glob(f"{suite}_*") if there.is_dir()}
-    from_it = tuple(sorted(evaluations))
-    clone_job = Job(f"{name}/clone", tuple(clone), folder / "clone", from_it, needs=(demos.name,), stage=BASE)
-    return [replace(job, environment=gymnasium_id(scene), root=options.root) for job in (demos, clone_job)]
+        train += ("--num_workers=0",)
+    return [Command(record, demos), Command(train, clone)]
 
 
-def train_flags(spec: RunSpec) -> list[str]:
-    """The flags of a run that are the experiment's: protocol, steps, seed."""
-    row, scale = spec.row, spec.options.scale
+def train_command(run: Run) -> Command:
+    """The training run."""
+    options, scale, experiment = run.options, run.options.scale, run.experiment
+    budgets = [scale.scaled(budget, experiment.steps) for budget in experiment.budgets]
+    output = run.folder / "train"
     flags = [
-        f"--seed={spec.seed}",
-        f"--steps={scale.steps[spec.paper_steps]}",
+        f"--policy.path={run.base_policy}",
+        "--env.type=cronos",
+        f"--env.scene={experiment.scene}",
+        f"--env.obs_type={OBS_TYPES[options.obs]}",
+        f"--seed={run.seed}",
+        f"--steps={run.steps}",
         f"--num_envs={scale.num_envs}",
         f"--protocol.update_interval={UPDATE_INTERVAL}",
-        f"--protocol.scene_reset_interval={row.interval or 'null'}",
-        f"--protocol.end_effector_reset={str(row.end_effector_reset).lower()}",
-        f"--protocol.task_order={row.task_order}",
-    ]
-    stages = [(spec.paper_steps // 2, CURRICULUM_INTERVAL)] if row.curriculum else row.stages
-    if stages:
-        curriculum = [[spec.scaled(until), interval] for until, interval in stages]
-        flags.append(f"--protocol.curriculum={json.dumps(curriculum)}")
-    for name in ("learned_reset", "heuristic_reset"):
-        if getattr(row, name):
-            flags.append(f"--protocol.{name}=true")
-    if row.num_configurations != 64:
-        flags.append(f"--protocol.num_configurations={row.num_configurations}")
-    return flags
-
-
-def train_job(spec: RunSpec, base: str | None) -> Job:
-    """One run of `cronos-train`."""
-    options = spec.options
-    extra, wanted, times = _eval_episodes(options)
-    episodes = wanted if _may_have_more(spec) else min(wanted, spec.row.num_configurations)
-    # From few configurations as many episodes as from all.
-    repetitions = times * (wanted // episodes if options.temperature else 1)
-    command = [
-        "cronos-train",
-        f"--policy.path={base_policy(spec.base, options)}",
-        *_recipe_flags(spec),
-        "--env.type=cronos",
-        f"--env.scene={spec.scene}",
-        f"--env.obs_type={options.obs_type}",
-        *train_flags(spec),
-        f"--eval_freq={options.scale.eval_freq}",
-        f"--eval_at_interventions={json.dumps(spec.budgets)}",
-        f"--eval.n_episodes={episodes}",
-        f"--eval.repetitions={repetitions}",
-        f"--eval.temperature={options.temperature}",
-        f"--save_freq={options.scale.eval_freq}",
-        f"--env.num_threads={options.threads}",
-        f"--torch_threads={options.threads}",
+        f"--eval_freq={scale.eval_freq}",
+        f"--eval_at_interventions={[budget for budget in budgets if budget]}",
+        f"--save_freq={scale.eval_freq}",
+        f"--eval.n_episodes={1 if scale.smoke else 64}",
+        *options.thread_flags,
         "--tensorboard=false",
-        f"--output_dir={spec.train_folder}",
+        "--resume=auto",
+        f"--output_dir={output}",
     ]
-    # A smoke run's share of a budget may be none, which is no budget.
-    budgets = [f"{flag}={max(1, spec.scaled(number))}" for flag, number in spec.row.budgets]
-    command = _with_flags(command, spec.row.flags, budgets, extra)
-
-    return Job(
-        spec.name,
-        tuple(command),
-        spec.train_folder,
-        made_from_it=(spec.evaluations_folder,),
-        needs=(base,) if base else (),
-        reads=(Path(base_policy(spec.base, options)),) if base else (),
-        resume=lambda: resume_command(spec.train_folder, command),
-        progress=lambda: train_progress(spec.train_folder, spec.steps),
-        environment=gymnasium_id(spec.scene),
-        work=spec.steps,
-        root=options.root,
-    )
+    if options.obs == "pixels" and not options.policy_path:
+        flags += PIXEL_FLAGS
+    for more in (run.row.flags, options.extra):
+        more = [
+            re.sub(r"\{([\d.]+)\}", lambda share: str(int(float(share[1]) * run.steps)), flag) for flag in more
+        ]
+        given = {flag.split("=")[0] for flag in more}
+        flags = [flag for flag in flags if flag.split("=")[0] not in given] + more
+    return Command(("cronos-train", *flags), output, resumes=True)
 
 
-def _may_have_more(spec: RunSpec) -> bool:
-    """Whether there may be more configurations than 64: of a benchmark of one's own it is seen by the run."""
-    given = dict(read_flags((*spec.row.flags, *spec.options.extra)))
-    return "env.benchmark" in given and spec.row.num_configurations == 64
+def evaluation_commands(run: Run) -> list[Command]:
+    """`cronos-eval` of the last checkpoint, and of all before it where the experiment has a held-out curve."""
+    scale, experiment, train = run.options.scale, run.experiment, run.folder / "train"
+    *before, last = scale.checkpoints(experiment.steps)
+    commands = []
+    if experiment.held_out_curve:
+        commands.append(_evaluation(run, run.base_policy, 0, "independent", "held_out"))
+        for step in before:
+            policy = train / "checkpoints" / get_step_identifier(step, last) / "pretrained_model"
+            commands.append(_evaluation(run, str(policy), step, "independent", "held_out"))
+    suites = ("independent,sequential", "train,held_out") if experiment.sequential else ("independent", "held_out")
+    return [*commands, _evaluation(run, str(train / POLICY), last, *suites)]
 
 
-def _recipe_flags(spec: RunSpec) -> list[str]:
-    """Those of `ALGORITHM_FLAGS` that a run follows: its agent may be another than PPO, its policy any."""
-    given = dict(read_flags((*spec.row.flags, *spec.options.extra)))
-    others = [] if given.get("algorithm.type", "ppo") == "ppo" else ["--algorithm."]
-    others += ["--policy."] if spec.options.policy_path else []
-    return [flag for flag in ALGORITHM_FLAGS[spec.options.obs_type] if not flag.startswith(tuple(others))]
+def get_step_identifier(step: int, total_steps: int) -> str:
+    """Name of a checkpoint's folder, as LeRobot's function of this name, whose import takes seconds."""
+    return f"{step:0{max(6, len(str(total_steps)))}d}"
 
 
-def _eval_episodes(options: Options) -> tuple[list[str], int, int]:
-    """The other flags that were given for every run; episodes of each task in its evaluations, and how often."""
-    numbers = {"--eval.n_episodes": options.scale.eval_episodes, "--eval.repetitions": 1}
-    others = []
-    for flag in options.extra:
-        name, _, value = flag.partition("=")
-        # What is no number is told when the command is checked.
-        if name in numbers and value.isdigit() and int(value):
-            numbers[name] = int(value)
-        else:
-            others.append(flag)
-    return others, numbers["--eval.n_episodes"], numbers["--eval.repetitions"]
-
-
-def resume_command(folder: Path, command: Iterable[str]) -> list[str] | None:
-    """`cronos-train` from the last checkpoint in `folder` of a run begun by `command`, with its plugins.
-
-    None before the first checkpoint.
-    """
-    config = folder / LAST_POLICY / TRAIN_CONFIG_NAME
-    plugins = [flag for flag in command if PLUGIN_FLAG in flag]
-    return ["cronos-train", "--resume=true", f"--config_path={config}", *plugins] if config.is_file() else None
-
-
-def _with_flags(command: list[str], *more: Iterable[str]) -> list[str]:
-    """What is given last wins: the row's own flags, then those of the command line."""
-    for flags in map(list, more):
-        given = {flag.split("=")[0] for flag in flags}
-        command = [flag for flag in command if flag.split("=")[0] not in given] + flags
-    return command
-
-
-def _env_flags(flags: Iterable[str]) -> list[str]:
-    """The flags of a training that its evaluation must have too: the scene's, and what registers it."""
-    return [flag for flag in flags if flag.startswith("--env.") or PLUGIN_FLAG in flag]
-
-
-def evaluation_jobs(spec: RunSpec, evaluation: CheckpointEvaluation) -> list[Job]:
-    """`cronos-eval` of a run's last checkpoint or of all, one job for each checkpoint and split."""
-    return [job for job, _ in checkpoint_evaluations(spec, evaluation)]
-
-
-def checkpoint_evaluations(spec: RunSpec, evaluation: CheckpointEvaluation) -> list[tuple[Job, int]]:
-    """`evaluation_jobs`, each with its checkpoint [interaction steps]."""
-    jobs = []
-    for checkpoint in spec.checkpoints if evaluation.every_checkpoint else [spec.steps]:
-        for split in evaluation.splits:
-            folder = spec.evaluation_folder(evaluation.suite, split, checkpoint)
-            videos = int(evaluation.suite == "sequential" and not spec.options.scale.smoke)
-            # A budget may end the run before its last step: only the link says where.
-            policy = str(spec.train_folder / LAST_POLICY if spec.row.has_budget else spec.policy(checkpoint))
-            command = eval_command(policy, spec.scene, evaluation.suite, split, folder, spec.options, videos)
-            command = _with_flags(command, _env_flags(spec.row.flags), _env_flags(spec.options.extra))
-            name, root = f"{spec.name}/{folder.name}", spec.options.root
-            jobs.append((_eval_job(name, command, folder, (spec.name, policy), spec.scene, root), checkpoint))
-    return jobs
-
-
-def base_evaluation_jobs(spec: RunSpec, evaluation: CheckpointEvaluation) -> list[Job]:
-    """`cronos-eval` of the base policy, where a run's curves begin, in the run's environment."""
-    if not evaluation.every_checkpoint:
-        return []
-    base, options = spec.base, spec.options
-
-    def needed_flags(flags: Iterable[str]) -> list[str]:
-        # Checkpoints of the runs have those of the policy in their config.
-        of_policy = [flag for flag in flags if options.policy_path and flag.startswith("--policy.")]
-        return [*_env_flags(flags), *of_policy]
-
-    # Rows that say the same in another order share it.
-    own = sorted(needed_flags(spec.row.flags))
-    jobs, policy = [], base_policy(base, options)
-    needed = None if options.policy_path else (base_jobs(base, options)[-1].name, policy)
-    for split in evaluation.splits:
-        folder = base_evaluation_folder(base, evaluation.suite, split, options, own)
-        command = eval_command(policy, base.scene, evaluation.suite, split, folder, options)
-        command = _with_flags(command, own, needed_flags(options.extra))
-        name = f"base/{folder.parent.name}/{folder.name}"
-        jobs.append(_eval_job(name, command, folder, needed, base.scene, options.root))
-    return jobs
-
-
-def eval_command(
-    policy: str, scene: str, suite: str, split: str, folder: Path, options: Options, videos: int = 0
-) -> list[str]:
-    """`cronos-eval` of one suite on one split."""
-    command = [
+def _evaluation(run: Run, policy: str, step: int, suites: str, splits: str) -> Command:
+    output = run.folder / "eval" / f"{step:07d}"
+    words = (
         "cronos-eval",
         f"--policy.path={policy}",
         "--env.type=cronos",
-        f"--env.scene={scene}",
-        f"--eval.suites={suite}",
-        f"--eval.splits={split}",
-        f"--eval.temperature={options.temperature}",
-        f"--eval.videos={videos}",
-        f"--env.num_threads={options.threads}",
-        f"--torch_threads={options.threads}",
-        f"--output_dir={folder}",
-    ]
-    if not options.scale.smoke:
-        return command
-    return [*command, "--eval.n_episodes=1", *(["--eval.orderings=1"] if suite == "sequential" else [])]
-
-
-def _eval_job(
-    name: str, command: list[str], folder: Path, needed: tuple[str, str] | None, scene: str, root: Path
-) -> Job:
-    """`needed`: the job that makes the policy, and the policy's folder."""
-    # cronos-eval goes on with what it finds in its folder.
-    return Job(
-        name,
-        tuple(command),
-        folder,
-        needs=needed[:1] if needed else (),
-        reads=(Path(needed[1]),) if needed else (),
-        resume=lambda: command,
-        environment=gymnasium_id(scene),
-        stage=EVALUATION,
-        root=root,
+        f"--env.scene={run.experiment.scene}",
+        f"--eval.suites=[{suites}]",
+        f"--eval.splits=[{splits}]",
+        "--eval.videos=0",
+        *run.options.thread_flags,
+        *[flag for flag in (*run.row.flags, *run.options.extra) if flag.startswith("--env.")],
+        f"--output_dir={output}",
     )
+    if run.options.scale.smoke:
+        words += ("--eval.n_episodes=1", *(("--eval.orderings=1",) if "sequential" in suites else ()))
+    return Command(words, output, resumes=True)

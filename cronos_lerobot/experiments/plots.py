@@ -1,136 +1,68 @@
-"""The figures of an experiment."""
+"""The figures of an experiment, from the evaluations of its runs."""
 
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.artist import Artist
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cronos_lerobot.experiments.definitions import INTERACTION_STEPS, INTERVENTIONS
-from cronos_lerobot.experiments.results import ExperimentResult, RowResult, paper_results, sequential
-from cronos_lerobot.report.figures import (
-    COLORS,
-    INK,
-    SPLIT_LABELS,
-    draw_curve,
-    segment_curve,
-    style_axes,
-    style_of,
-    style_segment_axis,
-)
-from cronos_lerobot.report.series import Curve, mean_curve, segment_rates
+from cronos_lerobot.experiments.definitions import Experiment
+from cronos_lerobot.experiments.tables import curve
+from cronos_lerobot.report.figures import COLORS, INK, SPLIT_LABELS, style_axes
+from cronos_lerobot.statistics import interpolate
 
-AXIS_LABELS = {INTERACTION_STEPS: "interaction steps, all streams", INTERVENTIONS: "interventions, all streams"}
-MUCH_LONGER = 5
-"""Rows whose numbers of interventions differ by so much do not share a linear axis."""
-Panel = tuple[str, str, str | None]
-"""Split, axis and task (None: all together) of one set of axes."""
+AXES = {"steps": "interaction steps, all streams", "interventions": "interventions, all streams"}
+POINTS = 60
+"""Places at which the curves of several seeds are averaged."""
 
 
-def row_curve(row: RowResult, split: str, axis: str, task: str | None = None) -> Curve | None:
-    """Mean and standard deviation over a row's seeds, or one seed with its 95 % interval; None without points."""
-    curves = [curve for seed in row.drawn if (curve := seed.curve(split, task))]
-    if len(curves) == 1:
-        points = curves[0]
-        ends = np.array([point.ci95 for point in points])
-        x, y = np.array([p.x(axis) for p in points]), np.array([p.success for p in points])
-        return Curve(x, y, ends[:, 0], ends[:, 1], is_band_over_seeds=False)
-    return mean_curve([([p.x(axis) for p in c], [p.success for p in c]) for c in curves]) if curves else None
-
-
-def row_label(row: RowResult, number: int | None = None) -> str:
-    """The legend's entry: settings and seeds, all that are drawn or `number` of them."""
-    number = len(row.drawn) if number is None else number
-    seeds = f"{number} seed{'s' * (number != 1)}"
-    return f"{row.row.label} ({seeds}{'' if row.finished else ', unfinished'})"
-
-
-def curves_figure(result: ExperimentResult) -> Figure | None:
-    """Success over the run, a panel for each split, axis and, where the paper has it so, task."""
-    experiment = result.experiment
-    panels: list[list[Panel]]
-    if experiment.by_task:
-        lines = [(split, axis) for split in experiment.splits for axis in experiment.axes]
-        panels = [[(split, axis, task) for task in result.tasks] for split, axis in lines]
-    elif len(experiment.axes) == 1:
-        panels = [[(split, experiment.axes[0], None) for split in experiment.splits]]
-    else:
-        panels = [[(split, axis, None) for axis in experiment.axes] for split in experiment.splits]
-    return _grid(result, panels) if panels[0] else None
-
-
-def _grid(result: ExperimentResult, panels: list[list[Panel]]) -> Figure | None:
-    height, width = len(panels), len(panels[0])
-    size = (max(6.4, min(5.2 * width, 3.4 * width + 2)), 3.1 * height + 0.9)
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(height, width, squeeze=False, sharey=True)
-    for line, line_axes in zip(panels, axes, strict=True):
-        for (split, axis, task), ax in zip(line, line_axes, strict=True):
-            for i, row in enumerate(result.rows):
-                curve = row_curve(row, split, axis, task)
-                number = sum(bool(seed.curve(split, task)) for seed in row.drawn)
-                draw_curve(ax, curve, i, row_label(row, number), marker="o", width=1.5, marker_size=3)
-            style_axes(ax, AXIS_LABELS[axis])
-            if axis == INTERVENTIONS:
-                _spread_interventions(ax)
-            ax.set_ylim(0, 1.02)
-            ax.set_title(task or SPLIT_LABELS[split], fontsize=9, color=INK, loc="left")
-        split, _, task = line[0]
-        line_axes[0].set_ylabel(f"success, {SPLIT_LABELS[split]}" if task else "success")
-    if not any(ax.lines for ax in axes.flat):
-        return None
-    legend_below(figure, list(axes.flat))
+def curves_figure(experiment: Experiment, found: pd.DataFrame) -> Figure:
+    """Success over interaction steps and interventions, a line of panels for each split."""
+    splits = ["train", "held_out"] if experiment.held_out_curve else ["train"]
+    figure = Figure(figsize=(10, 3.6 * len(splits)), layout="constrained")
+    axes = figure.subplots(len(splits), 2, squeeze=False, sharey=True)
+    for split, line in zip(splits, axes, strict=True):
+        for axis, ax in zip(AXES, line, strict=True):
+            draw_rows(ax, experiment, found, split, axis)
+        line[0].set_ylabel(f"success, {SPLIT_LABELS[split]}")
+    _legend(figure, axes[0, 0])
     return figure
 
 
-def _spread_interventions(ax: Axes) -> None:
-    """Make room for the rows with few interventions: logarithmic beyond half of the shortest one's."""
-    ends = [end for line in ax.lines if (end := float(np.max(np.asarray(line.get_xdata()), initial=0.0))) > 0]
-    if not ends or max(ends) < MUCH_LONGER * min(ends):
-        return
-    linear_to = min(ends) / 2
-    ax.set_xscale("symlog", linthresh=linear_to, linscale=0.5)
-    ticks = [step * 10**power for power in range(7) for step in (1, 2, 5)]
-    shown = [0, *(tick for tick in ticks if linear_to / 2 <= tick <= max(ends))]
-    ax.set_xticks(shown, [f"{tick:,}" for tick in shown])
-    ax.set_xticks([], minor=True)
-    ax.set_xlabel(f"{ax.get_xlabel()} (log scale)")
+def by_task_figure(experiment: Experiment, found: pd.DataFrame) -> Figure:
+    """Success over interaction steps and interventions, a column of panels for each task (Figures 11 to 14)."""
+    parts = [{part["part"] for part in some} for some in found[found["suite"] == "independent"]["parts"]]
+    tasks = sorted(set.union(*parts))
+    lines = [(split, axis) for split in ("train", *(["held_out"] * experiment.held_out_curve)) for axis in AXES]
+    figure = Figure(figsize=(3.2 * len(tasks), 2.9 * len(lines)), layout="constrained")
+    axes = figure.subplots(len(lines), len(tasks), squeeze=False, sharey=True)
+    for (split, axis), line in zip(lines, axes, strict=True):
+        for task, ax in zip(tasks, line, strict=True):
+            draw_rows(ax, experiment, found, split, axis, task)
+            ax.set_title(task, fontsize=8, color=INK, loc="left")
+        line[0].set_ylabel(f"success, {SPLIT_LABELS[split]}")
+    _legend(figure, axes[0, 0])
+    return figure
 
 
-def legend_below(figure: Figure, axes: list[Axes]) -> None:
-    """One legend for all axes, below them, each entry once."""
-    entries: dict[str, Artist] = {}
-    for ax in axes:
-        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
-    figure.legend(
-        list(entries.values()), list(entries), loc="outside lower center", ncols=2, fontsize=8, frameon=False
-    )
-
-
-def bars_figure(result: ExperimentResult) -> Figure | None:
-    """Success at the end of every row beside the paper's, mean and standard deviation over the seeds."""
-    paper = paper_results()["final_success"].get(result.experiment.name)
-    rows = [(row, summary) for row in result.rows if (summary := row.success("train"))]
-    if not rows or not paper:
-        return None
-    figure = Figure(figsize=(10, 0.55 * len(rows) + 1.2), layout="constrained")
+def bars_figure(experiment: Experiment, found: pd.DataFrame) -> Figure:
+    """Success at the end of every row beside the paper's: mean and standard deviation over the seeds."""
+    figure = Figure(figsize=(10, 0.55 * len(experiment.rows) + 1.2), layout="constrained")
     ax = figure.subplots()
-    y = np.arange(len(rows))
-    ours = [summary.mean for _, summary in rows]
-    ax.barh(y - 0.2, ours, 0.36, xerr=[s.std or 0 for _, s in rows], color=COLORS[0], label="here", ecolor=INK)
-    known = [paper[row.row.name] for row, _ in rows]
-    ax.barh(
-        y + 0.2,
-        [m for m, _ in known],
-        0.36,
-        xerr=[s for _, s in known],
-        color="#bbbbbb",
-        label="paper",
-        ecolor=INK,
-    )
-    ax.set_yticks(y, [row.row.label for row, _ in rows], fontsize=9)
+    y = np.arange(len(experiment.rows))
+    ends = [
+        [curve(run, "train")["success"].iloc[-1] for _, run in found[found["row"] == row.name].groupby("seed")]
+        for row in experiment.rows
+    ]
+    ours = [(np.mean(end), np.std(end, ddof=1) if len(end) > 1 else 0) if end else (np.nan, 0) for end in ends]
+    for shift, color, label, numbers in (
+        (-0.2, COLORS[0], "here", ours),
+        (0.2, "#bbbbbb", "paper", experiment.paper),
+    ):
+        means, spreads = zip(*numbers, strict=True)
+        ax.barh(y + shift, means, 0.36, xerr=spreads, color=color, label=label, ecolor=INK)
+    ax.set_yticks(y, [row.label for row in experiment.rows], fontsize=9)
     ax.invert_yaxis()
     style_axes(ax, "success at the end, training configurations")
     ax.set_xlim(0, 1)
@@ -138,60 +70,33 @@ def bars_figure(result: ExperimentResult) -> Figure | None:
     return figure
 
 
-def segments_figure(result: ExperimentResult) -> Figure | None:
-    """Success while training by segment since the last scene reset, in the last quarter of the runs."""
-    figure = Figure(figsize=(9, 4.2), layout="constrained")
-    ax = figure.subplots()
-    for i, row in enumerate(result.rows):
-        if rates := segment_rates(row.group):
-            draw_curve(ax, segment_curve(rates), i, row_label(row), marker="o")
-    style_segment_axis(ax)
-    ax.set(ylabel="success while training", ylim=(0, 1.02))
-    if not ax.lines:
-        return None
-    legend_below(figure, [ax])
-    return figure
+def draw_rows(
+    ax: Axes, experiment: Experiment, found: pd.DataFrame, split: str, axis: str, task: str | None = None
+) -> None:
+    """Draw the mean of each row's seeds, and their standard deviation as a band; `task` None is all tasks."""
+    for row, color in zip(experiment.rows, COLORS * 2, strict=False):
+        curves = [curve(run, split) for _, run in found[found["row"] == row.name].groupby("seed")]
+        points = [(one[axis].to_numpy(float), _success(one, task)) for one in curves if one[axis].notna().any()]
+        if not points:
+            continue
+        x = np.linspace(max(x[0] for x, _ in points), min(x[-1] for x, _ in points), POINTS)
+        y = np.array([interpolate(*one, x) for one in points])
+        ax.plot(x, y.mean(0), color=color, lw=1.6, label=f"{row.label} ({len(points)} seeds)")
+        if len(points) > 1:
+            ax.fill_between(
+                x, y.mean(0) - y.std(0, ddof=1), y.mean(0) + y.std(0, ddof=1), color=color, alpha=0.15, lw=0
+            )
+    style_axes(ax, AXES[axis])
+    if axis == "interventions":
+        ax.set_xscale("symlog", linthresh=100)
 
 
-def sequential_figure(result: ExperimentResult) -> Figure | None:
-    """SEQ 0-3: bars of mean and standard deviation over the seeds, one panel for each split."""
-    splits = [s for e in result.experiment.evaluations if e.suite == "sequential" for s in e.splits]
-    found = {
-        split: [(i, row, s) for i, row in enumerate(result.rows) if (s := sequential(row, split))]
-        for split in splits
-    }
-    found = {split: rows for split, rows in found.items() if rows}
-    if not found:
-        return None
-    figure = Figure(figsize=(5 * len(found), 3.8), layout="constrained")
-    axes = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
-    for ax, (split, rows) in zip(axes, found.items(), strict=True):
-        _sequential_panel(ax, rows)
-        ax.set_title(SPLIT_LABELS[split], fontsize=9, color=INK, loc="left")
-    axes[0].set_ylabel("success")
-    legend_below(figure, list(axes))
-    return figure
+def _success(one: pd.DataFrame, task: str | None) -> np.ndarray:
+    if task is None:
+        return one["success"].to_numpy(float)
+    by_task = [{part["part"]: part["success"] for part in some} for some in one["parts"]]
+    return np.array([found[task] for found in by_task], float)
 
 
-def _sequential_panel(ax: Axes, rows: list) -> None:
-    width = 0.8 / len(rows)
-    for place, (i, row, found) in enumerate(rows):
-        x = np.arange(len(found["positions"]))
-        means = [position.mean for position in found["positions"]]
-        spread = [position.std or 0.0 for position in found["positions"]]
-        color, _, hatch = style_of(i)
-        ax.bar(
-            x + (place - (len(rows) - 1) / 2) * width,
-            means,
-            0.92 * width,
-            yerr=spread,
-            color=color,
-            hatch=hatch,
-            edgecolor="white",
-            linewidth=0,
-            ecolor=INK,
-            label=row_label(row, found["seeds"]),
-        )
-    style_axes(ax, "task in the sequence")
-    ax.set_xticks(x, [f"SEQ {position}" for position in x])
-    ax.set_ylim(0, 1.02)
+def _legend(figure: Figure, ax: Axes) -> None:
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8, frameon=False)

@@ -1,14 +1,17 @@
-"""How large an experiment is run, and the base policy that it starts from."""
+"""How large an experiment is run, and the base policies that its runs begin with."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from cronos_lerobot.experiments.definitions import LONG, NARROW, SHORT
+from cronos_lerobot.experiments.definitions import LONG, ONE, PAPER, SHORT, WIDE
 
 STATE, PIXELS = "environment_state_agent_pos", "pixels_agent_pos"
-OBS_NAMES = {STATE: "state", PIXELS: "pixels"}
-"""Kinds of observation (`--env.obs_type`), and what folders call them."""
+OBS_TYPES = {"state": STATE, "pixels": PIXELS}
+"""Kinds of observation (`--env.obs_type`) by what folders call them."""
+
+UPDATE_INTERVAL = 160
+"""U: control steps of each stream between two policy updates (Table 2)."""
 
 
 @dataclass(frozen=True)
@@ -20,38 +23,40 @@ class Scale:
     """S [interaction steps] for each S of the paper."""
     seeds: int
     """Runs of each row."""
-    num_envs: int
+    num_envs: int = 64
     """Parallel streams."""
-    eval_freq: int
+    eval_freq: int = 102_400
     """Interaction steps between two evaluations, and between two checkpoints."""
-    eval_episodes: int
-    """Configurations for each task of a periodic evaluation."""
     smoke: bool = False
-    """Whether it only shows that everything runs: the smallest base policy, few configurations and orderings."""
+    """Show that everything runs: a base policy that has learned nothing, one episode where there are 64."""
+
+    @property
+    def steps_per_update(self) -> int:
+        """Interaction steps, all streams together, between two policy updates."""
+        return self.num_envs * UPDATE_INTERVAL
+
+    def scaled(self, number: int, paper_steps: int) -> int:
+        """A number of steps or interventions of a run with the paper's steps, in a run of this scale."""
+        return number * self.steps[paper_steps] // paper_steps
+
+    def checkpoints(self, paper_steps: int) -> list[int]:
+        """Interaction steps of the checkpoints of a run; it ends at the last one, with a whole update."""
+        last = -(-self.steps[paper_steps] // self.steps_per_update) * self.steps_per_update
+        updates = range(self.steps_per_update, last, self.steps_per_update)
+        crossed = [n for n in updates if n // self.eval_freq > (n - self.steps_per_update) // self.eval_freq]
+        return [*crossed, last]
 
 
-SCALES: dict[str, Scale] = {
-    "paper": Scale("paper", {SHORT: SHORT, LONG: LONG}, seeds=5, num_envs=64, eval_freq=102_400, eval_episodes=64),
-    "small": Scale(
-        "small", {SHORT: 307_200, LONG: 614_400}, seeds=3, num_envs=64, eval_freq=51_200, eval_episodes=64
-    ),
-    "smoke": Scale(
-        "smoke",
-        # Each its own, as folders of runs are named by their steps.
-        {SHORT: 2_560, LONG: 3_840},
-        seeds=1,
-        num_envs=4,
-        eval_freq=1_280,
-        eval_episodes=1,
-        smoke=True,
-    ),
+SCALES = {
+    "paper": Scale("paper", {SHORT: SHORT, LONG: LONG}, seeds=5),
+    "small": Scale("small", {SHORT: 307_200, LONG: 614_400}, seeds=3, eval_freq=51_200),
+    # Each its own number of steps: folders of runs are named by them.
+    "smoke": Scale("smoke", {SHORT: 2_560, LONG: 3_840}, seeds=1, num_envs=4, eval_freq=1_280, smoke=True),
 }
 
-
-DIVERSE_DEMO_FLAGS = ("--noise.share=0.75", "--misses.share=0.25", "--steps_after_release=8")
-"""Noise and misses show how to recover, the frames after the release that a finished task is left alone."""
-WIDE, WIDE_RESETS = "wide", "wide_resets"
-_WIDE_FLAGS = (
+DIVERSE_FLAGS = ("--noise.share=0.75", "--misses.share=0.25", "--steps_after_release=8")
+"""Noise and missed grasps show how to recover; the steps after the release, that a finished task is left alone."""
+WIDE_FLAGS = (
     "--start.layouts=reach",
     "--start.arm_pose=after_task",
     "--start.occupied_receptacles=true",
@@ -59,132 +64,41 @@ _WIDE_FLAGS = (
     "--start.earlier_tasks=3",
     "--start.share=0.5",
 )
-BASE_KINDS: dict[str, tuple[str, ...]] = {
-    NARROW: (),
-    WIDE: _WIDE_FLAGS,
-    WIDE_RESETS: (*_WIDE_FLAGS, "--reset_tasks=true"),
-}
-"""Kinds of base policies by where their demonstrations begin, as flags of `cronos-record-demos`: in the training
-configurations; wherever the arm can do the tasks, every second after one to three other tasks: where they left the
-arm, other objects on the target, the object itself on another receptacle; the same with reset tasks among them."""
+"""Layouts all over the reach, every second one after one to three other tasks."""
+BASE_FLAGS = {PAPER: (), WIDE: WIDE_FLAGS, ONE: ("--start.num_configurations=1",)}
 
 
 @dataclass(frozen=True)
 class BaseRecipe:
-    """How the base policy is made; PPO learns from one that succeeds in .3 to .6 of the evaluation."""
+    """How a base policy is made. PPO learns from one that succeeds in .3 to .6 of the evaluation."""
 
     demos: int
     """Demonstrations of the scripted expert, all tasks together."""
     clone_steps: int
     """Gradient steps of behaviour cloning."""
-    checkpoint: int
-    """The step whose policy is the base: a quarter, half, three quarters or all of `clone_steps`."""
-    clone_batch: int = 256
+    batch: int = 256
     """Frames of a gradient step."""
-    clean: bool = False
-    """Whether the demonstrations have no noise, no missed grasps and no frames after the release: the arm always
-    comes from home, which is the bias of the paper's base policy (Section 5)."""
-    kind: str = NARROW
-    """Where the demonstrations begin: one of `BASE_KINDS`."""
-
-    def __post_init__(self) -> None:
-        valid = [*range(self.save_freq, self.clone_steps, self.save_freq), self.clone_steps]
-        if self.checkpoint not in valid:
-            raise ValueError(f"base.checkpoint must be one of {valid}, got {self.checkpoint}")
-
-    @property
-    def demo_flags(self) -> tuple[str, ...]:
-        """Flags of `cronos-record-demos`."""
-        return BASE_KINDS[self.kind] + (() if self.clean else DIVERSE_DEMO_FLAGS)
-
-    @property
-    def made(self) -> str:
-        """What its folder is called after."""
-        words = ("" if self.kind == NARROW else self.kind, "clean" if self.clean else "", "demos")
-        return f"{self.demos}{''.join(words)}_{self.clone_steps}steps"
-
-    @property
-    def save_freq(self) -> int:
-        """Steps between two checkpoints of the cloning."""
-        return max(1, self.clone_steps // 4)
 
 
-MODEL = "kitchen_2x2"
-"""The scene whose recipes others take, with as much for each of their tasks."""
-BASE_RECIPES: dict[tuple[str, str], BaseRecipe] = {
-    (MODEL, STATE): BaseRecipe(400, 320, checkpoint=320),
-    ("playroom_2x2", STATE): BaseRecipe(400, 640, checkpoint=480),
-    (MODEL, PIXELS): BaseRecipe(3200, 1600, checkpoint=1600),
+NUM_TASKS = {"kitchen_2x2": 4, "kitchen_3x3": 9, "playroom_2x2": 4}
+RECIPES = {
+    (PAPER, STATE): BaseRecipe(400, 320),
+    (ONE, STATE): BaseRecipe(400, 320),
+    (WIDE, STATE): BaseRecipe(1200, 1920),
+    (PAPER, PIXELS): BaseRecipe(3200, 1600),
+    (ONE, PIXELS): BaseRecipe(3200, 1600),
+    (WIDE, PIXELS): BaseRecipe(3200, 2400),
 }
-"""By scene and kind of observation; scenes that are not here take `MODEL`'s. Measured (docs/experiments.md), with
-`kitchen_3x3` from the state. From pixels 800 demonstrations are learned by heart (docs/trials.md); more of them
-cost minutes, and no gradient step."""
-CLEAN_RECIPES: dict[tuple[str, str], BaseRecipe] = {
-    (MODEL, STATE): BaseRecipe(400, 640, checkpoint=480, clean=True),
-}
-"""The same from clean demonstrations."""
-WIDE_RECIPES: dict[tuple[str, str], BaseRecipe] = {
-    (MODEL, STATE): BaseRecipe(1200, 1920, checkpoint=1920, kind=WIDE),
-    (MODEL, PIXELS): BaseRecipe(3200, 2400, checkpoint=2400, kind=WIDE),
-}
-"""The same over the whole reach. What may lie anywhere takes more demonstrations: `kitchen_2x2`'s clone of 400
-came to .43 and stayed there, of 1,200 to .82 (docs/trials.md); the other scenes have as many for each task."""
-WIDE_RESETS_RECIPES: dict[tuple[str, str], BaseRecipe] = {
-    (MODEL, STATE): BaseRecipe(3600, 3840, checkpoint=3840, kind=WIDE_RESETS),
-    (MODEL, PIXELS): BaseRecipe(3200, 2400, checkpoint=2400, kind=WIDE_RESETS),
-}
-"""The same with reset tasks, of each as many as of any other task: learned resets have to succeed."""
-SMOKE_RECIPE = BaseRecipe(8, 5, checkpoint=5, clone_batch=32)
-
-ALGORITHM_FLAGS = {
-    STATE: ("--algorithm.type=ppo",),
-    PIXELS: ("--policy.freeze_encoder=true", "--algorithm.type=ppo", "--algorithm.policy_lr=1e-4"),
-}
-"""Flags of `cronos-train` that learn from each kind of observation; PPO's go where another agent is chosen."""
+"""For the four tasks of `kitchen_2x2`; another scene has as much for each of its tasks."""
+PLAYROOM = BaseRecipe(400, 480)
+"""`playroom_2x2` with the state takes more steps from the training configurations."""
 
 
-def base_recipe(scale: Scale, scene: str, obs_type: str, *, clean: bool = False, kind: str = NARROW) -> BaseRecipe:
-    """The recipe of a scene's base policy of a kind, the narrow one on request from clean demonstrations.
-
-    A scene without one of its own has that of `MODEL`, by the number of their tasks.
-
-    Raises:
-        ValueError: there is no such kind, no such scene, or no recipe; a policy can be given with --policy.path.
-    """
-    if kind not in BASE_KINDS:
-        raise ValueError(f"the base of a row must be one of {list(BASE_KINDS)}, got {kind!r}")
-    clean = clean and kind == NARROW
+def base_recipe(scale: Scale, scene: str, obs_type: str, base: str) -> BaseRecipe:
+    """The recipe of a scene's base policy."""
     if scale.smoke:
-        return replace(SMOKE_RECIPE, clean=clean, kind=kind)
-    recipes = {
-        NARROW: CLEAN_RECIPES if clean else BASE_RECIPES,
-        WIDE: WIDE_RECIPES,
-        WIDE_RESETS: WIDE_RESETS_RECIPES,
-    }[kind]
-    if (scene, obs_type) in recipes:
-        return replace(recipes[scene, obs_type], kind=kind)
-    if (MODEL, obs_type) not in recipes:
-        known = ", ".join(OBS_NAMES[o] for _, o in recipes)
-        name = "clean base policy" if clean else "base policy" if kind == NARROW else f"{kind} base policy"
-        raise ValueError(
-            f"no recipe for a {name} from {OBS_NAMES[obs_type]}; from {known} there is: use --policy.path"
-        )
-    return replace(_for_tasks(recipes[MODEL, obs_type], scene), kind=kind)
-
-
-def _for_tasks(recipe: BaseRecipe, scene: str) -> BaseRecipe:
-    """A recipe of `MODEL` with as many demonstrations and gradient steps for each task of another scene."""
-    from lerobot.utils.import_utils import register_third_party_plugins
-    from lerobot_env_cronos.scene.scenes import SCENES, describe_unknown_scene, get_scene
-
-    if scene not in SCENES:
-        # An installed one is registered by the import of its package.
-        register_third_party_plugins()
-    if scene not in SCENES:
-        # Demonstrations and clone are commands that no other module is given to.
-        raise ValueError(describe_unknown_scene(scene, None))
-    tasks, of = len(get_scene(scene).tasks), len(get_scene(MODEL).tasks)
-    steps = recipe.clone_steps * tasks // of
-    more = replace(recipe, demos=recipe.demos * tasks // of, clone_steps=steps, checkpoint=steps)
-    quarters = 4 * recipe.checkpoint // recipe.clone_steps
-    return more if quarters == 4 else replace(more, checkpoint=quarters * more.save_freq)
+        return BaseRecipe(8, 5, batch=32)
+    if (scene, obs_type) == ("playroom_2x2", STATE) and base != WIDE:
+        return PLAYROOM
+    recipe, tasks = RECIPES[base, obs_type], NUM_TASKS.get(scene, 4)
+    return BaseRecipe(recipe.demos * tasks // 4, recipe.clone_steps * tasks // 4)

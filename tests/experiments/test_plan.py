@@ -1,0 +1,99 @@
+"""Experiments as lists of commands."""
+
+from pathlib import Path
+
+import pytest
+
+from cronos_lerobot.experiments.definitions import EXPERIMENTS, Experiment, Row, find_rows, register_experiment
+from cronos_lerobot.experiments.plan import Options, make_pipelines, make_runs
+from cronos_lerobot.experiments.scales import SCALES
+
+
+def plan(name, rows=(), seeds=(1,), scale="paper", **options):
+    experiment = EXPERIMENTS[name]
+    chosen = Options(SCALES[scale], options.pop("obs", "state"), Path("root"), **options)
+    return make_pipelines(make_runs(experiment, find_rows(experiment, list(rows)), seeds, chosen))
+
+
+def flags(command):
+    return dict(word.split("=", 1) for word in command.words[1:])
+
+
+def test_labels_say_what_the_paper_calls_a_row():
+    labels = [row.label for row in EXPERIMENTS["table1"].rows]
+    assert labels == [
+        "T = 80",
+        "T = 1280",
+        "T = 1280, EER",
+        "T = 1280, EER, CL",
+        "T = 1280, EER, CL, LSR",
+        "T = 1280, EER, CL, HSR",
+        "T = 1280, EER, CL, LSR, HSR",
+    ]
+    assert EXPERIMENTS["figure2"].rows[1].label == "T = 1280, EER, CL, HSR, random order"
+    assert EXPERIMENTS["baselines"].rows[-1].label == "T = 4400, EER, staggered, CL, decaying KL target"
+
+
+def test_table1_at_the_papers_scale_is_the_papers_setting():
+    (pipeline,) = plan("table1", ["t1280_eer_cl_hsr"])
+    record, clone, train, evaluate = pipeline.commands
+    assert [c.words[0] for c in pipeline.commands] == [
+        "cronos-record-demos",
+        "lerobot-train",
+        "cronos-train",
+        "cronos-eval",
+    ]
+    given = flags(train)
+    assert given["--steps"] == "1300000"
+    assert given["--num_envs"] == "64"
+    assert given["--protocol.scene_reset_interval"] == "1280"
+    # Half of 1.3 M interaction steps, Section 6.3.
+    assert given["--protocol.curriculum"] == "[[650000,320]]"
+    assert given["--protocol.heuristic_reset"] == "true"
+    assert given["--eval_at_interventions"] == "[1000, 1600, 2000, 6000]"
+    assert given["--policy.path"].startswith(str(clone.output))
+    assert flags(clone)["--dataset.root"] == str(record.output)
+    assert flags(evaluate)["--policy.path"].startswith(str(train.output))
+
+
+def test_a_scale_shortens_steps_and_budgets_alike():
+    (pipeline,) = plan("figure3", ["t80"], scale="small")
+    # 614,400 of 2.9 M steps; 1000 interventions of the paper's are 211 here.
+    assert flags(pipeline.commands[2])["--eval_at_interventions"] == "[211, 423, 847, 1694]"
+
+
+def test_experiments_share_runs_and_base_policies():
+    shared = {p.name for p in plan("table1")} & {p.name for p in plan("figure2")}
+    assert shared == {"kitchen_2x2_state_paper/t1280_eer_cl_hsr_1300k/seed1"}
+    bases = {pipeline.commands[1].output for pipeline in plan("table1", seeds=(1, 2))}
+    assert len(bases) == 1
+
+
+def test_every_checkpoint_of_a_held_out_curve_is_evaluated():
+    (pipeline,) = plan("figure2", ["t1280_eer_cl_hsr"], scale="small")
+    evaluated = [int(command.output.name) for command in pipeline.commands[3:]]
+    # 51,200 steps apart; 30 updates of 10,240 steps are 307,200.
+    assert evaluated == [0, 51_200, 102_400, 153_600, 204_800, 256_000, 307_200]
+    assert Path(flags(pipeline.commands[4])["--policy.path"]).parent.name == "051200"
+
+
+def test_your_own_flags_win_over_the_rows():
+    (pipeline,) = plan("table1", ["t80"], extra=("--protocol.scene_reset_interval=160",), policy_path="me/policy")
+    (train, _) = pipeline.commands
+    assert flags(train)["--protocol.scene_reset_interval"] == "160"
+    assert flags(train)["--policy.path"] == "me/policy"
+
+
+def test_your_own_experiment_is_registered_once(monkeypatch):
+    monkeypatch.setattr("cronos_lerobot.experiments.definitions.EXPERIMENTS", {})
+    mine = Experiment("mine", "Mine", (Row("a", ("--protocol.scene_reset_interval=160",)),))
+    register_experiment(mine)
+    with pytest.raises(ValueError, match="mine"):
+        register_experiment(mine)
+    with pytest.raises(ValueError, match="different names"):
+        Experiment("mine", "Mine", (*mine.rows, *mine.rows))
+
+
+def test_an_unknown_row_is_an_error_that_lists_the_rows():
+    with pytest.raises(ValueError, match=r"--rows.*t320_eer"):
+        find_rows(EXPERIMENTS["figure5"], ["t81"])
