@@ -1,4 +1,4 @@
-"""The repository of a benchmark: parquet files, a card with pictures, `eval.yaml`, and `env.py`, which runs it."""
+"""The repository of a benchmark: parquet files, a card with pictures, `eval.yaml`, and `env.py` that runs it."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from lerobot_env_cronos.scene.scenes import BODIES, STEPS_PER_TASK
 from lerobot_env_cronos.simulation.gl import RenderingError
 
 from cronos_lerobot.hub import env_file
-from cronos_lerobot.hub.cards import is_packaged, render_card
+from cronos_lerobot.hub.cards import code, describe_source, is_packaged, render_card
 from cronos_lerobot.hub.config import BenchmarkConfig
 from cronos_lerobot.hub.pictures import configuration_pictures, configuration_sheet, task_sheet
 from cronos_lerobot.hub.push import PublishError
-from cronos_lerobot.hub.runs import describe_source
+from cronos_lerobot.hub.stage import write_text
 
 FRAMEWORK = "cronos-lerobot"
 """`evaluation_framework` of eval.yaml."""
 ENV_FILE = "env.py"
 """What LeRobot's EnvHub runs."""
 DATA = "configurations/*.parquet"
-"""What every benchmark has."""
+"""Files that every benchmark has."""
 REPLACES = [f"{config}/*" for config in CONFIGS] + ["pictures/*"]
-"""What a new version of a benchmark removes of the old one."""
+"""Files of an older version that a new one removes."""
 
 
 def choose_benchmark(config: BenchmarkConfig) -> Benchmark:
@@ -43,21 +43,22 @@ def choose_benchmark(config: BenchmarkConfig) -> Benchmark:
     """
     sizes = {name: getattr(config, name) for name in ("num_configurations", "num_orderings", "chain_length")}
     given = {name: value for name, value in sizes.items() if value is not None}
-    if config.seed is not None:
-        if config.benchmark is not None:
-            raise ValueError("--benchmark publishes one that is there, --seed draws a new one: choose")
-        return draw_benchmark(config.scene or DEFAULT_SCENE, config.seed, **given)
-    if given:
-        raise ValueError(
-            f"{', '.join(f'--{name}' for name in given)}: of a benchmark that is drawn; give a --seed"
-        )
-    if config.benchmark is not None:
-        return load_benchmark(config.benchmark, config.scene or benchmark_scene(config.benchmark))
-    return load_benchmark(None, config.scene or DEFAULT_SCENE)
+    if config.seed is None and given:
+        raise ValueError(f"{', '.join(f'--{name}' for name in given)} draw a new benchmark: give a --seed")
+    if config.seed is not None and config.benchmark is not None:
+        raise ValueError("--benchmark publishes an existing benchmark, --seed draws a new one: give one of them")
+    scene = config.scene or (benchmark_scene(config.benchmark) if config.benchmark else DEFAULT_SCENE)
+    if config.seed is None:
+        return load_benchmark(config.benchmark, scene)
+    return draw_benchmark(scene, config.seed, **given)
 
 
 def write_benchmark_repository(config: BenchmarkConfig, folder: Path, benchmark: Benchmark) -> str:
-    """Write the tree of the repository of a benchmark, that of the config, into `folder`; returns what it is."""
+    """Write the tree of the repository of a benchmark into `folder`; returns what it is, in words.
+
+    Raises:
+        PublishError: pictures cannot be drawn.
+    """
     try:
         pictures = configuration_pictures(benchmark) if config.pictures else None
     except RenderingError as error:
@@ -73,8 +74,8 @@ def write_benchmark_repository(config: BenchmarkConfig, folder: Path, benchmark:
         (folder / "pictures" / "configurations.png").write_bytes(configuration_sheet(pictures))
     title = config.title or f"CRONOS {benchmark.scene.name}"
     shutil.copyfile(env_file.__file__, folder / ENV_FILE)
-    (folder / "eval.yaml").write_text(_eval_yaml(benchmark, title))
-    (folder / "README.md").write_text(_card(benchmark, config, title))
+    write_text(folder / "eval.yaml", _eval_yaml(benchmark, title))
+    write_text(folder / "README.md", _card(benchmark, config, title))
     sizes = ", ".join(f"{benchmark.size(suite, 'held_out')} {suite}" for suite in SUITES)
     return f"{benchmark.scene.name} ({sizes} in held_out; fingerprint {benchmark.fingerprint})"
 
@@ -111,22 +112,26 @@ def _eval_yaml(benchmark: Benchmark, title: str) -> str:
 
 
 def task_id(suite: str, split: str) -> str:
-    """Of eval.yaml and of results: `independent_train`, `sequential_held_out`, ..."""
+    """The name in eval.yaml and in results: `independent_train`, `sequential_held_out`, ..."""
     return f"{suite}_{split}"
 
 
 def _card(benchmark: Benchmark, config: BenchmarkConfig, title: str) -> str:
     scene = benchmark.scene
     rows = sum(benchmark.size(suite, split) for suite in SUITES for split in SPLITS)
+    sizes = [
+        (code(body.name), ", ".join(f"{round(1000 * float(side), 1)}" for side in body.size), body.density)
+        for body in map(BODIES.__getitem__, scene.bodies)
+    ]
     return render_card(
         "benchmark",
         title=title,
         repo_id=config.repo_id,
         benchmark=benchmark,
-        source=describe_source(benchmark.source),
+        source=code(describe_source(benchmark.source)),
         scene=scene,
         environment=gymnasium_id(scene.name),
-        bodies=[BODIES[name] for name in scene.bodies],
+        bodies=sizes,
         window_steps=STEPS_PER_TASK,
         has_pictures=config.pictures,
         has_env_hub=config.env_hub,

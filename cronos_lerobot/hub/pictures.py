@@ -8,8 +8,9 @@ import numpy as np
 from lerobot_env_cronos import Benchmark, CronosVectorEnv
 from PIL import Image, ImageDraw
 
-from cronos_lerobot.data.png import encode_palette_png
-from cronos_lerobot.report.task_pictures import CAMERAS, PICTURE, caption_font, draw_sheet
+from cronos_lerobot.film.png import encode_palette_png
+from cronos_lerobot.film.sheets import PICTURE, caption_font, draw_task_sheet
+from cronos_lerobot.film.task_pictures import CAMERAS
 
 ROW_PICTURE = (320, 240)
 """Width and height of a configuration's picture [px]."""
@@ -58,7 +59,7 @@ def task_sheet(benchmark: Benchmark) -> bytes:
     poses = starts[np.arange(len(tasks)) % len(starts)]
     frames = render_poses(benchmark, poses, (2 * PICTURE[0], 2 * PICTURE[1]), CAMERAS)
     return encode_palette_png(
-        draw_sheet([(task.instruction, shown) for task, shown in zip(tasks, frames, strict=True)])
+        draw_task_sheet([(task.instruction, shown) for task, shown in zip(tasks, frames, strict=True)])
     )
 
 

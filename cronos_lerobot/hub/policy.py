@@ -1,205 +1,216 @@
-"""The repository of a policy: the checkpoint as LeRobot wrote it, a card, and curves."""
+"""The repository of a policy: the checkpoint as LeRobot wrote it, a card, and a curve of its training."""
 
 from __future__ import annotations
 
-import json
-import shutil
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot.utils.constants import (
-    ACTION,
-    POLICY_POSTPROCESSOR_DEFAULT_NAME,
-    POLICY_PREPROCESSOR_DEFAULT_NAME,
-)
+from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 from lerobot_env_cronos import get_scene
-from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
-from matplotlib.figure import Figure
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 
 from cronos_lerobot.agents.steering.steered import STEERING
-from cronos_lerobot.evaluation.config import EXPERT
-from cronos_lerobot.evaluation.policy_env import trained_renderer, trained_scene
-from cronos_lerobot.evaluation.policy_source import files_fingerprint
-from cronos_lerobot.evaluation.store import read_results
-from cronos_lerobot.hub.cards import render_card
-from cronos_lerobot.hub.caveats import describe_caveats
-from cronos_lerobot.hub.config import PolicyConfig
-from cronos_lerobot.hub.eval_flags import cronos_eval_flags, lerobot_eval_flags
-from cronos_lerobot.hub.peft_base import find_base, name_base
-from cronos_lerobot.hub.runs import (
-    Checkpoint,
-    config_facts,
-    describe_source,
-    find_checkpoint,
-    is_of_cronos_train,
-    is_repository,
-    read_run,
-    run_facts,
-    train_config_path,
+from cronos_lerobot.evaluation.policy_env import trained_scene
+from cronos_lerobot.evaluation.policy_source import (
+    ADAPTER_CONFIG,
+    BASE,
+    REVISION,
+    damage_named,
+    files_fingerprint,
+    find_base,
 )
-from cronos_lerobot.report import figures
-from cronos_lerobot.report.png import to_png
-from cronos_lerobot.report.runs import TrainingRun, group_runs
+from cronos_lerobot.evaluation.results import read_evaluation
+from cronos_lerobot.film.png import to_png
+from cronos_lerobot.hub.cards import code, interval, render_card
+from cronos_lerobot.hub.config import PolicyConfig
+from cronos_lerobot.hub.eval_flags import environment_flags
+from cronos_lerobot.hub.push import matching
+from cronos_lerobot.hub.results import describe_setting, differences
+from cronos_lerobot.hub.runs import Checkpoint, changed_flags, find_checkpoint, flatten, is_repository
+from cronos_lerobot.hub.stage import read_json, readable, stage, write_text
+from cronos_lerobot.protocol.interventions import COUNTED_INTERVENTIONS
+from cronos_lerobot.report.figures import evaluation_figure
+from cronos_lerobot.report.load import tables_of
+from cronos_lerobot.report.runs import TrainingRun
 
-REPLACES = [
-    "curves/*", "config.json", "train_config.json", "model.safetensors", "model.safetensors.index.json",
-    "model-*-of-*.safetensors", f"{POLICY_PREPROCESSOR_DEFAULT_NAME}*", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}*",
-    "adapter_config.json", "adapter_model.safetensors", STEERING, "tokenizer.json", "tokenizer.model",
-    "tokenizer_config.json", "special_tokens_map.json", "added_tokens.json", "merges.txt", "vocab.json",
-    "vocab.txt",
-]  # fmt: skip
-"""Also what a policy of another kind has left: an actor that steers or adapters would be loaded with this one. No
-file that is not a policy's: others may lie beside it."""
+FILES = (
+    "config.json", TRAIN_CONFIG_NAME, "model.safetensors", "model.safetensors.index.json",
+    "model-*-of-*.safetensors", ADAPTER_CONFIG, "adapter_model.safetensors", STEERING,
+    *(
+        f"{name}*.{kind}"
+        for name in (POLICY_PREPROCESSOR_DEFAULT_NAME, POLICY_POSTPROCESSOR_DEFAULT_NAME)
+        for kind in ("json", "safetensors")
+    ),
+    "generation_config.json", "preprocessor_config.json", "processor_config.json", "tokenizer.json",
+    "tokenizer.model", "tokenizer_config.json", "special_tokens_map.json", "added_tokens.json", "merges.txt",
+    "vocab.json", "vocab.txt",
+)  # fmt: skip
+"""What makes a policy. Nothing else is pushed. A new policy removes what an older one has left of these: an actor
+that steers, or adapters, would be loaded with it."""
+CURVE = "curves/evaluation.png"
 LICENSE = "apache-2.0"
-"""As LeRobot says of a policy that names none."""
-FIGURES = {
-    "evaluation": ("Periodic evaluation, with 95 % intervals", figures.evaluation_figure),
-    "training": ("Success of the training streams' segments", figures.training_figure),
-    "segments": ("The same by segment since the last scene reset, last quarter", figures.segments_figure),
-}
-DPI = 110
+"""Of a policy that names none, as in LeRobot."""
+CHECKPOINT, CHECKPOINT_REVISION = "checkpoint", "checkpoint_revision"
+"""Fields in which OpenVLA's config.json names what it was built from."""
 
 
 def write_policy_repository(config: PolicyConfig, folder: Path) -> str:
     """Write the tree of a policy's repository into `folder`; returns what it is, in words.
 
     Raises:
-        ValueError: --path is missing, the policy is damaged or of another robot, its adapters are of a policy
-            that is not on the Hub, or results.json is none, or of another policy or scene.
-        FileNotFoundError: there is no policy, or no results.json.
+        ValueError: --path is missing, a file is damaged, the adapters are of a policy that is not on the Hub, or
+            --results are of another policy.
+        FileNotFoundError: there is no policy, or no results.
     """
     if config.path is None:
         raise ValueError("--path=<run folder or checkpoint> is required")
     checkpoint = find_checkpoint(config.path)
-    policy = _read_policy(checkpoint.model)
-    adapters_of = find_base(checkpoint.model, config.base_policy)
-    for file in sorted(checkpoint.model.iterdir()):
-        if file.is_file():
-            shutil.copyfile(file, folder / file.name)
-    if adapters_of is not None:
-        name_base(folder, adapters_of)
-    run = read_run(checkpoint.run, checkpoint.step) if checkpoint.run else None
-    curves = _draw_curves(run, folder) if run else []
-    results = _read_scores(config.results, checkpoint) if config.results else None
-    (folder / "README.md").write_text(_card(config, checkpoint, policy, adapters_of, run, curves, results))
-    steps = f" after {run.last['interaction_steps']} interaction steps" if run else ""
+    model = checkpoint.model
+    names = matching(sorted(file.name for file in model.iterdir()), FILES)
+    base, changes = _adapters_base(model, config.base_policy)
+    stage(model, names, folder, changes)
+    with damage_named(model):
+        for name in (name for name in names if name.endswith(".safetensors")):
+            with safe_open(model / name, "numpy"):
+                pass
+    results = _read_scores(config.results, model) if config.results else []
+    policy = read_json(model / "config.json")
+    with readable(config.path):
+        has_curve = checkpoint.run is not None and _draw_curve(checkpoint.run, folder / CURVE)
+        card = _card(config, checkpoint, policy, base, results, CURVE if has_curve else None)
+    write_text(folder / "README.md", card)
+    steps = f" after {checkpoint.run.last['interaction_steps']} interaction steps" if checkpoint.run else ""
     return f"{policy['type']} policy{steps}"
 
 
-def _read_scores(path: Path, checkpoint: Checkpoint) -> dict[str, Any]:
-    """Results of `cronos-eval` of this policy.
+def _adapters_base(model: Path, base_policy: str | None) -> tuple[str | None, dict[str, dict[str, Any]]]:
+    """The repository of the policy that PEFT's adapters in `model` go onto, and the JSON that must say so.
 
     Raises:
-        FileNotFoundError: there are none.
-        ValueError: they are of the expert, or of a policy with other weights.
+        ValueError: they name a folder, and there is no `base_policy`.
     """
-    results = read_results(path)
-    evaluated = results.get("policy")
-    # Results of before there was a hash of the files alone are taken at their word.
-    files = results.get("policy_files")
-    if evaluated == EXPERT or (files and files != files_fingerprint(checkpoint.model, with_base=False)):
-        raise ValueError(f"--results={path} is of {evaluated}, whose weights are not those of {checkpoint.model}")
-    return results
-
-
-def _read_policy(model: Path) -> dict[str, Any]:
-    """config.json of a policy whose files are whole and which moves this robot.
-
-    Raises:
-        ValueError: names the file that is damaged, or says what the policy is.
-    """
-    try:
-        policy = json.loads((model / "config.json").read_text())
-        actions = policy["output_features"][ACTION]["shape"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{model / 'config.json'} is no policy's configuration: {error!r}") from error
-    if list(actions) != [len(ACTION_NAMES)]:
+    base, here = find_base(model)
+    if base is None or (is_repository(base) and here is None):
+        return base, {}
+    if base_policy is None:
         raise ValueError(
-            f"the policy in {model} has actions {actions}, those of the WidowX are {len(ACTION_NAMES)}"
+            f"{model} holds adapters of the policy in {base}, a folder: publish that policy first, then give its "
+            "repository here, --base_policy=<owner>/<name>"
         )
-    for file in sorted(model.glob("*.safetensors")):
-        try:
-            with safe_open(file, "numpy") as tensors:
-                tensors.keys()
-        except SafetensorError as error:
-            raise ValueError(f"{file} is damaged: {error}") from error
-    return policy
+    changes = {ADAPTER_CONFIG: {BASE: base_policy, REVISION: None}}
+    named = read_json(model / "config.json").get(CHECKPOINT)
+    if named and not is_repository(named):
+        changes["config.json"] = {CHECKPOINT: base_policy, CHECKPOINT_REVISION: None}
+    return base_policy, changes
 
 
-def _draw_curves(run: TrainingRun, folder: Path) -> list[tuple[str, str]]:
-    """Draw what there is to draw; returns (caption, path) of each."""
-    groups = group_runs([run])
-    drawn = []
-    for name, (caption, draw) in FIGURES.items():
-        figure: Figure | None = draw(groups)
-        if figure is None:
-            continue
-        path = folder / "curves" / f"{name}.png"
-        path.parent.mkdir(exist_ok=True)
-        path.write_bytes(to_png(figure, DPI))
-        drawn.append((caption, f"curves/{name}.png"))
-    return drawn
+def _read_scores(path: Path, model: Path) -> list[dict[str, Any]]:
+    """Results of `cronos-eval` of this policy, one for each suite and split.
+
+    Raises:
+        ValueError: they are of other weights.
+    """
+    results, files = read_evaluation(path), files_fingerprint(model, with_base=False)
+    if others := [one["policy"] for one in results if one.get("policy_files") != files]:
+        raise ValueError(f"--results={path} is of {others[0]}, whose weights are not those of {model}")
+    return results
 
 
 def _card(
     config: PolicyConfig,
     checkpoint: Checkpoint,
     policy: dict[str, Any],
-    adapters_of: str | None,
-    run: TrainingRun | None,
-    curves: list[tuple[str, str]],
-    results: dict[str, Any] | None,
+    adapters_base: str | None,
+    results: Sequence[dict[str, Any]],
+    curve: str | None,
 ) -> str:
-    trained = json.loads(train_config_path(checkpoint.model).read_text()) if _has_config(checkpoint) else {}
-    copied = config_facts(trained) if is_of_cronos_train(trained) else None
-    training = run_facts(run) if run else copied
-    base = (run.config.get("policy") or {}).get("pretrained_path") if run else None
-    recorded = (trained.get("record") or trained.get("dataset") or {}).get("repo_id")
-    # A folder may be none where the card is made; a run that began with one has noted its fingerprint.
-    is_on_hub = run is not None and run.base is None and is_repository(base)
-    base_model = config.base_policy or (str(base) if is_on_hub else None) or adapters_of
-    env = trained.get("env") or {}
-    renderer = trained_renderer(checkpoint.model).get("renderer")
-    # A scene of one's own, which may not be registered here, is in the config; that of a clone in its dataset.
-    trained_in = env.get("scene") or trained_scene(checkpoint.model).get("scene")
-    if config.scene and trained_in and config.scene != trained_in:
-        raise ValueError(f"--scene={config.scene}, but the policy was trained in {trained_in}")
-    if config.scene and not trained_in:
+    model, run = checkpoint.model, checkpoint.run
+    file = model / TRAIN_CONFIG_NAME
+    trained = read_json(file) if file.is_file() else {}
+    scene = config.scene or (trained.get("env") or {}).get("scene") or trained_scene(model).get("scene")
+    if config.scene:
         get_scene(config.scene)
-    scene = trained_in or config.scene or (results or {}).get("scene")
-    if results and results["scene"] != scene:
-        raise ValueError(f"--results={config.results} is of {results['scene']}, the policy of {scene}")
+    base = config.base_policy or adapters_base or _began_with(trained, run)
+    flags = environment_flags(policy, trained, scene, model)
+    is_reset_free = all(trained.get(name) for name in ("env", "protocol", "algorithm"))
     return render_card(
         "policy",
         repo_id=config.repo_id,
-        policy_type=policy["type"],
-        article="An" if policy["type"][0] in "aeiou" else "A",
-        inputs=policy.get("input_features") or {},
-        outputs=policy.get("output_features") or {},
-        training=training,
-        run=training if run else None,
-        dataset=config.dataset or recorded,
-        base_model=base_model,
-        base_is_local=base is not None and base_model is None,
-        adapters_of=adapters_of,
-        license=_license(config, policy, base_model),
+        curve=curve,
+        policy_type=str(policy["type"]),
         tags=[str(tag) for tag in policy.get("tags") or []],
-        is_steered=(checkpoint.model / STEERING).is_file(),
-        scene=scene,
-        lerobot_eval_flags=lerobot_eval_flags(policy, env, scene, renderer, trained.get("rename_map")),
-        cronos_eval_flags=cronos_eval_flags(policy, env, scene, trained.get("rename_map")),
-        curves=curves,
-        results=results,
-        caveats=describe_caveats(results, policy, renderer) if results else [],
-        results_source=describe_source(results["benchmark"]["source"]) if results else None,
+        # The license of another repository, which is not known here, may forbid any other.
+        license=config.license or policy.get("license") or (None if base else LICENSE),
+        base_model=base,
+        is_adapter=adapters_base is not None,
+        dataset=config.dataset or (trained.get("record") or trained.get("dataset") or {}).get("repo_id"),
+        is_steered=(model / STEERING).is_file(),
+        is_reset_free=is_reset_free,
+        scene=code(scene) if scene else None,
+        evaluate={
+            name: [name, f"--policy.path={config.repo_id}", *flags] for name in ("cronos-eval", "lerobot-eval")
+        },
+        features=list(_features(policy)),
+        flags=changed_flags(flatten(trained)) if is_reset_free else [],
+        changed=[(code(f"--{name}"), code(values)) for name, values in run.changed.items()] if run else [],
+        run=run.last if run else None,
+        by_kind=list(_by_kind(run)) if run else [],
+        evaluations=list(_evaluations(run)) if run else [],
+        scores=[row for one in results for row in _scores(one)],
+        settings=list(dict.fromkeys(code(describe_setting(one)) for one in results)),
+        differences=list(dict.fromkeys(code(text) for one in results for text in differences(one, policy))),
     )
 
 
-def _license(config: PolicyConfig, policy: dict[str, Any], base_model: str | None) -> str | None:
-    """The license of a policy; None where a base's, which is not known here, may forbid any other."""
-    return config.license or policy.get("license") or (None if base_model else LICENSE)
+def _draw_curve(run: TrainingRun, file: Path) -> bool:
+    """Draw success over interaction steps and interventions, if there were evaluations."""
+    figure = evaluation_figure(tables_of(run).evaluations)
+    if figure is None:
+        return False
+    file.parent.mkdir()
+    file.write_bytes(to_png(figure, dpi=110))
+    return True
 
 
-def _has_config(checkpoint: Checkpoint) -> bool:
-    return train_config_path(checkpoint.model).is_file()
+def _began_with(trained: dict[str, Any], run: TrainingRun | None) -> str | None:
+    """The repository of the policy that a training began with; None if there was none, or a folder."""
+    config = run.config if run else trained
+    path = (config.get("policy") or {}).get("pretrained_path")
+    # Of a folder, which may not be here, the run has noted a fingerprint.
+    return str(path) if is_repository(path) and not (run and run.base) else None
+
+
+def _features(policy: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
+    for way in ("input", "output"):
+        for name, feature in (policy.get(f"{way}_features") or {}).items():
+            yield way, code(name), code(feature["type"]), code(" x ".join(map(str, feature["shape"])))
+
+
+def _by_kind(run: TrainingRun) -> Iterator[tuple[Any, ...]]:
+    """(kind, number, whether it counts)."""
+    counted = {kind.name.lower() for kind in COUNTED_INTERVENTIONS}
+    for name, number in run.last["interventions_by_kind"].items():
+        if number:
+            yield code(name.replace("_", " ")), int(number), "yes" if name in counted else "no"
+
+
+def _evaluations(run: TrainingRun) -> Iterator[tuple[Any, ...]]:
+    for one in run.evaluations:
+        yield (
+            one["interaction_steps"], one["interventions"], interval(one["success"], one["ci95"]), one["n"],
+            code(one["split"]), code(one["temperature"]),
+        )  # fmt: skip
+
+
+def _scores(results: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
+    """(suite, split, measure, value with interval, n) of a results.json."""
+    where = code(results["suite"]), code(results["split"])
+    if "positions" not in results:
+        yield *where, "success", interval(results["success"], results["ci95"]), results["n"]
+        return
+    for k, position in enumerate(results["positions"]):
+        yield *where, f"SEQ {k}", interval(position["success"], position["ci95"]), int(position["n"])
+    length = results["average_chain_length"]
+    yield *where, "average chain length", interval(length["mean"], length["ci95"], 2), results["n"]

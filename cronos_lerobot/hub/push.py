@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-import logging
 import sys
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from glob import escape
+from json import JSONDecodeError
 from pathlib import Path
 
 import httpx
-from huggingface_hub import HfApi, constants
+from huggingface_hub import HfApi, constants, get_session, set_client_factory
 from huggingface_hub.errors import (
     HfHubHTTPError,
-    HFValidationError,
     LocalEntryNotFoundError,
     LocalTokenNotFoundError,
     RepositoryNotFoundError,
     RevisionNotFoundError,
 )
 from huggingface_hub.utils import disable_progress_bars
+
+TIMEOUT_S = 60.0
+"""Seconds that the Hub may take to answer, or to take the next bytes of an upload."""
+AGAIN = "run the same command again, it resumes with what is missing"
+UNREADABLE = (JSONDecodeError, KeyError, TypeError, AttributeError, httpx.DecodingError)
+"""What huggingface_hub raises at an answer that no Hub gives, such as a proxy's login page."""
 
 
 class PublishError(Exception):
@@ -49,6 +54,21 @@ class Target:
         return f"{constants.ENDPOINT}/{prefix}{self.repo_id}{branch}"
 
 
+def limit_waiting() -> None:
+    """Let requests to the Hub fail after `TIMEOUT_S` without an answer; huggingface_hub waits for ever."""
+    hooks = [hook for hook in get_session().event_hooks["request"] if hook is not _limit]
+    set_client_factory(
+        lambda: httpx.Client(event_hooks={"request": [*hooks, _limit]}, follow_redirects=True, timeout=None)
+    )
+
+
+def _limit(request: httpx.Request) -> None:
+    # Most requests of huggingface_hub ask for no limit, whatever the client's own is.
+    given = request.extensions.get("timeout") or {}
+    names = ("connect", "read", "write", "pool")
+    request.extensions["timeout"] = {name: given.get(name) or TIMEOUT_S for name in names}
+
+
 def push_folder(
     folder: Path,
     target: Target,
@@ -65,23 +85,21 @@ def push_folder(
         folder: the tree to push.
         target: where to.
         message: of the commit.
-        replaces: patterns of files that are removed where the folder does not have them; one without a folder is
-            of files at the root alone.
+        replaces: patterns of files that are removed if the folder does not have them. One without a slash is of
+            files at the root alone.
         tag: to put onto the result, moved if it is there.
         creates: make the repository if it is not there.
-        parent_commit: that the branch must still be at, where what is pushed was made from it.
+        parent_commit: that the branch must still be at, because the tree was made from it.
 
     Returns:
         The URL of the repository.
 
     Raises:
         PublishError: the Hub refused, the branch is at another commit than `parent_commit`, or the connection was
-            lost; pushing again goes on with what is missing.
+            lost; pushing again resumes with what is missing.
     """
     if not sys.stderr.isatty():
         disable_progress_bars()
-        # The Hub's advice on large folders and its retries: what matters of them is in our errors.
-        logging.getLogger("huggingface_hub").setLevel(logging.ERROR)
     api = HfApi()
     repo_id, kind = target.repo_id, target.repo_type
     with explained(target):
@@ -98,19 +116,21 @@ def push_folder(
             folder_path=folder,
             revision=target.branch,
             commit_message=message,
-            delete_patterns=[escape(file) for file in replaced(there, replaces)] or None,
+            delete_patterns=[escape(file) for file in matching(there, replaces)] or None,
             parent_commit=parent_commit,
         )
         if tag:
-            _move_tag(api, target, tag)
+            with suppress(RevisionNotFoundError):
+                api.delete_tag(repo_id, repo_type=kind, tag=tag)
+            api.create_tag(repo_id, repo_type=kind, tag=tag, revision=target.branch)
     return target.url
 
 
-def replaced(there: Iterable[str], patterns: Sequence[str]) -> list[str]:
-    """Return the files of a repository that patterns name; the `*` of one without a folder passes no folder."""
+def matching(files: Iterable[str], patterns: Sequence[str]) -> list[str]:
+    """Return the files that patterns name; the `*` of a pattern without a slash passes no folder."""
     return [
         file
-        for file in there
+        for file in files
         if any(fnmatchcase(file, pattern) and ("/" in pattern or "/" not in file) for pattern in patterns)
     ]
 
@@ -120,8 +140,8 @@ def check_holds(target: Target, known_by: Sequence[str], advice: str) -> None:
 
     Args:
         target: the repository.
-        known_by: patterns of files; it is if it holds one of them.
-        advice: what to do if it is not, for the error.
+        known_by: patterns of files; the repository must have one of them.
+        advice: what to do if it has none, for the error.
 
     Raises:
         PublishError: it holds something else, which a push would overwrite, or the Hub refused.
@@ -132,16 +152,10 @@ def check_holds(target: Target, known_by: Sequence[str], advice: str) -> None:
             return
         files = api.list_repo_files(target.repo_id, repo_type=target.repo_type)
     there = sorted(set(files) - {".gitattributes", "README.md"})
-    if there and not replaced(there, known_by):
+    if there and not matching(there, known_by):
         raise PublishError(
             f"{target.repo_type} {target.repo_id} holds something else ({', '.join(there[:3])}, ...): {advice}"
         )
-
-
-def _move_tag(api: HfApi, target: Target, tag: str) -> None:
-    with suppress(RevisionNotFoundError):
-        api.delete_tag(target.repo_id, repo_type=target.repo_type, tag=tag)
-    api.create_tag(target.repo_id, repo_type=target.repo_type, tag=tag, revision=target.branch)
 
 
 @contextmanager
@@ -150,37 +164,36 @@ def explained(target: Target) -> Generator[None]:
     try:
         yield
     except Exception as error:
-        why = _explain(error, target)
-        if why is None:
+        if (why := _explain(error, target)) is None:
             raise
-        raise PublishError(why) from error
+        raise PublishError(" ".join(why.split())) from error
 
 
 def _explain(error: BaseException, target: Target) -> str | None:
     where, hub = f"{target.repo_type} {target.repo_id}", constants.ENDPOINT
-    if isinstance(error, HFValidationError):
-        return f"{target.repo_id!r} is no name of a repository, expected <owner>/<name>: {error}"
     if isinstance(error, RevisionNotFoundError):
         return f"{where} has no revision {target.revision or target.branch or 'main'!r} on {hub}"
     if isinstance(error, LocalTokenNotFoundError):
         return f"there is no token for {hub}: set HF_TOKEN, or run `hf auth login`"
-    status = getattr(error.response, "status_code", None) if isinstance(error, HfHubHTTPError) else None
-    if status == 401:
-        return (
-            f"{hub} refused the token, or there is none: set HF_TOKEN to one that may write (or `hf auth login`)"
-        )
-    if isinstance(error, RepositoryNotFoundError):
+    status = error.response.status_code if isinstance(error, HfHubHTTPError) and error.response is not None else 0
+    if isinstance(error, RepositoryNotFoundError) and status != 401:
         return f"there is no {where} on {hub}, or the token gives no access to it"
-    if status == 403:
-        return f"the token may not write to {where} on {hub}"
-    if status == 412:
-        return f"{where} on {hub} was changed meanwhile, nothing was pushed: run the same command again"
-    if isinstance(error, HfHubHTTPError) and status is not None and status < 500:
-        return f"{hub} refused: {error}"
-    if isinstance(error, HfHubHTTPError | LocalEntryNotFoundError | httpx.TransportError):
-        return (
-            f"lost the connection to {hub} ({type(error).__name__}) while pushing to {where}: run the same command"
-            " again, it goes on with what is missing"
-        )
+    refusals = {
+        401: f"{hub} refused the token, or there is none: set HF_TOKEN, or run `hf auth login`",
+        403: f"the token may not write to {where} on {hub}",
+        412: f"{where} on {hub} was changed meanwhile, nothing was pushed: run the same command again",
+        429: f"{hub} asks for fewer requests (429 Too Many Requests): wait some minutes, then {AGAIN}",
+    }
+    if status >= 500:
+        return f"{hub} has a fault of its own ({status}) and did not take {where}: wait, then {AGAIN}"
+    if status >= 400:
+        return refusals.get(status) or f"{hub} refused {where} ({status}): {str(error)[:300]}"
+    if isinstance(error, httpx.TimeoutException):
+        return f"{hub} did not answer in time ({type(error).__name__}) about {where}: {AGAIN}"
+    if isinstance(error, UNREADABLE):
+        why = f"gave an answer that is none of a Hub's ({type(error).__name__})"
+        return f"{hub} {why} about {where}: check HF_ENDPOINT and your proxy"
+    if isinstance(error, httpx.HTTPError | LocalEntryNotFoundError):
+        return f"lost the connection to {hub} ({type(error).__name__}) about {where}: {AGAIN}"
     # An upload in a thread is reported with its cause.
     return _explain(error.__cause__, target) if isinstance(error, RuntimeError) and error.__cause__ else None

@@ -3,64 +3,98 @@
 from __future__ import annotations
 
 import errno
-import json
-import shutil
-from collections.abc import Generator
+import re
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lerobot.datasets.utils import INFO_PATH
-from lerobot_env_cronos.statistics import wilson_interval
+from lerobot.datasets.utils import DEFAULT_TASKS_PATH, EPISODES_DIR, INFO_PATH, STATS_PATH
 
 from cronos_lerobot.data.file_check import check_dataset
-from cronos_lerobot.data.origin import STREAMS, Origin
-from cronos_lerobot.data.stream_filter import read_filter
+from cronos_lerobot.data.origin import DEMONSTRATIONS, ORIGIN, STREAMS, Origin
+from cronos_lerobot.data.stream_statistics import statistics
 from cronos_lerobot.data.streams import StreamDataset
-from cronos_lerobot.hub.cards import render_card
+from cronos_lerobot.dataset_metadata import named_files, open_metadata
+from cronos_lerobot.hub.cards import code, render_card
 from cronos_lerobot.hub.config import StreamConfig
-from cronos_lerobot.hub.runs import read_run, run_facts
+from cronos_lerobot.hub.runs import changed_flags
+from cronos_lerobot.hub.stage import read_json, readable, stage, write_text
 from cronos_lerobot.locks import FolderInUseError, FolderLock
-from cronos_lerobot.report.runs import TrainingRun
-from cronos_lerobot.training.logging import MANIFEST, METRICS
+from cronos_lerobot.protocol.interventions import Intervention
+from cronos_lerobot.statistics import wilson_interval
 
-FOLDERS = ("data", "meta", "videos")
-"""Of a LeRobotDataset; others, such as pictures that wait to be encoded, stay here."""
-REPLACES = [f"{folder}/*" for folder in FOLDERS]
+META = re.compile(rf"{EPISODES_DIR}/chunk-\d+/file-\d+\.parquet")
+REPLACES = ["data/*", "meta/*", "videos/*"]
+"""What a new version of a dataset removes of the old one."""
 OUTCOMES = ("success", "found_complete")
 """Fields of a filter that choose segments by how they went."""
-READ_ONLY = (errno.EACCES, errno.EPERM, errno.EROFS)
-"""Errors of a folder that this process may only read."""
+COLUMNS = {
+    "action": "executed action: end-effector target delta [m, rad] and gripper (1 open, 0 close)",
+    "next.reward": "reward of the action",
+    "next.success": "the task is complete after the action",
+    "next.done": "the episode ends with its task; always false in a stream, which never ends",
+    "next.truncated": "last frame of a segment, or of an episode whose time is over",
+    "intervention": "a person or a script acted",
+    "cronos.stream_id": "number of the stream",
+    "cronos.step": "control step of the stream, from 0",
+    "cronos.segment_index": "number of the segment in its stream",
+    "cronos.segments_since_reset": "task switches since the stream's last scene reset",
+    "cronos.event": "what happened right before the frame: "
+    + ", ".join(f"{kind.value} {kind.name.lower().replace('_', ' ')}" for kind in Intervention),
+    "cronos.stream_interventions": "interventions of this stream so far",
+    "cronos.total_interventions": "interventions of all streams so far",
+    "cronos.policy_version": "policy updates before the action",
+    "cronos.log_prob": "log-probability of the action [nats]",
+    "cronos.value": "the policy's value",
+}
+"""What the columns hold that do not say it themselves."""
+LEROBOTS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
-def read_info(config: StreamConfig) -> dict[str, Any]:
-    """meta/info.json of the dataset.
+def write_stream_repository(config: StreamConfig, folder: Path) -> str:
+    """Write the tree of a dataset's repository into `folder`; returns what it is, in words.
 
     Raises:
-        ValueError: --root is missing, or the dataset is empty.
+        ValueError: the dataset is damaged, empty, of another robot or version, or has a link that leads out of it.
+    """
+    root = config.root
+    assert root is not None
+    origin = check_dataset(root)
+    stage(root, _files(root), folder)
+    info = read_json(root / INFO_PATH)
+    with readable(root / ORIGIN):
+        card = _card(config.repo_id, root, info, origin)
+    write_text(folder / "README.md", card)
+    return f"{origin.kind}: {info['total_episodes']} episodes, {info['total_frames']} frames"
+
+
+def read_version(config: StreamConfig) -> str:
+    """LeRobot's version of the dataset's format: the tag that LeRobot looks for on the Hub.
+
+    Raises:
+        ValueError: --root is missing, or info.json is damaged.
         FileNotFoundError: there is no dataset.
     """
     if config.root is None:
         raise ValueError("--root=<folder of the dataset> is required, such as outputs/train/eer/streams")
-    path = config.root / INFO_PATH
-    if not path.is_file():
-        raise FileNotFoundError(f"{config.root} is no LeRobotDataset: it has no {INFO_PATH}")
-    info = json.loads(path.read_text())
-    if not info["total_episodes"]:
-        raise ValueError(f"{config.root} has no episode yet")
-    return info
+    file = config.root / INFO_PATH
+    if not file.is_file():
+        raise FileNotFoundError(f"--root={config.root} is no LeRobotDataset: it has no {INFO_PATH}")
+    with readable(file):
+        return str(read_json(file)["codebase_version"])
 
 
-def read_codebase_version(config: StreamConfig) -> str:
-    """LeRobot's version of the dataset's format, the tag that LeRobot looks for on the Hub."""
-    return read_info(config)["codebase_version"]
+def _files(root: Path) -> list[str]:
+    """The files of a dataset: what `info.json` and `meta/episodes` name."""
+    names = [name for name in (INFO_PATH, STATS_PATH, DEFAULT_TASKS_PATH, ORIGIN) if (root / name).exists()]
+    meta = (path.relative_to(root).as_posix() for path in sorted((root / EPISODES_DIR).glob("*/*")))
+    return [*names, *filter(META.fullmatch, meta), *named_files(open_metadata("local/dataset", root))]
 
 
 @contextmanager
 def not_being_recorded(root: Path) -> Generator[None]:
-    """Keep writers out of a dataset while its files are checked and pushed.
-
-    One that may only be read, as a shared one, is not locked.
+    """Keep writers out of a dataset while it is read and pushed; one that may only be read has none.
 
     Raises:
         FolderInUseError: it is still being recorded.
@@ -68,10 +102,10 @@ def not_being_recorded(root: Path) -> Generator[None]:
     lock = FolderLock(root)
     try:
         lock.acquire()
-    except FolderInUseError as error:
-        raise FolderInUseError(f"{root} is still being recorded, publish it afterwards: {error}") from error
+    except FolderInUseError:
+        raise
     except OSError as error:
-        if error.errno not in READ_ONLY:
+        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
             raise
     try:
         yield
@@ -79,121 +113,73 @@ def not_being_recorded(root: Path) -> Generator[None]:
         lock.release()
 
 
-def write_stream_repository(config: StreamConfig, folder: Path) -> str:
-    """Write the tree of a dataset's repository into `folder`; returns what it is, in words.
-
-    A dry run copies the files; a push, whose tree is gone afterwards, links them.
-
-    Raises:
-        ValueError: --root is missing, the dataset is empty or not ours, or a file of it is damaged.
-        FileNotFoundError: there is no dataset, or --run is no run.
-    """
-    info = read_info(config)
-    assert config.root is not None
-    origin = check_dataset(config.root)
-    for name in FOLDERS:
-        for file in sorted((config.root / name).rglob("*")):
-            # What the recorder has not finished yet has a hidden name.
-            if file.is_file() and not file.name.startswith("."):
-                place = folder / file.relative_to(config.root)
-                place.parent.mkdir(parents=True, exist_ok=True)
-                if config.dry_run:
-                    shutil.copyfile(file, place)
-                else:
-                    place.symlink_to(file.resolve())
+def _card(repo_id: str, root: Path, info: dict[str, Any], origin: Origin) -> str:
     is_stream = origin.kind == STREAMS
-    card = _stream_card(config, info, origin) if is_stream else _demonstrations_card(config, info, origin)
-    (folder / "README.md").write_text(card)
-    kind = "streams" if is_stream else "demonstrations"
-    return f"{kind}: {info['total_episodes']} episodes, {info['total_frames']} frames"
-
-
-def _find_run(config: StreamConfig) -> Path | None:
-    """Folder of the training run, given or around the dataset."""
-    assert config.root is not None
-    if config.run is not None:
-        if not (config.run / MANIFEST).is_file():
-            raise FileNotFoundError(f"{config.run} is no run of cronos-train: it has no {MANIFEST}")
-        return config.run
-    around = config.root.resolve().parent
-    return around if (around / MANIFEST).is_file() and (around / METRICS).is_file() else None
-
-
-def _stream_card(config: StreamConfig, info: dict[str, Any], origin: Origin) -> str:
-    from cronos_lerobot.data.stream_statistics import statistics
-
-    assert config.root is not None
-    streams = StreamDataset(config.repo_id, root=config.root)
-    filters, counts = _filters(config.root), statistics(streams)
-    chosen_by_outcome = any(one["filter"].get(name) is not None for one in filters for name in OUTCOMES)
-    run = _find_run(config)
-    trained = read_run(run) if run else None
-    if trained and (scene := trained.config["env"]["scene"]) != origin.scene:
-        raise ValueError(f"{config.root} was recorded in {origin.scene}, the run {run} is of {scene}")
+    shown = _what_happened(StreamDataset(repo_id, root=root), origin) if is_stream else {}
     return render_card(
-        "streams",
-        repo_id=config.repo_id,
+        "dataset",
+        repo_id=repo_id,
+        is_stream=is_stream,
+        is_demonstration=origin.kind == DEMONSTRATIONS,
         info=info,
-        statistics=counts,
-        missing=_missing(streams) or (_broken_off(streams, trained) if trained and not filters else None),
-        filters=filters,
-        chosen_by_outcome=chosen_by_outcome,
-        # There are none of the policy's own where an expert did all segments.
-        tells_success=not chosen_by_outcome and bool(counts["success_by_position"]),
-        run=run_facts(trained) if trained else None,
-        interval=wilson_interval,
-        **_common(info, origin),
+        scene=code(origin.scene),
+        environment=code(origin.environment),
+        filters=[_describe_filter(one) for one in origin.filters],
+        flags=list(_flags(origin)),
+        columns=list(_columns(info)),
+        **shown,
     )
 
 
-def _filters(root: Path) -> list[dict[str, Any]]:
-    """The filters that a dataset came through, the last one first; see `filter_streams`."""
-    found, last = [], read_filter(root)
-    while last:
-        found.append(last | {"flags": _filter_flags(last)})
-        # Notes of earlier releases do not have it.
-        last = last.get("filter_of_source")
-    return found
+def _columns(info: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    for name, feature in info["features"].items():
+        if name not in LEROBOTS:
+            shape = " x ".join(str(int(size)) for size in feature["shape"])
+            yield code(name), code(feature["dtype"]), shape, COLUMNS.get(name, "")
 
 
-def _filter_flags(filtered: dict[str, Any]) -> list[str]:
-    """Flags of `cronos-streams filter` that made a dataset."""
-    flags = {f"filter.{name}": value for name, value in filtered["filter"].items()}
-    flags["frames_after_success"] = filtered["frames_after_success"]
-    return [f"--{name}={json.dumps(value)}" for name, value in flags.items() if value is not None]
+def _flags(origin: Origin) -> Iterator[tuple[str, str]]:
+    """What made the dataset, as rows of a table."""
+    if origin.kind == DEMONSTRATIONS:
+        for name, value in origin.flags.items():
+            if value not in (None, False, "", [], {}) and not name.startswith(("env.features", "dataset.")):
+                yield code(f"--{name}"), code(value)
+        return
+    yield from changed_flags(origin.flags)
+    for change in origin.resumed:
+        for name, value in change["flags"].items():
+            yield code(f"--{name}"), code(f"{value}, from episode {change['episodes']} of the recording")
 
 
-def _missing(streams: StreamDataset) -> str | None:
-    """What is missing of the streams, if anything: filtered ones are not whole."""
+def _what_happened(streams: StreamDataset, origin: Origin) -> dict[str, Any]:
+    """Numbers of recorded streams for the card."""
+    counts = statistics(streams)
     try:
         streams.check()
+        missing = None
     except ValueError as error:
-        return str(error)
-    return None
-
-
-def _broken_off(streams: StreamDataset, run: TrainingRun) -> str | None:
-    """How far a recording came that ended before its run: all of its streams end at the same step."""
-    recorded = max(segment.step + segment.length for segment in streams.segments)
-    taken = run.last["interaction_steps"] // run.config["num_envs"]
-    return f"the recording ends after {recorded} of {taken} control steps" if recorded < taken else None
-
-
-def _demonstrations_card(config: StreamConfig, info: dict[str, Any], origin: Origin) -> str:
-    return render_card("demonstrations", repo_id=config.repo_id, info=info, **_common(info, origin))
-
-
-def _common(info: dict[str, Any], origin: Origin) -> dict[str, Any]:
-    cameras = [name for name, feature in info["features"].items() if feature["dtype"] in ("video", "image")]
-    observation = [
-        f"`{name}` {feature['shape'][1]} x {feature['shape'][0]} px"
-        for name, feature in info["features"].items()
-        if name in cameras
-    ] + [f"`{name}`" for name in info["features"] if name.startswith("observation.") and name not in cameras]
+        missing = code(error)
+    # Segments that were chosen by how they went say nothing of how often the policy succeeded.
+    is_chosen = any(one["filter"].get(name) is not None for one in origin.filters for name in OUTCOMES)
     return {
-        "scene": origin.scene,
-        "environment": origin.environment,
-        "origin": origin,
-        "observation": ", ".join(observation),
-        "is_video": any(feature["dtype"] == "video" for feature in info["features"].values()),
+        "num_streams": counts["streams"],
+        "missing": missing,
+        "is_chosen": is_chosen,
+        "success": [] if is_chosen else list(_success_rows(counts["success_by_position"])),
+        "began_after": [(code(name.replace("_", " ")), n) for name, n in counts["began_after"].items()],
     }
+
+
+def _success_rows(by_position: dict[int, list[int]]) -> Iterator[tuple[Any, ...]]:
+    for position, (successes, _, n) in by_position.items():
+        low, high = wilson_interval(successes, n)
+        yield position + 1, f"{successes / n:.2f}", f"{low:.2f} to {high:.2f}", n
+
+
+def _describe_filter(one: dict[str, Any]) -> dict[str, Any]:
+    """A call of `cronos-streams filter`."""
+    flags = {f"filter.{name}": value for name, value in one["filter"].items()}
+    flags["frames_after_success"] = one["frames_after_success"]
+    given = [f"--{name}={value}" for name, value in flags.items() if value is not None]
+    return {"kept": int(one["segments"]), "of": int(one["source_segments"]), "source": code(one["source"]),
+            "flags": code(" ".join(given))}  # fmt: skip

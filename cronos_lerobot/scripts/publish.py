@@ -1,16 +1,16 @@
-"""`cronos-publish`: benchmarks, streams, policies and results to the Hugging Face Hub.
+"""`cronos-publish`: push benchmarks, streams, policies and results to the Hugging Face Hub.
 
 cronos-publish benchmark   configurations and chains of a scene, for `--env.benchmark`, `datasets.load_dataset` and
                            LeRobot's `make_env`
-cronos-publish stream      recorded training streams, a LeRobotDataset
-cronos-publish policy      a policy with its training protocol, its interventions and its curves
+cronos-publish stream      recorded training streams or demonstrations, a LeRobotDataset
+cronos-publish policy      a policy, with a card that says how it was trained and how to evaluate it
 cronos-publish results     results of cronos-eval to a policy's repository, for the benchmark's leaderboard
 
 examples:
-  the benchmark of a scene; and one of your own, drawn from a seed
+  the benchmark of a scene; and your own, drawn from a seed
       cronos-publish benchmark --repo_id=me/cronos_kitchen
       cronos-publish benchmark --repo_id=me/my_kitchen --seed=7 --num_configurations=32 --num_orderings=4
-  what would be pushed, as a folder
+  show what would be pushed, as a folder
       cronos-publish benchmark --repo_id=me/cronos_kitchen --dry_run=true --output_dir=outputs/publish
   a training run: its streams, its policy
       cronos-publish stream --root=outputs/train/eer/streams --repo_id=me/eer_stream
@@ -20,9 +20,11 @@ examples:
       cronos-publish results --results=outputs/eval/eer --benchmark=me/cronos_kitchen --repo_id=me/eer
 
 HF_ENDPOINT chooses the Hub and HF_TOKEN the account (or `hf auth login`). After a lost connection the same command
-goes on with what is missing. `cronos-publish policy --help` has the flags of a command, docs/hub.md the rest.
+resumes with what is missing. Only files of a policy or a dataset are pushed, without access tokens and folders.
+`cronos-publish policy --help` lists the flags of a command.
 """
 
+import shutil
 import tempfile
 from collections.abc import Callable
 from functools import partial
@@ -42,11 +44,11 @@ def publish_benchmark(config: BenchmarkConfig) -> None:
     from cronos_lerobot.hub.benchmark import DATA, ENV_FILE, REPLACES, choose_benchmark, write_benchmark_repository
 
     if not config.dry_run:
-        # Benchmarks that were made otherwise have the data alone.
+        # Benchmarks that were made in another way have only the data.
         check_holds(config.target, (ENV_FILE, DATA), "choose another --repo_id")
         for target in config.targets[1:]:
             check_holds(target, (ENV_FILE,), "choose another --repo_id, or --env_hub=false")
-    # The data and what runs it are two repositories: one name for both, whatever their commits are called.
+    # Data and code are two repositories with commits of their own. The tag is one name for both.
     benchmark = choose_benchmark(config)
     tag = f"benchmark-{benchmark.fingerprint}"
     _publish(config, partial(write_benchmark_repository, benchmark=benchmark), replaces=REPLACES, tag=tag)
@@ -58,27 +60,22 @@ def publish_benchmark(config: BenchmarkConfig) -> None:
 def publish_stream(config: StreamConfig) -> None:
     """`cronos-publish stream`."""
     config.validate()
-    from cronos_lerobot.hub.streams import (
-        REPLACES,
-        not_being_recorded,
-        read_codebase_version,
-        write_stream_repository,
-    )
+    from cronos_lerobot.hub.streams import REPLACES, not_being_recorded, read_version, write_stream_repository
 
-    # LeRobot reads a dataset at its version's tag unless it is told a revision: that is not for a branch.
-    version = read_codebase_version(config)
-    tag = version if config.branch is None else None
+    # LeRobot reads a dataset at its version's tag unless it is told a revision; a branch does not move it.
+    version = read_version(config)
     assert config.root is not None
     with not_being_recorded(config.root):
+        tag = version if config.branch is None else None
         _publish(config, write_stream_repository, replaces=REPLACES, tag=tag)
 
 
 def publish_policy(config: PolicyConfig) -> None:
     """`cronos-publish policy`."""
     config.validate()
-    from cronos_lerobot.hub.policy import REPLACES, write_policy_repository
+    from cronos_lerobot.hub.policy import FILES, write_policy_repository
 
-    _publish(config, write_policy_repository, replaces=REPLACES)
+    _publish(config, write_policy_repository, replaces=FILES)
 
 
 def publish_results(config: ResultsConfig) -> None:
@@ -92,28 +89,18 @@ def publish_results(config: ResultsConfig) -> None:
     _publish(config, write, creates=False, parent_commit=commit)
 
 
-def _publish(
-    config: Any,
-    write: Callable[[Any, Path], str],
-    **push: Any,
-) -> None:
-    """Write the tree, to the dry run's folder or to one that is pushed and gone."""
-    if config.dry_run:
-        # Whole or not there: what is refused halfway leaves nothing to remove before the next try.
-        place = config.output_dir.resolve()
-        place.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{place.name}.", dir=place.parent) as beside:
-            tree = Path(beside, place.name)
-            tree.mkdir()
-            what = write(config, tree)
-            tree.rename(place)
-        files = [path for path in place.rglob("*") if path.is_file()]
-        size = sum(path.stat().st_size for path in files) / 1e6
-        print(f"dry run: {what}\n{len(files)} files, {size:.2f} MB in {config.output_dir}; nothing was pushed")
-        return
-    with tempfile.TemporaryDirectory(prefix="cronos_publish_") as folder:
-        what = write(config, Path(folder))
-        urls = [push_folder(Path(folder), target, f"Publish {what}", **push) for target in config.targets]
+def _publish(config: Any, write: Callable[[Any, Path], str], **push: Any) -> None:
+    """Write the tree, then push it or copy it to the dry run's folder."""
+    with tempfile.TemporaryDirectory(prefix="cronos_publish_") as name:
+        folder = Path(name)
+        what = write(config, folder)
+        if config.dry_run:
+            shutil.copytree(folder, config.output_dir, dirs_exist_ok=True)
+            sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
+            size = f"{len(sizes)} files, {sum(sizes) / 1e6:.2f} MB"
+            print(f"dry run: {what}\n{size} in {config.output_dir}; nothing was pushed")
+            return
+        urls = [push_folder(folder, target, f"Publish {what}", **push) for target in config.targets]
     print("\n".join([f"published {what}", *urls]))
 
 

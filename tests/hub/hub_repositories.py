@@ -105,6 +105,10 @@ class Faults:
     """Downloads of files with this suffix lose their connection."""
     drop_commits: int = 0
     """So many commits lose their connection before they are read."""
+    answer: tuple[int, bytes] | None = None
+    """Status and body of the answer to every request."""
+    is_silent: bool = False
+    """Requests are taken and never answered."""
 
 
 @dataclass

@@ -12,6 +12,7 @@ import json
 import re
 import socket
 import threading
+import time
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -73,8 +74,17 @@ class Handler(BaseHTTPRequestHandler):
         self.query = parse_qs(url.query)
         self.hub.requests.append(f"{self.command} {url.path}")
         method = "GET" if self.command == "HEAD" else self.command
+        faults = self.hub.faults
+        if faults.is_silent:
+            while faults is self.hub.faults:
+                time.sleep(0.05)
+            self.close_connection = True
+            return
         try:
-            status, headers, body = self._route(method, url.path)
+            if faults.answer is not None:
+                status, headers, body = faults.answer[0], {"Content-Type": "text/html"}, faults.answer[1]
+            else:
+                status, headers, body = self._route(method, url.path)
         except HubError as error:
             body = json.dumps({"error": error.message}).encode()
             headers = {"X-Error-Code": error.code, "X-Error-Message": error.message}

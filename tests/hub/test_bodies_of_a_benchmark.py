@@ -8,7 +8,7 @@ from lerobot_env_cronos import SCENES, Body, Scene, gymnasium_id, load_benchmark
 from lerobot_env_cronos.benchmark import load
 from lerobot_env_cronos.benchmark.benchmark import draw_benchmark
 from lerobot_env_cronos.benchmark.files import BODIES_KEY, BenchmarkError, write_benchmark
-from lerobot_env_cronos.hub_config import CronosHubEnvConfig
+from lerobot_env_cronos.config import CronosHubEnvConfig
 from lerobot_env_cronos.scene.scenes import BODIES
 from pyarrow import parquet
 

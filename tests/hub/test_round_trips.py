@@ -6,12 +6,6 @@ import re
 import pytest
 import yaml
 from hub_repositories import File
-from lerobot_env_cronos import CronosEnvConfig
-from lerobot_policy_pocketvla import PocketVLAConfig
-
-from cronos_lerobot.protocol.config import ProtocolConfig
-from cronos_lerobot.training.config import CronosTrainConfig
-from cronos_lerobot.training.factory import make_env
 
 BENCHMARK = ("benchmark", "--repo_id=me/bench", "--scene=playroom_2x2", "--seed=5", "--num_configurations=2",
              "--num_orderings=2", "--chain_length=2")  # fmt: skip
@@ -48,22 +42,6 @@ def run(bench, commands, tmp_path_factory):
     return folder
 
 
-def test_a_training_that_asks_for_more_configurations_than_there_are_is_told(bench, commands, tmp_path):
-    flags = [*TRAINING, f"--env.benchmark={bench}", f"--output_dir={tmp_path / 'run'}", "--eval_freq=16"]
-    outcome = commands.try_("cronos-train", *flags)
-    assert outcome.code == 1
-    assert "--eval.n_episodes=64, but" in outcome.output
-    assert "has 2 train configurations: give --eval.n_episodes=2 or fewer" in outcome.output
-    # Also where only numbers of interventions are to be evaluated at.
-    config = CronosTrainConfig(
-        policy=PocketVLAConfig(device="cpu", push_to_hub=False), env=CronosEnvConfig(benchmark=str(bench)),
-        output_dir=tmp_path / "other", protocol=ProtocolConfig(num_configurations=2), eval_freq=0,
-        eval_at_interventions=[2],
-    )  # fmt: skip
-    with pytest.raises(ValueError, match=r"--eval\.n_episodes=64, but .* has 2 train configurations"):
-        make_env(config, 2)
-
-
 @pytest.fixture(scope="module")
 def policy(run, commands):
     """The policy on the Hub."""
@@ -86,67 +64,36 @@ print(load_dataset("me/bench", "independent", split="train").num_rows, load_data
     assert "[(0, 0, 2), (0, 1, 2), (1, 0, 2), (1, 1, 2)]" in output
     assert re.search(r"\(320, 240\) 0\.[23]\d+", output)
     assert "8 dict_keys(['train', 'held_out'])" in output
-    card = (bench / "eval.yaml").read_text()
-    tasks = yaml.safe_load(card)["tasks"]
+    tasks = yaml.safe_load((bench / "eval.yaml").read_text())["tasks"]
     assert {"id": "sequential_held_out", "config": "sequential", "split": "held_out"} in tasks
 
 
-def test_the_packages_sequential_suite_has_640_chains(hub, commands):
+def test_a_branch_leaves_main_as_it_was(hub, commands):
     commands.run("cronos-publish", "benchmark", "--repo_id=me/kitchen", "--pictures=false", "--branch=dev")
     where = '"me/kitchen", "sequential", split="held_out", revision="dev"'
     assert "640" in commands.run("python", f"import datasets; print(len(datasets.load_dataset({where})))").split()
-    assert set(hub.tree("datasets", "me/kitchen")) == set(), "the main branch stays as it was"
+    assert set(hub.tree("datasets", "me/kitchen")) == set()
 
 
 def test_lerobot_eval_runs_the_benchmark_from_the_hub(bench, policy, commands, tmp_path):
-    commands.forget()
-    commands.run(
-        "lerobot-eval", f"--policy.path={policy}", "--policy.device=cpu", "--env.type=cronos",
-        "--env.benchmark=me/bench@main", "--env.suite=sequential", "--env.split=held_out", "--env.task=1",
-        "--env.observation_height=32", "--env.observation_width=32", "--eval.n_episodes=2", "--eval.batch_size=2",
-        "--env.render_size=[32, 32]", f"--output_dir={tmp_path / 'eval'}",
-    )  # fmt: skip
-    info = json.loads((tmp_path / "eval/eval_info.json").read_text())
-    assert [(task["task_group"], task["task_id"]) for task in info["per_task"]] == [("sequential_held_out", 1)]
-    assert info["overall"]["n_episodes"] == 2
-
-
-def test_a_policy_of_the_hub_that_was_trained_in_another_scene_is_told(policy, commands):
-    code = """
-from types import SimpleNamespace
-from cronos_lerobot.training.factory import warn_of_other_scene
-for path in ("me/policy", "me/nobody"):
-    for scene in ("playroom_2x2", "kitchen_2x2"):
-        print("run in", scene)
-        warn_of_other_scene(SimpleNamespace(pretrained_path=path, pretrained_revision=None), scene)
-"""
-    commands.forget()
-    output = commands.run("python", code)
-    told = "me/policy was trained in --env.scene=playroom_2x2, this run is in --env.scene=kitchen_2x2"
-    assert output.count("was trained in") == output.count(told) == 1
-
-
-def test_lerobot_eval_runs_the_repositorys_own_code(bench, policy, commands, tmp_path):
-    hub_env = ("--env.type=cronos_hub", "--env.hub_path=me/bench")
+    """By its name, and by the repository's own code where that is allowed to run."""
     flags = (
-        f"--policy.path={policy}", "--policy.device=cpu", *hub_env,
-        "--env.suite=sequential", "--env.split=held_out", "--env.task=1", "--env.observation_height=32",
-        "--env.observation_width=32", "--env.render_size=[32, 32]", "--eval.n_episodes=2", "--eval.batch_size=2",
+        f"--policy.path={policy}", "--policy.device=cpu", "--env.suite=sequential", "--env.split=held_out",
+        "--env.task=1", "--env.observation_height=32", "--env.observation_width=32", "--eval.n_episodes=2",
+        "--eval.batch_size=2", "--env.render_size=[32, 32]",
     )  # fmt: skip
-    refused = commands.try_("lerobot-eval", *flags, f"--output_dir={tmp_path / 'refused'}")
-    assert refused.code == 1
-    assert "Refusing to execute remote code" in refused.output
-    commands.run("lerobot-eval", *flags, f"--output_dir={tmp_path / 'eval'}", "--trust_remote_code=true")
-    info = json.loads((tmp_path / "eval/eval_info.json").read_text())
-    assert [(task["task_group"], task["task_id"]) for task in info["per_task"]] == [("sequential_held_out", 1)]
-    for command in ("cronos-eval", "cronos-train"):
-        outcome = commands.try_(command, *flags[:4])
-        assert outcome.code == 1
-        assert "got 'cronos_hub'" in outcome.output
-    another = commands.try_("lerobot-eval", *flags[:4], "--env.benchmark=me/other")
-    assert "env.benchmark is that of env.hub_path=me/bench; got 'me/other'" in another.output
-    nowhere = commands.try_("lerobot-eval", *flags[:2], "--env.type=cronos_hub")
-    assert "env.type=cronos_hub needs env.hub_path" in nowhere.output
+    own_code = ("--env.type=cronos_hub", "--env.hub_path=me/bench")
+    refused = commands.try_("lerobot-eval", *flags, *own_code, f"--output_dir={tmp_path / 'refused'}")
+    assert (refused.code, "Refusing to execute remote code" in refused.output) == (1, True)
+    commands.forget()
+    for name, env in (
+        ("data", ("--env.type=cronos", "--env.benchmark=me/bench@main")),
+        ("code", (*own_code, "--trust_remote_code=true")),
+    ):
+        commands.run("lerobot-eval", *flags, *env, f"--output_dir={tmp_path / name}")
+        info = json.loads((tmp_path / name / "eval_info.json").read_text())
+        assert [(task["task_group"], task["task_id"]) for task in info["per_task"]] == [("sequential_held_out", 1)]
+        assert info["overall"]["n_episodes"] == 2
 
 
 def test_a_stream_is_loaded_back_whole(hub, run, commands, tmp_path):
@@ -174,15 +121,12 @@ camera, segment = "observation.images.front", streams.segments_of(0)[2]
 assert remote.segments == streams.segments
 assert (remote.pixels(segment, camera) == streams.pixels(segment, camera)).all()
 assert (remote.columns(segment)["action"] == streams.columns(segment)["action"]).all()
-print([(s.step, s.length, s.intervention.name) for s in streams.segments_of(0)])
+print([(s.step, s.length, s.event.name) for s in streams.segments_of(0)])
 print(streams.dataset[15]["observation.images.front"].shape)
 """
     output = commands.run("python", code)
     assert "(0, 4, 'INITIAL'), (4, 4, 'END_EFFECTOR_RESET'), (8, 4, 'SCENE_RESET'), (12, 4," in output
     assert "torch.Size([3, 32, 32])" in output
-    card = repository.find("main").files["README.md"].content.decode()
-    assert "1 of 2 parallel streams" in card
-    assert "4 segments, 16 frames at 5 Hz" in card
     # A branch is for those who name it: the tag, which LeRobot reads at, stays.
     commands.run(*publish, "--branch=trial/1")
     assert set(repository.branches) == {"main", "trial/1"}
@@ -191,26 +135,30 @@ print(streams.dataset[15]["observation.images.front"].shape)
     assert "whole: 1 streams, 4 segments, 16 frames" in branch
 
 
-def test_a_policy_is_loaded_back_with_its_card(hub, run, policy, commands, tmp_path):
+def test_a_policy_is_loaded_back_as_its_card_says(hub, run, policy, commands, tmp_path):
     commands.run("cronos-publish", "policy", f"--path={run}", "--repo_id=me/policy", "--dry_run=true",
                  f"--output_dir={tmp_path / 'dry'}")  # fmt: skip
     assert hub.tree("models", policy) == tree(tmp_path / "dry")
-    model = run / "checkpoints/last/pretrained_model"
-    assert tree(model).items() <= tree(tmp_path / "dry").items()
+    model = tree(run / "checkpoints/last/pretrained_model")
+    assert hub.tree("models", policy).keys() == model.keys() | {"README.md"}
+    for name in model.keys() - {"train_config.json"}:
+        assert hub.tree("models", policy)[name] == model[name]
     card = (tmp_path / "dry/README.md").read_text()
     front = yaml.safe_load(card.split("---")[1])
     assert front["datasets"] == ["me/stream"]
     assert "base_model" not in front
     commit = hub.repositories["datasets", "me/bench"].branches["main"]
-    assert f"2 training configurations of [me/bench@{commit}]({hub.url}/datasets/me/bench)" in card
+    assert f"| `--env.benchmark` | `me/bench@{commit}` |" in card
     # 32 steps are 16 of each of the 2 streams; the scene of each is reset after 8 and after 16.
-    assert "Interventions that count: **4**." in card
-    assert "| scene reset | 4 | yes |" in card
-    assert "| a stream switches its task every | 4 steps |" in card
+    assert "- Interventions: 4\n" in card
+    assert "| `scene reset` | 4 | yes |" in card
+    commands.forget()
+    (code,) = re.findall(r"```python\n(.*?)```", card, re.DOTALL)
+    assert "PocketVLA" in commands.run("python", f"{code}\nprint(type(policy).__name__)")
     first = commands.run("cronos-publish", "policy", f"--path={run / 'checkpoints/000016'}", "--repo_id=me/first",
                          "--dry_run=true", f"--output_dir={tmp_path / 'first'}")  # fmt: skip
     assert "after 16 interaction steps" in first
-    assert "Interventions that count: **2**." in (tmp_path / "first/README.md").read_text()
+    assert "- Interventions: 2\n" in (tmp_path / "first/README.md").read_text()
 
 
 @pytest.fixture(scope="module")
@@ -218,23 +166,16 @@ def evaluation(policy, commands, tmp_path_factory):
     """Results of the Hub's policy on the Hub's benchmark."""
     folder = tmp_path_factory.mktemp("evaluation") / "eval"
     commands.run("cronos-eval", f"--policy.path={policy}", "--env.benchmark=me/bench", "--eval.videos=0",
-                 "--eval.suites=independent", f"--output_dir={folder}")  # fmt: skip
+                 "--eval.suites=[independent]", f"--output_dir={folder}")  # fmt: skip
     return folder
 
 
 def test_results_join_those_of_others(hub, policy, evaluation, commands, tmp_path):
-    other = {
-        "dataset": {"id": "other/bench", "task_id": "t"},
-        "value": 3,
-        "source": {"url": "https://x", "user": "y"},
-    }
+    other = {"dataset": {"id": "other/bench", "task_id": "t"}, "value": 3, "source": {"url": "https://x"}}
     old = {"dataset": {"id": "me/bench", "task_id": "independent_train"}, "value": -1}
     publish = ("cronos-publish", "results", f"--results={evaluation}", f"--repo_id={policy}")
-    commands.run("python", f"""
-from huggingface_hub import HfApi
-HfApi().upload_file(path_or_fileobj={yaml.safe_dump([old, other]).encode()!r}, repo_id="me/policy",
-    path_in_repo=".eval_results/cronos.yaml")
-""")  # fmt: skip
+    there = File(yaml.safe_dump([old, other]).encode(), is_lfs=False)
+    hub.repositories["models", policy].commit("main", "results", {".eval_results/cronos.yaml": there}, [])
     before, hub.faults.drop_downloads_of = hub.tree("models", policy), "cronos.yaml"
     # It may have results: they are not taken for none.
     assert "lost the connection" in commands.try_(*publish, impatient=True).output
@@ -247,23 +188,23 @@ HfApi().upload_file(path_or_fileobj={yaml.safe_dump([old, other]).encode()!r}, r
     entries = yaml.safe_load(after[".eval_results/cronos.yaml"])
     assert [entry["dataset"]["task_id"] for entry in entries] == ["independent_train", "t", "independent_held_out"]
     assert entries[1] == other
-    written = json.loads((evaluation / "results.json").read_text())
-    assert written["policy"] == policy
-    assert re.fullmatch(r"[0-9a-f]{40}", written["policy_revision"])
-    results = written["independent"]
     for i, split in ((0, "train"), (2, "held_out")):
-        assert entries[i]["value"] == pytest.approx(100 * results[split]["success"])
+        written = json.loads((evaluation / f"independent_{split}/results.json").read_text())
+        assert re.fullmatch(r"[0-9a-f]{40}", written["policy_revision"])
+        assert entries[i]["value"] == pytest.approx(100 * written["success"])
         assert entries[i]["dataset"]["revision"] == hub.repositories["datasets", "me/bench"].branches["main"]
         assert "n=8" in entries[i]["notes"]
 
 
-def test_results_of_a_policy_that_flags_changed_are_refused(policy, commands, tmp_path):
+def test_results_on_the_wrong_benchmark_or_of_a_changed_policy_are_refused(policy, evaluation, commands, tmp_path):
+    publish = ("cronos-publish", "results", f"--repo_id={policy}")
+    other = commands.try_(*publish, f"--results={evaluation}", "--benchmark=me/kitchen@dev")
+    assert (other.code, other.output.startswith("error: ")) == (1, True)
     commands.run("cronos-eval", f"--policy.path={policy}", "--policy.sigma_max=0.3", "--env.benchmark=me/bench",
-                 "--eval.suites=independent", "--eval.splits=train", "--eval.videos=0",
+                 "--eval.suites=[independent]", "--eval.splits=[train]", "--eval.videos=0",
                  f"--output_dir={tmp_path / 'eval'}")  # fmt: skip
-    refused = commands.try_("cronos-publish", "results", f"--results={tmp_path / 'eval'}", f"--repo_id={policy}")
-    assert refused.code == 1
-    assert "independent_train: flags changed the policy: sigma_max 0.3 in place of 0.6;" in refused.output
+    changed = commands.try_(*publish, f"--results={tmp_path / 'eval'}")
+    assert "flags changed the policy: sigma_max 0.3 instead of 0.6;" in changed.output
 
 
 def test_a_training_begins_with_one_commit_of_a_policy(hub, run, commands, tmp_path):
@@ -287,42 +228,10 @@ def test_a_training_begins_with_one_commit_of_a_policy(hub, run, commands, tmp_p
         began_with = json.loads((saved / "train_config.json").read_text())["policy"]
         assert (began_with["pretrained_path"], began_with["pretrained_revision"]) == (policy, revision)
         own = json.loads((saved / "config.json").read_text())
-        assert own["sigma_init"] == sigma
         # It would be looked for where this policy is pushed to.
-        assert own["pretrained_revision"] is None
+        assert (own["sigma_init"], own["pretrained_revision"]) == (sigma, None)
         # A processor is saved under its name.
         assert (saved / "new_policy_preprocessor.json").exists() == (revision != first)
-    two = commands.try_(
-        "cronos-train", f"--policy.path={policy}@{first}", "--policy.pretrained_revision=main", *flags
-    )
-    assert "are two revisions: give one" in two.output
-
-
-def test_results_of_another_benchmark_are_refused(policy, evaluation, commands, tmp_path):
-    commands.run("cronos-publish", *BENCHMARK, "--repo_id=me/other", "--seed=6", "--pictures=false")
-    publish = ("cronos-publish", "results", f"--results={evaluation}", f"--repo_id={policy}")
-    refused = commands.try_(*publish, "--benchmark=me/other")
-    assert refused.code == 1
-    assert re.search(
-        r"results are not of me/other: fingerprint \w+ was evaluated, me/other has \w+", refused.output
-    )
-    refused = commands.try_(*publish, "--benchmark=me/kitchen@dev")
-    assert "is of kitchen_2x2, not of playroom_2x2" in refused.output
-
-
-def test_results_of_a_policy_that_has_changed_since_are_refused(policy, evaluation, commands, hub, tmp_path):
-    publish = ("cronos-publish", "results", f"--results={evaluation}", f"--repo_id={policy}", "--branch=retrained")
-    commands.run("python", f"""
-from huggingface_hub import HfApi
-HfApi().create_branch("{policy}", branch="retrained")
-HfApi().upload_file(path_or_fileobj=b"{{}}", repo_id="{policy}", path_in_repo="policy_preprocessor.json",
-    revision="retrained")
-""")  # fmt: skip
-    refused = commands.try_(*publish)
-    assert refused.code == 1
-    assert re.search(
-        rf"results are of {policy} as it was at [0-9a-f]{{40}}, which has another policy now", refused.output
-    )
 
 
 # Faults --------------------------------------------------------------------------------------------------
@@ -332,33 +241,20 @@ def test_a_refused_token(hub, commands):
     hub.faults.refuse_tokens = True
     refused = commands.try_("cronos-publish", *BENCHMARK, "--pictures=false")
     assert refused.code == 1
-    assert refused.output.startswith(f"error: {hub.url} refused the token, or there is none: set HF_TOKEN to one")
+    assert f"error: {hub.url} refused the token" in refused.output
     hub.faults.refuse_tokens, hub.faults.read_only_tokens = False, True
-    refused = commands.try_("cronos-publish", *BENCHMARK, "--pictures=false", "--repo_id=me/bench")
+    refused = commands.try_("cronos-publish", *BENCHMARK, "--pictures=false")
     assert f"the token may not write to dataset me/bench on {hub.url}" in refused.output
 
 
-def test_a_benchmark_that_cannot_be_loaded(hub, bench, commands):
-    commands.forget()
-    show = ("cronos-eval", "--expert=true", "--env.benchmark=me/bench")
-    hub.faults.drop_downloads_of = ""
-    lost = commands.try_(*show, impatient=True)
-    assert re.search(r"error: .*(lost the connection to|cannot reach) the Hub .*benchmark 'me/bench'", lost.output)
-    hub.faults.drop_downloads_of, hub.faults.refuse_tokens = None, True
-    refused = commands.try_(*show)
-    assert "error: the Hub refused to give out benchmark 'me/bench': Client error '401" in refused.output
-
-
 def test_missing_repositories_and_revisions(hub, bench, evaluation, commands):
-    results = ("cronos-publish", "results", f"--results={evaluation}")
-    output = commands.try_(*results, "--repo_id=me/nobody").output
-    assert "the results are of 'me/policy', not of me/nobody: evaluate with --policy.path=me/nobody" in output
-    output = commands.try_(*results, "--repo_id=me/policy", "--benchmark=me/bench@v9").output
-    assert "benchmark me/bench has no revision 'v9'" in output
-    output = commands.try_("cronos-publish", *BENCHMARK, "--pictures=false", "--branch=x", "--revision=v9").output
-    assert f"dataset me/bench has no revision 'v9' on {hub.url}" in output
-    output = commands.try_("cronos-eval", "--expert=true", "--env.benchmark=me/nobody").output
-    assert "no benchmark 'me/nobody': no such dataset on the Hub" in output
+    results = ("cronos-publish", "results", f"--results={evaluation}", "--repo_id=me/policy")
+    for command, said in (
+        ((*results, "--benchmark=me/bench@v9"), "benchmark me/bench has no revision 'v9'"),
+        (("cronos-publish", *BENCHMARK, "--pictures=false", "--branch=x", "--revision=v9"), "no revision 'v9'"),
+        (("cronos-eval", "--expert=true", "--env.benchmark=me/nobody"), "no benchmark 'me/nobody'"),
+    ):
+        assert said in commands.try_(*command).output
 
 
 def test_a_connection_lost_in_the_middle_of_an_upload(hub, run, commands):
@@ -367,7 +263,6 @@ def test_a_connection_lost_in_the_middle_of_an_upload(hub, run, commands):
     lost = commands.try_(*publish, impatient=True)
     assert lost.code == 1
     assert f"error: lost the connection to {hub.url} (" in lost.output
-    assert "run the same command again, it goes on with what is missing" in lost.output
     assert "Traceback" not in lost.output
     assert hub.tree("datasets", "me/broken") == {}, "there is no half of a dataset"
     uploaded = set(hub.repositories["datasets", "me/broken"].lfs)
@@ -375,9 +270,8 @@ def test_a_connection_lost_in_the_middle_of_an_upload(hub, run, commands):
     hub.faults.drop_uploads_of = None
     hub.requests.clear()
     commands.run(*publish)
-    assert hub.tree("datasets", "me/broken") == hub.tree("datasets", "me/stream") | {
-        "README.md": hub.tree("datasets", "me/broken")["README.md"]
-    }
+    there = hub.tree("datasets", "me/broken")
+    assert there == tree(run / "streams") | {"README.md": there["README.md"]}
     again = {request.rsplit("/", 1)[-1] for request in hub.requests if request.startswith("PUT")}
     assert again, "the videos were missing"
     assert not again & uploaded, "what had arrived was not sent again"
@@ -392,9 +286,6 @@ def test_a_connection_lost_at_the_commit(hub, bench, commands):
     commands.run(*publish)
     # The card names its repository, the rest is the same as elsewhere.
     assert hub.tree("datasets", "me/late").keys() == tree(bench).keys()
-    first = hub.repositories["datasets", "me/late"].branches["main"]
     commands.run(*publish, "--pictures=false")
     names = {name for name in tree(bench) if not name.startswith("pictures/")}
     assert set(hub.tree("datasets", "me/late")) == names, "nothing is left behind of the larger one"
-    commands.run(*publish)
-    assert hub.tree("datasets", "me/late") == hub.tree("datasets", "me/late", first)
