@@ -24,9 +24,9 @@ class FolderLock:
 
     Keep the object: the lock goes with it.
 
-    The operating system's lock is on `.<name>.lock` beside the folder, which itself need not exist yet; on
-    `.lock` in a folder that another disk is mounted on, or whose parent cannot be written to. The file stays
-    behind and means nothing by itself; it says who holds the lock.
+    The operating system's lock is on `.<name>.lock` beside the folder, which itself need not exist yet, or on
+    `.lock` in a folder whose parent cannot be written to. The file stays behind and means nothing by itself; it
+    says who holds the lock.
 
     Args:
         folder: of a run, or the root of a dataset.
@@ -34,7 +34,7 @@ class FolderLock:
 
     def __init__(self, folder: Path | str) -> None:
         self.folder = Path(folder).resolve()
-        self.path = self.folder / INSIDE if _locks_inside(self.folder) else _beside(self.folder)
+        self.path = _lock_file(self.folder)
         self._lock = FileLock(self.path)
 
     def acquire(self) -> Self:
@@ -70,16 +70,8 @@ class FolderLock:
         self.release()
 
 
-def _beside(folder: Path) -> Path:
-    return folder.with_name(f".{folder.name}.lock")
-
-
-def _locks_inside(folder: Path) -> bool:
-    """Whether the place beside a folder is no place for its lock.
-
-    Beside a mounted disk lies what another machine that mounts it does not see.
-    """
-    if not folder.is_dir():
-        return False
-    beside = _beside(folder)
-    return folder.is_mount() or not os.access(beside if beside.exists() else beside.parent, os.W_OK)
+def _lock_file(folder: Path) -> Path:
+    """The place beside a folder, which need not exist; in it if only the folder itself can be written to."""
+    beside = folder.with_name(f".{folder.name}.lock")
+    is_writable = os.access(beside if beside.exists() else beside.parent, os.W_OK)
+    return folder / INSIDE if folder.is_dir() and not is_writable else beside

@@ -49,15 +49,6 @@ def test_a_killed_writer_leaves_no_lock(tmp_path):
         FolderLock(tmp_path / "run").acquire().release()
 
 
-def test_of_a_mounted_disk_the_lock_is_on_it(tmp_path, monkeypatch):
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    monkeypatch.setattr(Path, "is_mount", lambda path: path == folder)
-    with FolderLock(folder), pytest.raises(FolderInUseError):
-        FolderLock(folder).acquire()
-    assert [file.name for file in tmp_path.rglob("*")] == ["disk", ".lock"]
-
-
 def test_where_nothing_can_be_written_beside_a_folder_the_lock_is_in_it(tmp_path, monkeypatch):
     (tmp_path / "mine").mkdir()
     monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)

@@ -20,29 +20,30 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 from lerobot_env_cronos import CronosVectorEnv, Task, get_scene
-from lerobot_env_cronos.config import CronosEnvConfig
+from lerobot_env_cronos.config import CronosEnvConfig, is_of_this_package
 from lerobot_env_cronos.episodic import find_task
-from lerobot_env_cronos.hub_config import is_of_this_package
 from lerobot_env_cronos.simulation.gl import RenderingError
 from tqdm import tqdm
 
+from cronos_lerobot.agents.actor import Actor
+from cronos_lerobot.command_line import parse_command_line
 from cronos_lerobot.data.demo_starts import check_starts
 from cronos_lerobot.data.demos import DemoCollector, DemoConfig, ExpertError, tasks_of
 from cronos_lerobot.data.origin import DEMONSTRATIONS, flags_of, origin_of
 from cronos_lerobot.data.schema import demonstration_features, feature_names
 from cronos_lerobot.data.writer import RecordingError, SegmentWriter
 from cronos_lerobot.dataset_metadata import check_path
-from cronos_lerobot.evaluation.policy_source import files_fingerprint, find_policy
+from cronos_lerobot.evaluation.actors import load_actor
+from cronos_lerobot.evaluation.config import SuitesConfig
+from cronos_lerobot.evaluation.policy_env import check_observations
+from cronos_lerobot.evaluation.policy_source import files_fingerprint, find_policy, load_policy_config
 from cronos_lerobot.locks import FolderLock
-from cronos_lerobot.report.stream_video import PolicySpectator, load_spectator
-from cronos_lerobot.scripts.errors import error_line, parse_command_line, stop
+from cronos_lerobot.scripts.errors import error_line, stop
 
 MAY_DIFFER = (
     "resume", "num_envs", "env.num_threads", "dataset.repo_id", "dataset.num_episodes", "dataset.overwrite",
 )  # fmt: skip
 """Flags that need not be those of the dataset that is resumed."""
-EVALUATION_ONLY = {"suite": "independent", "split": "train", "advance": "window", "end_effector_reset": False}
-"""Flags of the environment that say how to evaluate, with their defaults."""
 
 
 @dataclass
@@ -74,24 +75,13 @@ class RecordDemosConfig(DemoConfig):
     num_envs: int = 32
     """Streams that the expert acts in at once."""
     resume: bool = False
-    """Go on with a dataset that is already there, until it has `dataset.num_episodes`."""
+    """Add to a dataset that is already there, until it has `dataset.num_episodes`."""
 
     def __post_init__(self) -> None:
         """Check what draccus cannot."""
         super().__post_init__()
         if not is_of_this_package(self.env):
             raise ValueError(f"the scripted expert needs --env.type=cronos, got {self.env.type!r}")
-        for name, value in EVALUATION_ONLY.items():
-            if getattr(self.env, name) != value:
-                raise ValueError(
-                    f"--env.{name}={getattr(self.env, name)} is of evaluations; demonstrations begin from training"
-                    " configurations or random layouts, one task each"
-                )
-        if self.env.task is not None and self.reset_tasks:
-            raise ValueError(
-                f"--reset_tasks=true demonstrates other tasks than --env.task={self.env.task}, the only one to"
-                " demonstrate: leave one of them out"
-            )
         for name, value, least in (
             ("dataset.num_episodes", self.dataset.num_episodes, 1),
             ("num_envs", self.num_envs, 1),
@@ -121,30 +111,43 @@ def record_demos(cfg: RecordDemosConfig) -> None:
 
 def _open(
     cfg: RecordDemosConfig,
-) -> tuple[CronosVectorEnv, SegmentWriter, PolicySpectator | None, Sequence[Task]]:
+) -> tuple[CronosVectorEnv, SegmentWriter, Actor | None, Sequence[Task]]:
     """Streams, the dataset, the policy that does the earlier tasks, and the tasks to demonstrate."""
     assert isinstance(cfg.env, CronosEnvConfig)
     scene = get_scene(cfg.env.scene)
     task = find_task(scene.name, cfg.env.task)
     tasks = tasks_of(cfg, scene) if task is None else [task]
     env = CronosVectorEnv(cfg.num_envs, cfg.env.scene, **cfg.env.gym_kwargs)
-    check_starts(cfg.start, scene, tasks, len(env.benchmark.configurations["train"]))
+    check_starts(cfg.start, scene, tasks)
     # Once: the last checkpoint of a run that goes on is soon another one.
     source = None if cfg.start.policy is None else find_policy(cfg.start.policy).folder
-    policy = None if source is None else load_spectator(str(source), cfg.env)
+    policy = None if source is None else _load_policy(source, cfg.env)
     # Before there is a dataset: whether pictures can be drawn here.
     env.observe(np.arange(1))
     writer = open_writer(cfg, env, source)
     if policy is not None:
-        policy.seed(cfg.seed + writer.num_episodes)
+        seed = cfg.seed + writer.num_episodes
+        policy.seed(seed)
+        policy.begin(np.arange(cfg.num_envs), [(seed, i) for i in range(cfg.num_envs)])
     return env, writer, policy, tasks
+
+
+def _load_policy(folder: Path, env: CronosEnvConfig) -> Actor:
+    """The policy of a checkpoint, at its own sampling temperature if it has one.
+
+    Raises:
+        ValueError: the checkpoint is damaged, or the environment does not show it what it takes.
+    """
+    config = load_policy_config(str(folder), ["--device=cpu"])
+    check_observations(config, env)
+    return load_actor(config, env, getattr(config, "temperature", SuitesConfig.temperature))
 
 
 def _collect(
     cfg: RecordDemosConfig,
     env: CronosVectorEnv,
     writer: SegmentWriter,
-    policy: PolicySpectator | None,
+    policy: Actor | None,
     tasks: Sequence[Task],
 ) -> None:
     from lerobot_env_cronos.expert.expert import ScriptedExpert
@@ -153,7 +156,7 @@ def _collect(
     try:
         with writer:
             before = writer.num_episodes
-            expert = ScriptedExpert(env, seed=cfg.seed)
+            expert = ScriptedExpert(env)
             collector = DemoCollector(env, expert, writer, cfg, seed=cfg.seed, tasks=tasks, policy=policy)
             with tqdm(total=cfg.dataset.num_episodes, initial=before, unit="episode") as bar:
                 frames = 0
@@ -181,6 +184,8 @@ def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv, source: Path | Non
     """A new dataset, or the one that is there if `resume` or `overwrite` says what to do with it.
 
     Args:
+        cfg: of the command.
+        env: to record in.
         source: the files of `start.policy`, if there is one.
 
     Raises:
@@ -192,32 +197,31 @@ def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv, source: Path | Non
     """
     root = cfg.dataset.root
     assert root is not None
-    # Before anything is deleted.
+    # Before anything is deleted: what cannot be recorded raises here.
     check_path(root)
-    policy = None if source is None else files_fingerprint(source)
-    origin = origin_of(env, DEMONSTRATIONS, flags_of(cfg), policy)
-    if cfg.resume:
-        writer = SegmentWriter.resume(cfg.dataset.repo_id, root, origin=origin, may_differ=MAY_DIFFER)
-        if writer.num_episodes > cfg.dataset.num_episodes:
-            writer.finalize()
-            raise ValueError(
-                f"{root} has {writer.num_episodes} episodes already, more than"
-                f" --dataset.num_episodes={cfg.dataset.num_episodes}"
-            )
-        return writer
-    # Before anything is deleted: they refuse what cannot be recorded.
     features = demonstration_features(env.single_observation_space, video=cfg.dataset.video, **feature_names(env))
-    if root.exists():
+    if root.exists() and not cfg.resume:
         if not cfg.dataset.overwrite:
-            raise FileExistsError(
-                f"{root} exists: --resume=true goes on with it, --dataset.overwrite=true replaces it"
-            )
+            raise FileExistsError(f"{root} exists: --resume=true adds to it, --dataset.overwrite=true replaces it")
         if any(root.iterdir()) and not (root / INFO_PATH).is_file():
             raise FileExistsError(f"{root} exists and is not a LeRobotDataset: not overwriting it")
         with FolderLock(root):
             shutil.rmtree(root)
-    fps = int(env.metadata["render_fps"])
-    return SegmentWriter(cfg.dataset.repo_id, root, features, fps, robot_type="widowx", origin=origin)
+    writer = SegmentWriter(
+        cfg.dataset.repo_id,
+        root,
+        features,
+        int(env.metadata["render_fps"]),
+        resume=-1 if cfg.resume else None,
+        origin=origin_of(env, DEMONSTRATIONS, flags_of(cfg), files_fingerprint(source) if source else None),
+        may_differ=MAY_DIFFER,
+    )
+    if writer.num_episodes > cfg.dataset.num_episodes:
+        writer.finalize()
+        raise ValueError(
+            f"--dataset.num_episodes={cfg.dataset.num_episodes}, but {root} has {writer.num_episodes} already"
+        )
+    return writer
 
 
 def main() -> None:

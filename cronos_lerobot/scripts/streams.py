@@ -1,7 +1,7 @@
-"""`cronos-streams`: looks into recorded training streams, checks them, and makes training data of them.
+"""`cronos-streams`: look into recorded training streams, check them, and make training data of them.
 
 cronos-streams statistics   successes by segment since the scene reset, task, policy version; what they began after
-cronos-streams check        that nothing is missing, nothing there twice, every annotation where it belongs
+cronos-streams check        that nothing is missing, nothing is there twice, every annotation is right
 cronos-streams filter       some of the segments as an ordinary LeRobotDataset, for lerobot-train
 cronos-streams weights      a weight for every frame, good and bad segments alike, for lerobot-train's RA-BC
 
@@ -10,14 +10,17 @@ examples:
       cronos-streams statistics --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams
   is a recording on the Hub whole? (reads only the numbers)
       cronos-streams check --dataset.repo_id=me/stream
-  what the policy brought about itself, cut 8 frames after the success, as training data
+  what the policy did itself, cut 8 frames after the success, merged with demonstrations as training data
       cronos-streams filter --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams \\
           --filter.success=true --filter.found_complete=false --frames_after_success=8 \\
           --output.repo_id=me/successes --output.root=outputs/successes
-  the failures of a late policy in scenes that nobody had tidied up
+      lerobot-edit-dataset --operation.type merge --operation.repo_ids "['me/demos', 'me/successes']" \\
+          --operation.roots "['outputs/demos', 'outputs/successes']" \\
+          --new_repo_id me/both --new_root outputs/both
+  the failures of a late policy in scenes that nobody had tidied up, with all columns of a stream
       cronos-streams filter --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams \\
-          --filter.success=false --filter.min_policy_version=10 --filter.interventions='[end_effector_reset]' \\
-          --output.repo_id=me/failures --output.root=outputs/failures
+          --filter.success=false --filter.min_policy_version=10 --filter.events='[end_effector_reset]' \\
+          --schema=streams --output.repo_id=me/failures --output.root=outputs/failures
   learn from the whole stream with a stock lerobot-train: a frame counts in full if its action chunk led nearer to
   a grasp or a success, not at all if it undid one, by less than half if it changed nothing
       cronos-streams weights --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams \\
@@ -29,7 +32,7 @@ examples:
       cronos-streams weights --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams \\
           --weight_by=advantage --output=outputs/advantage.parquet
 
-`cronos-streams filter --help` has the flags of a command, docs/streams.md the rest.
+`cronos-streams filter --help` has the flags of a command, docs/streams.md explains them.
 """
 
 import json
@@ -50,6 +53,7 @@ from cronos_lerobot.data.stream_statistics import make_tables, statistics
 from cronos_lerobot.data.stream_weights import Weighting, count_weights, write_progress
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.scripts.subcommands import run_subcommand
+from cronos_lerobot.whole_files import written_whole
 
 
 @dataclass
@@ -61,7 +65,7 @@ class SourceConfig:
     root: Path | None = None
     """Its folder; null looks where LeRobot keeps its datasets, then on the Hub."""
     revision: str | None = None
-    """Branch, tag or commit on the Hub; refused of a dataset that is in a folder."""
+    """Branch, tag or commit on the Hub."""
     discover_packages_path: str | None = None
     """Module to import first, one that registers the scene of the streams."""
 
@@ -74,13 +78,11 @@ class SourceConfig:
             FileNotFoundError: there is no dataset in `root`.
         """
         if self.repo_id is None:
-            raise ValueError(
-                "choose a dataset: --dataset.repo_id=<user/name>, and --dataset.root=<folder> if local"
-            )
+            raise ValueError("--dataset.repo_id=<user/name> is required, and --dataset.root=<folder> if local")
         if self.discover_packages_path is not None:
             import_module(self.discover_packages_path)
         if self.root is not None and not (self.root / "meta/info.json").is_file():
-            raise FileNotFoundError(f"no LeRobotDataset in {self.root}")
+            raise FileNotFoundError(f"no LeRobotDataset in --dataset.root={self.root}")
         return StreamDataset(self.repo_id, self.root, self.revision, streaming=streaming)
 
 
@@ -122,12 +124,15 @@ class FilterConfig:
     """The dataset to write."""
     filter: SegmentFilter = field(default_factory=SegmentFilter)
     """Which segments; everything given must fit."""
+    schema: str = "demonstrations"
+    """Columns to write: `demonstrations`, so that LeRobot can merge the two; `streams` keeps all, as
+    `cronos-streams` needs them."""
     frames_after_success: int | None = None
-    """Cut a segment so many frames after the first in which its task was complete; null keeps it whole."""
+    """Cut a segment this many frames after the first in which its task was complete; null keeps it whole."""
 
     def __post_init__(self) -> None:
         if self.frames_after_success is not None and self.frames_after_success < 0:
-            raise ValueError(f"frames_after_success must be >= 0 or null, got {self.frames_after_success}")
+            raise ValueError(f"--frames_after_success must be at least 0, got {self.frames_after_success}")
 
 
 @dataclass
@@ -139,17 +144,13 @@ class WeightsConfig(Weighting):
     """
 
     dataset: SourceConfig = field(default_factory=SourceConfig)
-    """The streams, as recorded or filtered. Train on the same dataset: frames are known by their index."""
+    """The streams, as recorded or filtered with --schema=streams. Train on the same dataset: frames are known by
+    their index."""
     output: Path | None = None
     """The parquet file, for --sample_weighting.progress_path."""
     chunk_size: int | None = None
-    """Actions in a chunk of the policy that will be trained: says how many frames get which weight. The file is
+    """Actions in a chunk of the policy that will be trained: prints how many frames get which weight. The file is
     the same for every policy."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.chunk_size is not None and self.chunk_size < 1:
-            raise ValueError(f"chunk_size must be >= 1 or null, got {self.chunk_size}")
 
 
 def print_statistics(config: StatisticsConfig) -> None:
@@ -159,10 +160,8 @@ def print_statistics(config: StatisticsConfig) -> None:
     for table in make_tables(result):
         console.print(table)
     if config.output is not None:
-        config.output.parent.mkdir(parents=True, exist_ok=True)
-        partial = config.output.with_name(f".{config.output.name}.partial")
-        partial.write_text(json.dumps(result, indent=2))
-        partial.replace(config.output)
+        with written_whole(config.output) as file:
+            json.dump(result, file, indent=2)
 
 
 def check(config: CheckConfig) -> None:
@@ -171,32 +170,36 @@ def check(config: CheckConfig) -> None:
     if streams.is_local:
         check_dataset(streams.meta.root)
     streams.check()
-    frames = sum(segment.length for segment in streams.segments)
-    print(f"whole: {len(streams.streams)} streams, {len(streams.segments)} segments, {frames} frames")
+    meta = streams.meta
+    print(f"whole: {len(streams.streams)} streams, {meta.total_episodes} segments, {meta.total_frames} frames")
 
 
 def filter_segments(config: FilterConfig) -> None:
     """`cronos-streams filter`."""
     if config.output.repo_id is None:
-        raise ValueError("name the dataset to write: --output.repo_id=<user/name>, and --output.root=<folder>")
+        raise ValueError("--output.repo_id=<user/name> is required, and --output.root=<folder> says where")
     root = config.output.root or HF_LEROBOT_HOME / config.output.repo_id
     # What is on this machine need not be loaded as a whole.
     streams = config.dataset.open(streaming=config.dataset.root is not None)
-    total = len(streams.segments)
     written = filter_streams(
-        streams, config.filter, config.output.repo_id, root, frames_after_success=config.frames_after_success
+        streams,
+        config.filter,
+        config.output.repo_id,
+        root,
+        schema=config.schema,
+        frames_after_success=config.frames_after_success,
     )
-    print(f"{written} of {total} segments in {root}")
+    print(f"{written} of {len(streams.segments)} segments in {root}")
 
 
 def write_weights(config: WeightsConfig) -> None:
     """`cronos-streams weights`."""
-    if config.output is None:
-        raise ValueError("name the file to write: --output=<file>.parquet")
+    if config.output is None or config.output.is_dir():
+        raise ValueError(f"--output=<file>.parquet must name a file, got {config.output}")
     streams = config.dataset.open(streaming=True)
     made_with = write_progress(streams, config.output, config)
     how = ", ".join(f"{name}={value}" for name, value in made_with.items() if name != "dataset")
-    print(f"{config.output}: {streams.meta.total_frames} frames of {len(streams.segments)} segments, {how}")
+    print(f"{config.output}: {streams.meta.total_frames} frames of {streams.meta.total_episodes} segments, {how}")
     if config.chunk_size is not None:
         counts = count_weights(config.output, config.chunk_size)
         text = ", ".join(f"{n} frames {weight}" for weight, n in counts.items())

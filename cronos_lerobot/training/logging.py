@@ -1,12 +1,9 @@
-"""Metrics of a run: one JSON line per update and evaluation, TensorBoard, W&B, a progress bar, a manifest."""
+"""Metrics of a run: one JSON line per update and evaluation, TensorBoard, W&B, a progress bar."""
 
 from __future__ import annotations
 
 import json
-import logging
 import os
-import platform
-import sys
 import time
 from contextlib import suppress
 from copy import copy
@@ -14,18 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from tqdm import tqdm
 
-from cronos_lerobot.evaluation.policy_source import files_fingerprint
 from cronos_lerobot.protocol.loop_state import LoopState
-from cronos_lerobot.provenance import git_commit, package_versions
 from cronos_lerobot.training.config import CronosTrainConfig
-from cronos_lerobot.training.resume import MANIFEST, describe_environment, read_starts
 from cronos_lerobot.training.rollout import Count
-from cronos_lerobot.whole_files import written_whole
-
-METRICS = "metrics.jsonl"
+from cronos_lerobot.training.run_folder import METRICS, TENSORBOARD
 
 
 class MetricsFile:
@@ -44,8 +35,8 @@ class MetricsFile:
         size = path.stat().st_size if path.is_file() else 0
         if size < (offset or 0):
             raise ValueError(
-                f"{path} has {size} bytes, {offset} when the checkpoint was made: it was cut or replaced. Put it "
-                "back, or begin a new run with the checkpoint as --policy.path."
+                f"{path} has {size} bytes, {offset} when the checkpoint was made: put it back, or begin a new run "
+                "with the checkpoint as --policy.path."
             )
         self._file = path.open("ab")
         self._file.truncate(offset or 0)
@@ -153,89 +144,27 @@ class RunLogger:
 
         # Events past the checkpoint that the run resumes from are hidden, those at it are not.
         purge_step = self.loop.n + 1 if self.loop.n else None
-        return SummaryWriter(str(output_dir / "tensorboard"), purge_step=purge_step)
+        return SummaryWriter(str(output_dir / TENSORBOARD), purge_step=purge_step)
 
     def _open_wandb(self) -> Any:
         from lerobot.common.wandb_utils import WandBLogger
 
-        config = self.config
+        config = copy(self.config)
         has_folder = (Path(config.output_dir or "") / "wandb").is_dir()
-        if config.resume and not has_folder and config.wandb.run_id is None:
-            # A run that begins to be logged there has no former one to go on with.
-            config = copy(config)
-            config.resume = False
+        # A run that was not logged there before has nothing to resume there.
+        config.resume = config.checkpoint_path is not None and (has_folder or config.wandb.run_id is not None)
         return WandBLogger(config)  # ty: ignore[invalid-argument-type]
 
 
 class SilentLogger:
-    """Stands in for RunLogger in every process but the first."""
+    """Stands in for RunLogger in every process but the first, and logs nothing."""
 
     def log(self, kind: str, values: dict[str, Any]) -> None:
         """Log nothing."""
 
-    def progress(self, values: dict[str, Any]) -> None:
-        """Show nothing."""
-
-    def log_checkpoint(self, folder: Path) -> None:
-        """Send nothing."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return nothing: a checkpoint has the first process's."""
-        return {}
-
-    def close(self) -> None:
-        """Nothing is open."""
-
-
-def write_manifest(config: CronosTrainConfig, num_processes: int = 1, interaction_steps: int = 0) -> None:
-    """Write what is needed to tell this run from another, once for each start, into manifest.json.
-
-    A resumed run appends to `starts`, so that a change of machine or version in between is on record, and the
-    interaction steps that it goes on from.
-    """
-    assert config.output_dir is not None
-    path = Path(config.output_dir) / MANIFEST
-    path.parent.mkdir(parents=True, exist_ok=True)
-    starts = read_starts(path) if path.exists() else []
-    instructions = torch.backends.cpu.get_cpu_capability()
-    start = {
-        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "interaction_steps": interaction_steps,
-        "seed": config.seed,
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": {"python": platform.python_version()} | package_versions(),
-        "git_commit": git_commit(),
-        "machine": {
-            "platform": platform.platform(),
-            "cpu_count": os.cpu_count(),
-            # What its floating-point sums are made with, and so their last bits.
-            "cpu_capability": instructions,
-        },
-        "num_processes": num_processes,
-        "renderer": os.environ.get("MUJOCO_GL"),
-        "policy_device": config.policy.device if config.policy else None,
-        "policy_fingerprint": _policy_fingerprint(config),
-        "config": config.to_dict(),
-    } | describe_environment(config.env)
-    if starts:
-        _warn_of_other_instructions(starts[-1]["machine"].get("cpu_capability"), instructions)
-    with written_whole(path) as file:
-        file.write(json.dumps({"starts": [*starts, start]}, indent=2))
-
-
-def _warn_of_other_instructions(was: str | None, now: str) -> None:
-    if was and was != now:
-        logging.warning(
-            f"This run computed with {was} and goes on with {now}, which have other last bits: it becomes another "
-            "run than it would have been, as with another seed. docs/experiments.md has the variables that hold a "
-            "command to AVX2, as cronos-reproduce does."
-        )
-
-
-def _policy_fingerprint(config: CronosTrainConfig) -> str | None:
-    """Of the policy in a folder that this start begins with: two machines may have made other clones of it."""
-    path = config.weights_path
-    return files_fingerprint(Path(path)) if path is not None and Path(path).is_dir() else None
+    progress = log_checkpoint = lambda self, _: None
+    close = lambda self: None  # noqa: E731
+    state_dict = lambda self: {}  # noqa: E731
 
 
 def _jsonable(value: Any) -> Any:

@@ -12,10 +12,9 @@ import numpy as np
 from lerobot.envs.utils import parse_camera_names
 from lerobot_env_cronos import CronosEnvConfig
 
-from cronos_lerobot.data.drawing import LateCamera
 from cronos_lerobot.data.origin import flags_of
 from cronos_lerobot.data.recorder import StreamRecorder
-from cronos_lerobot.data.writer import RecordingError
+from cronos_lerobot.data.writer import LateCamera, RecordingError
 from cronos_lerobot.protocol.loop_state import Step
 from cronos_lerobot.training.config import CronosTrainConfig
 
@@ -86,24 +85,30 @@ class StreamObserver:
         env: Any,
         state: dict[str, Any] | None,
         report: Callable[[dict[str, str]], None] | None = None,
+        describes: tuple[str, ...] = (),
     ) -> Self:
-        """Begin the datasets of a run, or continue them from a checkpoint's `state`."""
+        """Begin the datasets of a run, or continue them from a checkpoint's `state`.
+
+        `describes` names what the agent says of its actions, see `LearningAgent`.
+        """
         record, state = config.record, state or {}
         if record.repo_id is None:
             return cls(None)
         assert config.output_dir is not None
         root = record.root_in(Path(config.output_dir))
+        num_recorded = record.count(config.num_envs)
         stopped = state.get("stopped", {})
         recorders = {}
         common: dict[str, Any] = {
             "segment_length": config.protocol.task_switch_interval,
+            "describes": describes,
             "flush_interval_s": record.flush_interval_s,
             "flags": flags_of(config, only=MADE_WITH),
         }
         camera = ""
         if "streams" not in stopped:
             recorders["streams"] = StreamRecorder.open(
-                env, record.repo_id, root, streams=record.num_streams, state=state.get("streams"), **common
+                env, record.repo_id, root, streams=num_recorded, state=state.get("streams"), **common
             )
         if record.filmed_streams and FILM not in stopped:
             assert isinstance(config.env, CronosEnvConfig)

@@ -43,14 +43,13 @@ class RolloutStatistics:
         """Take in a Step or the end of a segment."""
         state = self._state
         if isinstance(event, Step):
-            own = event.reward if event.taken_over is None else event.reward[~event.taken_over]
-            state["reward"] += float(own.sum())
+            state["reward"] += float(event.reward[~event.intervened].sum())
             state["diverged"] += int(event.diverged.sum())
         elif isinstance(event, SegmentEnd):
             for stream, task in enumerate(event.task):
-                if event.taken_over[stream]:
-                    state["takeovers"][0] += int(event.success[stream])
-                    state["takeovers"][1] += 1
+                if event.helped[stream]:
+                    state["helped"][0] += int(event.success[stream])
+                    state["helped"][1] += 1
                     continue
                 self._count(state["by_task"], self.instructions[task], event.success[stream])
                 if task < self.num_tasks:
@@ -64,8 +63,8 @@ class RolloutStatistics:
         `success` is the rate in all `segments`, [k, n] those `found_complete` (successes for which nothing had to
         be done) and `never_grasped` (other successes whose object was never grasped). The three `..._by_segment`
         have one [k, n] for each number of segments since the scene reset, `success_by_task` one for each
-        instruction. Learned reset tasks are in the last one only. `takeovers`, [k, n], is what
-        an expert did, and in none of the others.
+        instruction. Learned reset tasks are in the last one only. Segments with help are counted in `helped`,
+        [k, n], and in none of the others.
         """
         state = self._state
         total = {sort: _total(table.values()) for sort, table in state["by_segment"].items()}
@@ -84,7 +83,7 @@ class RolloutStatistics:
             },
             "reward_per_segment": state["reward"] / all_segments if all_segments else None,
             "diverged": state["diverged"],
-            "takeovers": Count(*state["takeovers"]),
+            "helped": Count(*state["helped"]),
         }
         self._state = self._empty()
         return statistics
@@ -95,13 +94,12 @@ class RolloutStatistics:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from `state_dict`."""
-        # One from before there were takeovers has none.
-        self._state = self._empty() | state
+        self._state = state
 
     @classmethod
     def _empty(cls) -> dict[str, Any]:
         by_segment: dict[str, Any] = {sort: {} for sort in cls.SORTS}
-        return {"reward": 0.0, "diverged": 0, "takeovers": [0, 0], "by_task": {}, "by_segment": by_segment}
+        return {"reward": 0.0, "diverged": 0, "helped": [0, 0], "by_task": {}, "by_segment": by_segment}
 
     @staticmethod
     def _count(table: dict[str, list[int]], key: str, success: bool) -> None:

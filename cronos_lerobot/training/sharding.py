@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from cronos_lerobot.agents.base import ActionSample
 from cronos_lerobot.processes import Processes
 from cronos_lerobot.protocol.loop_state import Step
 from cronos_lerobot.training.recording import FILM
 
-INFO = ("is_success", "is_grasped", "diverged")
+INFO = ("is_success", "is_grasped", "diverged", "intervened")
+OWN = ("action", "log_prob", "value")
+"""Arrays of an ActionSample that have a row for each stream of this process."""
 
 
 class ShardedEnv:
@@ -48,12 +49,14 @@ class ShardedEnv:
         self.single_observation_space = env.single_observation_space
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict]:
-        """Act on the streams of this process; the reward (N,) and the info's arrays (N,) are of all."""
+        """Act on the streams of this process; the reward (N,) and the info's flags (N,) are of all."""
         observation, reward, _, _, info = self._env.step(actions)
-        table = self._concatenate(np.stack([reward, *(info[name] for name in INFO)], axis=1, dtype=np.float32))
+        names = [name for name in INFO if name in info]
+        table = self._concatenate(np.stack([reward, *(info[name] for name in names)], axis=1, dtype=np.float32))
         never = np.zeros(self.num_envs, np.bool_)
-        flags = {name: table[:, i] > 0 for i, name in enumerate(INFO, start=1)}
-        return observation, table[:, 0], never, never.copy(), flags
+        flags = {name: table[:, i] > 0 for i, name in enumerate(names, start=1)}
+        own = {name: info[name] for name in ("executed_action",) if name in info}
+        return observation, table[:, 0], never, never.copy(), flags | own
 
     def observe(self) -> dict[str, Any]:
         """The observation now, of the streams of this process."""
@@ -147,8 +150,8 @@ def whole_step(step: Step, processes: Processes, num_recorded: int) -> Step:
     step has that process's only. Films are always its own.
     """
     own = len(step.action.action)
-    arrays = {name: array for name, array in vars(step.action).items() if array is not None}
-    action = ActionSample(**{name: processes.collect(array) for name, array in arrays.items()})
+    own_arrays = {name: array for name in OWN if (array := getattr(step.action, name)) is not None}
+    action = replace(step.action, **{name: processes.collect(array) for name, array in own_arrays.items()})
     if num_recorded <= own:
         return replace(step, action=action)
     seen = {name: value for name, value in step.observation.items() if name != FILM}

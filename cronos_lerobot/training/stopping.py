@@ -11,13 +11,14 @@ from contextlib import suppress
 from types import FrameType
 from typing import Any, Self
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
+"""Ctrl-C, what a cluster sends at the end of its time, a dropped connection, and a cluster's warnings."""
 SAME_S = 2.0
 """Signals this close to each other [s] are one: a cluster sends it to us, and so does who started us."""
 
 
 class StopRequest:
-    """Notes Ctrl-C or SIGTERM while it is entered; a second one ends the process as if there were no first.
+    """Notes one of SIGNALS while it is entered; a second one ends the process as if there were no first.
 
     Where a signal is ignored it stays ignored, as for what a shell runs in the background.
     """

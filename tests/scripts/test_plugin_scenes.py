@@ -7,7 +7,7 @@ import sys
 import pytest
 from forked_commands import run_forked
 
-from cronos_lerobot.hub.eval_flags import lerobot_eval_flags
+from cronos_lerobot.hub.eval_flags import environment_flags
 from cronos_lerobot.scripts import streams
 
 PLUGIN = """
@@ -75,14 +75,14 @@ def test_the_cards_of_a_scene_of_ones_own_name_its_module(tmp_path):
     ]  # fmt: skip
     run_forked(publish, env=os.environ | {"PYTHONPATH": str(tmp_path)}, check=True)
     card = (tmp_path / "out/README.md").read_text()
-    assert "The scene is none of the package's: it takes the module that registers it." in card
+    assert "import the module that registers it" in card
     commands = [
         line for line in card.replace("`", "\n").splitlines() if re.match(r"(lerobot|cronos)-\w+ -?", line)
     ]
     assert [line.split()[0] for line in commands if "discover_packages_path=<its module>" in line] == [
-        "lerobot-eval", "lerobot-eval", "cronos-eval", "cronos-publish",
+        "cronos-eval", "cronos-publish", "lerobot-eval",
     ]  # fmt: skip
-    assert "import <its module>  # that registers study_1x1\n\nenvs = make_env(" in card
-    flags = lerobot_eval_flags({}, {}, "study_1x1")
+    assert "import <its module>  # registers study_1x1\n\nenvs = make_env(" in card
+    flags = environment_flags({}, {}, "study_1x1")
     assert flags[:2] == ["--env.discover_packages_path=<module of the scene>", "--env.type=cronos"]
-    assert lerobot_eval_flags({}, {}, "kitchen_3x3")[0] == "--env.type=cronos"
+    assert environment_flags({}, {}, "kitchen_3x3")[0] == "--env.type=cronos"

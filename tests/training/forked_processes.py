@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 from dummies import DummyEnv, DummyPolicy
-from test_trainer import KilledError
+from runs import DIVERGES, KilledError
 
 from cronos_lerobot.processes import join_processes
 
@@ -27,9 +27,6 @@ SERVER.set_forkserver_preload(
 )
 
 PATIENCE_S = 120
-
-DIVERGE_AT = {(5, 1), (21, 2)}
-"""Stream 1 is the first process's of two, stream 2 the second's."""
 
 
 def together(function, *args, count=2):
@@ -85,7 +82,7 @@ class WanderingEnv(DummyEnv):
     """Part of a world of streams, in which body "a" is lost beyond 1.4 and put back at a random place."""
 
     def __init__(self, num_envs, first=0, dies_at=None):
-        diverge_at = {(t, i - first) for t, i in DIVERGE_AT if first <= i < first + num_envs}
+        diverge_at = {(t, i - first) for t, i in DIVERGES if first <= i < first + num_envs}
         super().__init__(num_envs, diverge_at=diverge_at)
         self.dies_at = dies_at
 

@@ -13,10 +13,10 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from peft import get_peft_model_state_dict
+from runs import assert_same_run, metrics, weights
 from safetensors.torch import load_file
 from test_cronos_train import OBSERVATIONS, cronos_train
 from test_imitation import ACT
-from test_trainer import assert_same_run, metrics, weights
 from tiny_checkpoints import save_policy
 from tiny_smolvla import pretend_num2words, save_tiny_smolvlm
 
@@ -92,7 +92,7 @@ def test_act_learns_in_chunks_saves_resumes_and_is_a_lerobot_policy(tmp_path, mo
     cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=160")
     assert_same_run(whole, broken)
     assert any(not torch.equal(tensor, before[name]) for name, tensor in weights(whole).items())
-    updates = [line["agent"] for line in metrics(whole) if line["kind"] == "update"]
+    updates = [line["agent"] for line in metrics(whole, "update")]
     assert len(updates) == 2
     assert all(update["policy_grad_norm"] > 0 for update in updates)
 
@@ -116,7 +116,7 @@ def test_diffusion_learns_by_its_chain_saves_resumes_and_is_a_lerobot_policy(tmp
     cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=160")
     assert_same_run(whole, broken)
     assert all(not torch.equal(tensor, before[name]) for name, tensor in weights(whole).items())
-    updates = [line["agent"] for line in metrics(whole) if line["kind"] == "update"]
+    updates = [line["agent"] for line in metrics(whole, "update")]
     assert len(updates) == 2
     assert all(update["policy_grad_norm"] > 0 for update in updates)
 
@@ -126,39 +126,9 @@ def test_diffusion_learns_by_its_chain_saves_resumes_and_is_a_lerobot_policy(tmp
     assert actions_alone(last) == actions_here(DiffusionPolicy.from_pretrained(last))
 
 
-@pytest.mark.parametrize(
-    ("policy", "flag", "message"),
-    [
-        ("act", "noise_steps=1", r"noise_steps=1 is not for --policy\.type=act, which reads noise_std"),
-        ("act", "denoising_discount=0.9", r"discount=0\.9 is between .* which --policy\.type=act has not: give 1"),
-        ("act", "noise_level=0.2", r"noise_level=0\.2 is not for --policy\.type=act, which reads noise_std"),
-        ("diffusion", "noise_steps=1", r"noise_steps=1 is not for .*, which reads noise_level and noise_std"),
-        (
-            "diffusion",
-            "entropy_coef=0.1",
-            r"entropy_coef=0\.1: no entropy .*type=diffusion decides; give 0",
-        ),
-        (
-            "pocketvla",
-            "ratio=factor",
-            r"ratio=factor clips .*type=pocketvla gives a decision one probability",
-        ),
-    ],
-)
-def test_what_a_policy_does_not_follow_is_refused_before_it_begins(policy, flag, message, tmp_path, monkeypatch):
-    flags = {
-        "act": FLAGS,
-        "diffusion": (*DIFFUSION, "--policy.noise_scheduler_type=DDIM"),
-        "pocketvla": ("--policy.type=pocketvla", *(f for f in FLAGS if not f.startswith("--policy."))),
-    }[policy]
-    with pytest.raises(SystemExit, match=message):
-        cronos_train(monkeypatch, *flags, f"--algorithm.{flag}", f"--output_dir={tmp_path / 'run'}")
-    assert not (tmp_path / "run").exists()
-
-
 def test_chunks_that_reach_beyond_a_switch_are_refused(tmp_path, monkeypatch):
     flags = [flag.replace("n_action_steps=5", "n_action_steps=3") for flag in FLAGS]
-    with pytest.raises(SystemExit, match=r"3 actions at once.*Choose --policy\.n_action_steps from \[1, 2, 5\]"):
+    with pytest.raises(SystemExit, match=r"--policy\.n_action_steps"):
         cronos_train(monkeypatch, *flags, "--steps=80", f"--output_dir={tmp_path / 'run'}")
 
 
@@ -205,7 +175,7 @@ def test_smolvla_learns_from_pixels_saves_resumes_and_is_a_lerobot_policy(clone,
     moved = {name for name, tensor in weights(whole).items() if not torch.equal(tensor, before[name])}
     assert [name for name in moved if "lm_expert" in name]
     assert not [name for name in moved if ".vlm." in name]
-    updates = [line["agent"] for line in metrics(whole) if line["kind"] == "update"]
+    updates = [line["agent"] for line in metrics(whole, "update")]
     assert len(updates) == 2
     assert all(update["policy_grad_norm"] > 0 for update in updates)
 
@@ -231,7 +201,7 @@ def test_lora_learns_saves_resumes_and_is_a_lerobot_policy(clone, tmp_path, monk
     cronos_train(monkeypatch, *flags, "--steps=20", f"--output_dir={broken}")
     before = load_file(broken / model / "adapter_model.safetensors")
     resume = ("--resume=true", f"--config_path={broken / model}/train_config.json", "--steps=40")
-    with pytest.raises(SystemExit, match=r"--peft\.r=4, but the run that is resumed has 2"):
+    with pytest.raises(SystemExit, match=r"--peft\.r=4"):
         cronos_train(monkeypatch, *resume, "--peft.r=4")
     cronos_train(monkeypatch, *resume)
     after = [load_file(run / model / "adapter_model.safetensors") for run in (whole, broken)]

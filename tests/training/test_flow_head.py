@@ -8,12 +8,12 @@ import pytest
 import torch
 from forked_commands import run_forked
 from lerobot.policies import make_pre_post_processors
-from lerobot_env_cronos import CronosEnvConfig, SequentialVectorEnv, get_scene
+from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from lerobot_policy_pocketvla import PocketVLAFlowPolicy, PocketVLAPolicy
+from runs import assert_same_run, metrics, weights
 from safetensors.torch import load_file
 from test_adapters import paid_for_moving  # noqa: F401
 from test_cronos_train import OBSERVATIONS, cronos_train
-from test_trainer import assert_same_run, metrics, weights
 from tiny_checkpoints import STATE, save_policy
 
 from cronos_lerobot.agents.processing import make_processors
@@ -56,7 +56,7 @@ def trains_saves_and_resumes(folder, monkeypatch, *flags):
     last = broken / "checkpoints/last/pretrained_model"
     cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=40")
     assert_same_run(whole, broken)
-    updates = [line["agent"] for line in metrics(whole) if line["kind"] == "update"]
+    updates = [line["agent"] for line in metrics(whole, "update")]
     assert len(updates) == 2
     assert all(update["policy_grad_norm"] > 0 and update["value_grad_norm"] > 0 for update in updates)
     return before, weights(whole), whole / "checkpoints/last/pretrained_model"
@@ -95,11 +95,12 @@ def test_cloned_trained_and_evaluated_by_the_commands(tmp_path, monkeypatch):
 
     monkeypatch.setattr(sys, "argv", [
         "cronos-eval", f"--policy.path={checkpoint}", "--policy.device=cpu", "--eval.n_episodes=1",
-        "--eval.splits=train", "--eval.suites=independent", "--eval.videos=0", f"--output_dir={tmp_path / 'eval'}",
+        "--eval.splits=[train]", "--eval.suites=[independent]", "--eval.videos=0",
+        f"--output_dir={tmp_path / 'eval'}",
     ])  # fmt: skip
     cronos_eval.main()
-    results = json.loads((tmp_path / "eval/results.json").read_text())
-    assert results["independent"]["train"]["n"] == 4
+    results = json.loads((tmp_path / "eval/independent_train/results.json").read_text())
+    assert results["n"] == 4
     # Nothing is sampled at a temperature; the noise that a chunk begins with is the policy's own.
     assert results["temperature"] is None
 
@@ -108,7 +109,7 @@ def test_an_evaluation_repeats_with_its_seed(tmp_path):
     checkpoint = save_policy(tmp_path, "pocketvla", STATE, head="flow", hidden_width=16, flow_width=16)
     policy = PocketVLAPolicy.from_pretrained(checkpoint)
     processors = make_processors(policy, *make_pre_post_processors(policy.config, str(checkpoint)))
-    env = SequentialVectorEnv(2, ordering=get_scene("kitchen_2x2").tasks, window=20, **STATE)
+    env = CronosVectorEnv(2, **STATE)
     options = {"n_episodes": 1, "split": "train", "temperature": 0.6, "keeps_states": True}
     paths = []
     for seed in (3, 3, 4):
@@ -117,16 +118,6 @@ def test_an_evaluation_repeats_with_its_seed(tmp_path):
         paths.append(np.stack([result.trajectory.qpos for result in results]))
     assert np.array_equal(paths[0], paths[1])
     assert not np.array_equal(paths[0], paths[2])
-
-
-@pytest.mark.usefixtures("paid_for_moving")
-def test_a_frozen_encoder_is_asked_once_for_an_observation(tmp_path, monkeypatch):
-    flags = ("--policy.type=pocketvla", "--policy.head=flow", "--policy.freeze_encoder=true", *TINY)
-    before, after, _ = trains_saves_and_resumes(tmp_path, monkeypatch, *flags, *OBSERVATIONS["pixels"])
-    moved = {name for name, tensor in after.items() if not torch.equal(tensor, before[name])}
-    assert [name for name in moved if name.startswith("head.")]
-    assert [name for name in moved if name.startswith("actor.trunk.")]
-    assert not [name for name in moved if name.startswith(("actor.encoder.", "actor.text."))]
 
 
 @pytest.mark.usefixtures("paid_for_moving")
@@ -147,7 +138,7 @@ def test_lora_in_every_layer_as_lerobot_train_has_it(tmp_path, monkeypatch):
     )  # fmt: skip
     adapted = tmp_path / "adapted/checkpoints/last/pretrained_model"
     steering = [*(flag for flag in TRAIN if not flag.startswith("--algorithm.")), "--algorithm.type=steering"]
-    with pytest.raises(SystemExit, match=r"--peft\.\* .* --algorithm\.type=steering trains nothing"):
+    with pytest.raises(SystemExit, match="--peft"):
         cronos_train(
             monkeypatch, f"--policy.path={clone}", "--policy.device=cpu", *OBSERVATIONS["state"], *steering, *peft,
             "--steps=40", f"--output_dir={tmp_path / 'none'}",

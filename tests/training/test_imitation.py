@@ -11,18 +11,9 @@ from dummies import DummyEnv, DummyPolicy, DummyPolicyConfig, identity_processor
 from forked_processes import together
 from lerobot.configs import PreTrainedConfig
 from lerobot.optim import AdamWConfig, MultiAdamConfig
-from lerobot.utils.random_utils import set_seed
 from lerobot_env_cronos import CronosEnvConfig
+from runs import STEPS_PER_UPDATE, KilledError, MortalEnv, assert_same_run, config, make_trainer, metrics, weights
 from test_cronos_train import cronos_train
-from test_trainer import (
-    STEPS_PER_UPDATE,
-    KilledError,
-    MortalEnv,
-    assert_same_run,
-    config,
-    metrics,
-    weights,
-)
 
 from cronos_lerobot.agents.imitation.agent import ImitationAgent, copy_trained
 from cronos_lerobot.agents.imitation.config import ImitationConfig
@@ -31,7 +22,6 @@ from cronos_lerobot.evaluation.actors import SelectingPolicy
 from cronos_lerobot.evaluation.independent import evaluate_independent
 from cronos_lerobot.processes import Processes
 from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig, record_demos
-from cronos_lerobot.training.trainer import Trainer
 
 
 @PreTrainedConfig.register_subclass("dummy_cloned")
@@ -66,18 +56,19 @@ class ClonedPolicy(DummyPolicy):
         return self.actor.parameters()
 
 
-def settings(folder, **options):
+def settings(folder, resumes=False, **options):
     algorithm = ImitationConfig(steps_per_update=5, batch_size=8, warmup_segments=3, tail_steps=1)
     defaults = {"policy": ClonedConfig(), "algorithm": algorithm, "steps": 6 * STEPS_PER_UPDATE, "eval_freq": 0}
-    return config(folder, **defaults | options)
+    cfg = config(folder, **defaults | options)
+    cfg.checkpoint_path = (folder / "checkpoints/last").resolve() if resumes else None
+    return cfg
 
 
-def train(cfg, env_class=DummyEnv, processes=None, policy_seed=0):
+def train(cfg, env_class=DummyEnv, processes=None):
     processes = processes or Processes()
     mine = processes.share_of(cfg.num_envs)
-    set_seed(cfg.seed + processes.rank)
     env = env_class(mine.stop - mine.start, diverge_at={(5, 1)})
-    trainer = Trainer(cfg, env, DummyEnv, ClonedPolicy(policy_seed), *identity_processors(), processes)
+    trainer = make_trainer(cfg, env, ClonedPolicy(8 if cfg.checkpoint_path else 0), processes)
     try:
         trainer.train()
     except KilledError:
@@ -88,26 +79,24 @@ def train(cfg, env_class=DummyEnv, processes=None, policy_seed=0):
 def test_a_resumed_run_equals_the_unbroken_one_and_learns(tmp_path):
     unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
     trainer = train(settings(unbroken))
-    updates = [line for line in metrics(unbroken) if line["kind"] == "update"]
+    updates = metrics(unbroken, "update")
     kept = [line["agent"]["segments"] for line in updates]
     assert kept == sorted(kept)
     assert kept[-1] >= 3
     # As many as succeeded without being found complete; an update does not see its own last segments yet.
     rollouts = [line["rollout"] for line in updates]
     won = np.cumsum([r["success"] * r["segments"] - r["found_complete"][0] for r in rollouts])
-    assert len(trainer.agent.memory) == won[-1]
+    assert len(trainer.run.agent.memory) == won[-1]
     assert all(low <= k <= high for low, k, high in zip([0, *won], kept, won, strict=False))
     assert won[1] >= 1  # in the memory of the checkpoint that the killed run goes on from
     # Below three segments there is no step, from there on five for each update.
     steps = [line["agent"]["optimizer_steps"] for line in updates]
     assert steps == [5.0 * (segments >= 3) for segments in kept]
     assert steps[0] == 0
-    assert {len(segment) for segment in trainer.agent.memory.segments} <= {2, 3, 4}
+    assert {len(segment) for segment in trainer.run.agent.memory.segments} <= {2, 3, 4}
     assert train(settings(broken), MortalEnv) is None
-    resumed = settings(broken)
-    resumed.checkpoint_path = (broken / "checkpoints/last").resolve()
     torch.manual_seed(999)
-    train(resumed, policy_seed=8)
+    train(settings(broken, resumes=True))
     assert_same_run(unbroken, broken)
     assert not torch.equal(weights(unbroken)["actor.weight"], ClonedPolicy().actor.weight)
     assert torch.equal(weights(unbroken)["critic.weight"], ClonedPolicy().critic.weight)
@@ -120,9 +109,9 @@ def test_a_weighted_run_keeps_what_failed_and_resumes(tmp_path, weighting):
         steps_per_update=2, batch_size=8, warmup_segments=1, tail_steps=1, weighting=weighting
     )
     trainer = train(settings(unbroken, algorithm=algorithm))
-    updates = [line for line in metrics(unbroken) if line["kind"] == "update"]
+    updates = metrics(unbroken, "update")
     rollouts = [line["rollout"] for line in updates]
-    memory = trainer.agent.memory
+    memory = trainer.run.agent.memory
     won = sum(segment.success for segment in memory.segments)
     assert won == sum(r["success"] * r["segments"] - r["found_complete"][0] for r in rollouts)
     failed = sum(r["segments"] - r["success"] * r["segments"] for r in rollouts)
@@ -132,10 +121,8 @@ def test_a_weighted_run_keeps_what_failed_and_resumes(tmp_path, weighting):
     assert 0 < last["effective_share"] < 1
     assert last["optimizer_steps"] == 2
     assert train(settings(broken, algorithm=algorithm), MortalEnv) is None
-    resumed = settings(broken, algorithm=algorithm)
-    resumed.checkpoint_path = (broken / "checkpoints/last").resolve()
     torch.manual_seed(999)
-    train(resumed, policy_seed=8)
+    train(settings(broken, resumes=True, algorithm=algorithm))
     assert_same_run(unbroken, broken)
 
 
@@ -156,9 +143,8 @@ def test_the_policy_may_be_an_average_of_what_is_trained_and_resumes(tmp_path, m
     assert len(trained) >= 4
     torch.testing.assert_close(weights(unbroken)["actor.weight"], expected)
     assert train(settings(broken, algorithm=algorithm), MortalEnv) is None
-    resumed = settings(broken, algorithm=algorithm)
-    resumed.checkpoint_path = (broken / "checkpoints/last").resolve()
-    train(resumed, policy_seed=8)
+    torch.manual_seed(999)
+    train(settings(broken, resumes=True, algorithm=algorithm))
     assert_same_run(unbroken, broken)
 
 
@@ -170,48 +156,19 @@ def test_an_average_costs_only_what_is_trained(tmp_path):
     assert copied.critic.weight is policy.critic.weight
     assert copied.actor.weight is not policy.actor.weight
     algorithm = ImitationConfig(steps_per_update=2, batch_size=8, warmup_segments=3)
-    trainer = Trainer(
-        settings(tmp_path, algorithm=algorithm), DummyEnv(4), DummyEnv, policy, *identity_processors()
-    )
-    assert set(trainer.agent.state_dict()["learner"]) == {"actor.weight", "actor.bias", "running_mean"}
-
-
-class TiedPolicy(ClonedPolicy):
-    """Has one frozen weight under two names."""
-
-    def __init__(self, seed=0):
-        super().__init__(seed)
-        self.embedding = torch.nn.Linear(2, 2, bias=False).requires_grad_(False)
-        self.head = torch.nn.Linear(2, 2, bias=False)
-        self.head.weight = self.embedding.weight
-
-
-def test_what_is_frozen_under_two_names_is_in_neither_and_the_average_resumes(tmp_path):
-    algorithm = ImitationConfig(steps_per_update=2, batch_size=8, warmup_segments=3, ema_decay=0.75)
-
-    def agent(folder, seed):
-        cfg = settings(tmp_path / folder, algorithm=algorithm)
-        return Trainer(cfg, DummyEnv(4), DummyEnv, TiedPolicy(seed), *identity_processors(), Processes()).agent
-
-    saved = agent("saved", 0)
-    with torch.no_grad():
-        saved._learner.actor.weight += 1
-    state = saved.state_dict()
-    assert not {"embedding.weight", "head.weight"} & set(state["learner"])
-    resumed = agent("resumed", 8)
-    resumed.policy.load_state_dict(saved.policy.state_dict())
-    resumed.load_state_dict(state)
-    assert torch.equal(resumed._learner.actor.weight, saved._learner.actor.weight)
-    assert not torch.equal(resumed._learner.actor.weight, resumed.policy.actor.weight)
-    assert torch.equal(resumed._learner.head.weight, saved.policy.head.weight)
+    trainer = make_trainer(settings(tmp_path, algorithm=algorithm), policy=policy)
+    assert set(trainer.run.agent.state_dict()["learner"]) == {"actor.weight", "actor.bias", "running_mean"}
 
 
 def in_processes(processes, cfg, env_class=DummyEnv):
     trainer = train(cfg, env_class, processes)
     if trainer is None:
         return None
-    weights = [tensor.tolist() for tensor in (trainer.policy.actor.weight, trainer.policy.running_mean)]
-    return weights, len(trainer.agent.memory)
+    weights = [
+        tensor.tolist()
+        for tensor in (trainer.run.agent.policy.actor.weight, trainer.run.agent.policy.running_mean)
+    ]
+    return weights, len(trainer.run.agent.memory)
 
 
 def test_two_processes_learn_together_and_resume(tmp_path):
@@ -219,22 +176,18 @@ def test_two_processes_learn_together_and_resume(tmp_path):
     first, second = together(in_processes, settings(tmp_path / "unbroken"))
     assert first[0] == second[0]
     assert np.any(first[0][1])
-    last = [line for line in metrics(tmp_path / "unbroken") if line["kind"] == "update"][-1]
+    last = metrics(tmp_path / "unbroken", "update")[-1]
     assert last["agent"]["optimizer_steps"] == 5
     assert last["agent"]["segments"] <= first[1] + second[1]
     assert together(in_processes, settings(tmp_path / "broken"), MortalEnv) == [None, None]
-    resumed = settings(tmp_path / "broken")
-    resumed.checkpoint_path = (tmp_path / "broken/checkpoints/last").resolve()
-    assert together(in_processes, resumed) == [first, second]
+    assert together(in_processes, settings(tmp_path / "broken", resumes=True)) == [first, second]
     assert_same_run(tmp_path / "unbroken", tmp_path / "broken")
 
 
 def update_once(processes, cfg, segments, rank=0):
     """An update of which one process has all that is remembered."""
     mine = processes.share_of(cfg.num_envs)
-    set_seed(cfg.seed)
-    env = DummyEnv(mine.stop - mine.start)
-    agent = Trainer(cfg, env, DummyEnv, ClonedPolicy(), *identity_processors(), processes).agent
+    agent = make_trainer(cfg, DummyEnv(mine.stop - mine.start), ClonedPolicy(), processes).run.agent
     if processes.rank == rank:
         agent.memory.load_state_dict(segments)
     torch.manual_seed(0)
@@ -243,7 +196,7 @@ def update_once(processes, cfg, segments, rank=0):
 
 def test_a_process_without_a_success_takes_the_steps_of_the_others(tmp_path):
     cfg = settings(tmp_path / "run")
-    segments = train(cfg).agent.memory.state_dict()
+    segments = train(cfg).run.agent.memory.state_dict()
     cfg.output_dir = tmp_path / "other"
     alone, first = update_once(Processes(), cfg, segments), together(update_once, cfg, segments)
     assert alone[0]["optimizer_steps"] == 5
@@ -261,13 +214,8 @@ def test_a_process_without_a_success_takes_the_steps_of_the_others(tmp_path):
 
 def test_weights_too_coarse_for_its_steps_are_refused(tmp_path):
     policy = ClonedPolicy().bfloat16()
-    with pytest.raises(ValueError, match=r"torch\.bfloat16 cannot hold .* in float32, or train adapters"):
-        Trainer(settings(tmp_path), DummyEnv(4), DummyEnv, policy, *identity_processors(), Processes())
-
-
-def test_a_policy_without_optimizer_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"--policy\.type=dummy_linear has no optimizer preset"):
-        Trainer(settings(tmp_path), DummyEnv(4), DummyEnv, DummyPolicy(), *identity_processors())
+    with pytest.raises(ValueError, match="bfloat16"):
+        make_trainer(settings(tmp_path), policy=policy)
 
 
 OBSERVATIONS = {"obs_type": "environment_state_agent_pos", "task_observation": "one_hot"}
@@ -327,7 +275,7 @@ def test_an_evaluation_keeps_the_environments_apart():
             return batch["observation.state"][:, None, :1].expand(-1, 3, 7)
 
     actor = SelectingPolicy(Planner(), PolicyProcessors(*identity_processors()), (dict, dict))
-    assert actor.is_per_environment
+    assert actor.is_per_stream
     actor.begin(np.array([0, 1]))
     assert ask(actor, [1, 2], [0, 1]) == [1, 2]
     actor.begin(np.array([1]))
@@ -357,7 +305,7 @@ def test_an_evaluation_clears_one_memory_for_all_whenever_a_task_begins():
             return self.remembered
 
     actor = SelectingPolicy(Rememberer(), PolicyProcessors(*identity_processors()), (dict, dict))
-    assert not actor.is_per_environment
+    assert not actor.is_per_stream
     actor.begin(np.array([0, 1]))
     assert ask(actor, [1, 2], [0, 1]) == [1, 2]
     assert ask(actor, [3, 4], [0, 1]) == [1, 2]
@@ -370,8 +318,7 @@ def test_an_evaluation_clears_one_memory_for_all_whenever_a_task_begins():
 def ask(actor, numbers, ids):
     """First numbers of the actions in environments `ids` that show these numbers."""
     state = np.array([[number, 0] for number in numbers], np.float32)
-    answer = actor.act({"agent_pos": state}, ["go"] * len(ids), np.zeros((len(ids), 7)), np.array(ids))
-    return answer[:, 0].tolist()
+    return actor.act({"agent_pos": state}, ["go"] * len(ids), np.array(ids)).action[:, 0].tolist()
 
 
 class TwoOptimizersConfig(ClonedConfig):
@@ -392,6 +339,6 @@ class TwoOptimizersPolicy(ClonedPolicy):
 def test_every_optimizer_of_a_policy_learns_at_its_own_share_of_the_rate(tmp_path):
     policy = TwoOptimizersPolicy()
     policy.config = TwoOptimizersConfig()
-    trainer = Trainer(settings(tmp_path), DummyEnv(4), DummyEnv, policy, *identity_processors())
-    rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in trainer.agent.optimizer.items()}
+    trainer = make_trainer(settings(tmp_path), policy=policy)
+    rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in trainer.run.agent.optimizer.items()}
     assert rates == pytest.approx({"weight": 1e-3, "bias": 1e-4})

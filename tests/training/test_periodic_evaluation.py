@@ -1,5 +1,8 @@
 """The evaluation of `cronos-train` and that of `cronos-eval` are one: the same episodes, motion for motion."""
 
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
 import numpy as np
 import pytest
 import torch
@@ -11,8 +14,8 @@ from tiny_checkpoints import STATE, save_policy
 from cronos_lerobot.agents.processing import make_processors
 from cronos_lerobot.evaluation.config import CronosEvalConfig, SuitesConfig
 from cronos_lerobot.evaluation.independent import run_independent
+from cronos_lerobot.evaluation.results import describe_episodes
 from cronos_lerobot.evaluation.runner import Evaluation
-from cronos_lerobot.evaluation.store import chain_key, chain_records
 from cronos_lerobot.processes import Processes
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.factory import make_eval_env, make_policy_and_processors
@@ -28,19 +31,28 @@ def checkpoint(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def of_cronos_eval(checkpoint, tmp_path_factory):
-    """Records and motions of `cronos-eval`, by episode."""
-    suites = SuitesConfig("independent", "held_out", N_EPISODES, temperature=TEMPERATURE, batch_size=8, videos=8)
-    config = CronosEvalConfig(
-        CronosEnvConfig(**STATE, render_size=(64, 64)), policy(checkpoint), suites, seed=SEED,
-        output_dir=tmp_path_factory.mktemp("evaluation") / "out",
-    )  # fmt: skip
-    evaluation = Evaluation(config)
-    evaluation.run()
-    (part,) = evaluation.parts
-    records = evaluation.store.read(part.name)["chains"]
+def of_cronos_eval(checkpoint):
+    """Episodes and motions of `cronos-eval`."""
+    ended = []
+
+    def keep(folder, results, chains, render, count):
+        ended.extend(chains)
+
+    with TemporaryDirectory() as folder:
+        config = CronosEvalConfig(CronosEnvConfig(**STATE), policy(checkpoint), seed=SEED, output_dir=Path(folder))
+        config.eval = SuitesConfig(
+            ["independent"], ["held_out"], N_EPISODES, temperature=TEMPERATURE, batch_size=8
+        )
+        config.resolve()
+        (results,) = Evaluation(config, draw=keep).run()
+    assert results["episodes"] == describe_episodes(ended, SEED)
+    return by_episode(ended)
+
+
+def by_episode(ended):
     return {
-        key: (r, evaluation.store.read_trajectory(part.name, key).qpos) for r in records for key in [chain_key(r)]
+        (e["number"], e["configuration"]): (e, result.trajectory.qpos)
+        for e, result in zip(describe_episodes(ended, SEED), ended, strict=True)
     }
 
 
@@ -59,7 +71,7 @@ def of_cronos_train(processes, checkpoint, batch_size):
         env, network, make_processors(network, *pipelines), n_episodes=N_EPISODES, split="held_out",
         temperature=TEMPERATURE, seed=SEED, processes=processes, keeps_states=True,
     )  # fmt: skip
-    return {chain_key(r): (r, x.trajectory.qpos) for r, x in zip(chain_records(results), results, strict=True)}
+    return by_episode(results)
 
 
 def check_the_same(found, expected):

@@ -6,12 +6,12 @@ import sys
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
+from runs import assert_same_run, metrics
 from safetensors import safe_open
 from safetensors.torch import load_file
 from test_adapters import DIFFUSION, FLAGS, SMOLVLA, VLA_FLAGS
 from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
-from test_steering_runs import assert_same_run
-from test_trainer import metrics
+from test_steering_runs import assert_same_actor
 from tiny_checkpoints import save_policy
 from tiny_smolvla import pretend_num2words, save_tiny_smolvlm
 
@@ -38,8 +38,9 @@ def test_smolvla_is_steered_saved_resumed_and_evaluated(tmp_path, monkeypatch, c
     last = broken / "checkpoints/last/pretrained_model"
     cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=40")
     assert_same_run(whole, broken)
+    assert_same_actor(whole, broken)
     # Two streams decide twice in an update of ten steps.
-    updates = [line["agent"] for line in metrics(whole) if line["kind"] == "update"]
+    updates = [line["agent"] for line in metrics(whole, "update")]
     assert [(line["decisions"], line["optimizer_steps"]) for line in updates] == [(4, 4), (8, 4)]
     folder = whole / "checkpoints/last/pretrained_model"
     frozen = load_file(clone / "model.safetensors")
@@ -55,12 +56,12 @@ def test_smolvla_is_steered_saved_resumed_and_evaluated(tmp_path, monkeypatch, c
         out = tmp_path / f"steered_{steers}"
         command = [
             "cronos-eval", f"--policy.path={policy}", "--policy.device=cpu", "--eval.n_episodes=1",
-            "--eval.videos=0", "--eval.suites=independent", "--eval.splits=train", f"--output_dir={out}",
+            "--eval.videos=0", "--eval.suites=[independent]", "--eval.splits=[train]", f"--output_dir={out}",
         ]  # fmt: skip
         monkeypatch.setattr(sys, "argv", command)
         asked.clear()
         eval_script.main()
-        assert json.loads((out / "results.json").read_text())["independent"]["train"]["n"] == 4
+        assert json.loads((out / "independent_train/results.json").read_text())["n"] == 4
         # 80 steps, five at a time, for all four tasks at once.
         assert len(asked) == (16 if steers else 0)
 
@@ -93,7 +94,7 @@ def test_pocketvlas_flow_head_is_steered_from_the_state(tmp_path, monkeypatch, c
     others += ["--policy.device=cpu", "--algorithm.type=ppo", "--algorithm.minibatch_size=8", "--steps=16"]
     assert "steers the policy" not in capsys.readouterr().err
     cronos_train(monkeypatch, *others, f"--policy.path={steered}", f"--output_dir={tmp_path / 'on'}")
-    assert "--algorithm.type=ppo begins with the frozen policy, without that actor" in capsys.readouterr().err
+    assert "steers the policy" in capsys.readouterr().err
     learned = tmp_path / "on/checkpoints/last/pretrained_model"
     assert not (learned / STEERING).exists()
     resume = ("--resume=true", f"--config_path={steered}/train_config.json", "--steps=48")
@@ -116,8 +117,9 @@ def test_a_diffusion_that_looks_back_is_steered(tmp_path, monkeypatch):
     last = broken / "checkpoints/last/pretrained_model"
     cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=160")
     assert_same_run(whole, broken)
+    assert_same_actor(whole, broken)
     # Four streams decide every five steps: 16 times in an update.
-    assert [line["agent"]["decisions"] for line in metrics(whole) if line["kind"] == "update"] == [16, 32]
+    assert [line["agent"]["decisions"] for line in metrics(whole, "update")] == [16, 32]
 
 
 def policy_config(folder):

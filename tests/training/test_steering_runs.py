@@ -3,24 +3,31 @@
 import logging
 import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from dummies import DummyEnv, DummyPolicyConfig, identity_processors
+from dummies import DummyEnv, DummyPolicyConfig
 from forked_processes import together
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.random_utils import set_seed
+from runs import (
+    STEPS_PER_UPDATE,
+    KilledError,
+    MortalEnv,
+    assert_same_run,
+    config,
+    make_trainer,
+    metrics,
+    plain,
+    weights,
+)
 from safetensors.torch import load_file
-from test_trainer import STEPS_PER_UPDATE, KilledError, MortalEnv, config, metrics, weights
 
 from cronos_lerobot.agents.steering.config import SteeringConfig
 from cronos_lerobot.agents.steering.steered import STEERING, SteeredPolicy, with_steering
 from cronos_lerobot.processes import Processes
 from cronos_lerobot.scripts import train as train_script
-from cronos_lerobot.training.trainer import Trainer
 
 
 @PreTrainedConfig.register_subclass("dummy_noise")
@@ -63,7 +70,7 @@ class NoisePolicy(PreTrainedPolicy):
     forward = get_optim_params = None
 
 
-def settings(folder, **options):
+def settings(folder, resumes=False, **options):
     own = {
         "hidden_width": 32,
         "batch_size": 32,
@@ -74,15 +81,16 @@ def settings(folder, **options):
     }
     algorithm = SteeringConfig(**own | options.pop("algorithm", {}))
     defaults = {"policy": NoiseConfig(), "algorithm": algorithm, "steps": 6 * STEPS_PER_UPDATE, "eval_freq": 0}
-    return config(folder, **defaults | options)
+    cfg = config(folder, **defaults | options)
+    cfg.checkpoint_path = (folder / "checkpoints/last").resolve() if resumes else None
+    return cfg
 
 
-def train(cfg, env_class=DummyEnv, processes=None, policy_seed=0):
+def train(cfg, env_class=DummyEnv, processes=None):
     processes = processes or Processes()
     mine = processes.share_of(cfg.num_envs)
-    set_seed(cfg.seed + processes.rank)
     env = env_class(mine.stop - mine.start, diverge_at={(5, 1)})
-    trainer = Trainer(cfg, env, DummyEnv, NoisePolicy(seed=policy_seed), *identity_processors(), processes)
+    trainer = make_trainer(cfg, env, NoisePolicy(seed=8 if cfg.checkpoint_path else 0), processes)
     try:
         trainer.train()
     except KilledError:
@@ -90,21 +98,10 @@ def train(cfg, env_class=DummyEnv, processes=None, policy_seed=0):
     return trainer
 
 
-def assert_same_run(a: Path, b: Path):
-    assert metrics(a) == metrics(b)
-    last = "checkpoints/last"
-    for file in ("pretrained_model/model.safetensors", f"pretrained_model/{STEERING}"):
-        tensors = load_file(b / last / file)
-        for name, tensor in load_file(a / last / file).items():
-            assert torch.equal(tensor, tensors[name]), name
-    kept = [torch.load(folder / last / "training_state/agent.pt") for folder in (a, b)]
-    for part in ("sac", "memory"):
-        for name, tensor in kept[0][part].items():
-            assert torch.equal(tensor, kept[1][part][name]), name
-    for name in ("actor", "critics", "alpha"):
-        file = f"{last}/training_state/{name}/optimizer_state.safetensors"
-        for key, tensor in load_file(a / file).items():
-            assert torch.equal(tensor, load_file(b / file)[key]), key
+def assert_same_actor(a, b):
+    """The one that lies beside the policy."""
+    file = f"checkpoints/last/pretrained_model/{STEERING}"
+    assert plain(load_file(a / file)) == plain(load_file(b / file))
 
 
 @pytest.mark.parametrize("memory_size", [1000, 40])
@@ -113,17 +110,16 @@ def test_a_resumed_run_equals_the_unbroken_one(tmp_path, memory_size):
     unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
     options = {"algorithm": {"memory_size": memory_size}}
     trainer = train(settings(unbroken, **options))
-    updates = [line["agent"] for line in metrics(unbroken) if line["kind"] == "update"]
+    updates = [line["agent"] for line in metrics(unbroken, "update")]
     # Four streams decide four times in eight steps; the first 16 decisions are too few to learn from.
     assert [line["decisions"] for line in updates] == [min(memory_size, 16.0 * (i + 1)) for i in range(6)]
     assert [line["optimizer_steps"] for line in updates] == [0.0, *[16.0] * 5]
-    assert trainer.agent.num_steps == 80
+    assert trainer.run.agent.num_steps == 80
     assert train(settings(broken, **options), MortalEnv) is None
-    resumed = settings(broken, **options)
-    resumed.checkpoint_path = (broken / "checkpoints/last").resolve()
     torch.manual_seed(999)
-    train(resumed, policy_seed=8)
+    train(settings(broken, resumes=True, **options))
     assert_same_run(unbroken, broken)
+    assert_same_actor(unbroken, broken)
     # Frozen.
     assert weights(unbroken)["weight"].item() == 1.0
 
@@ -132,19 +128,17 @@ def in_processes(processes, cfg, env_class=DummyEnv):
     trainer = train(cfg, env_class, processes)
     if trainer is None:
         return None
-    return [param.sum().item() for param in trainer.agent.sac.parameters()], len(trainer.agent.memory)
+    return [param.sum().item() for param in trainer.run.agent.sac.parameters()], len(trainer.run.agent.memory)
 
 
 def test_two_processes_learn_together_and_resume(tmp_path):
     first, second = together(in_processes, settings(tmp_path / "unbroken"))
     assert first == second
     assert first[1] == 6 * 16 / 2
-    last = [line["agent"] for line in metrics(tmp_path / "unbroken") if line["kind"] == "update"][-1]
+    last = metrics(tmp_path / "unbroken", "update")[-1]["agent"]
     assert (last["decisions"], last["optimizer_steps"]) == (96.0, 16.0)
     assert together(in_processes, settings(tmp_path / "broken"), MortalEnv) == [None, None]
-    resumed = settings(tmp_path / "broken")
-    resumed.checkpoint_path = (tmp_path / "broken/checkpoints/last").resolve()
-    assert together(in_processes, resumed) == [first, second]
+    assert together(in_processes, settings(tmp_path / "broken", resumes=True)) == [first, second]
     assert_same_run(tmp_path / "unbroken", tmp_path / "broken")
 
 
@@ -155,7 +149,7 @@ def test_what_is_evaluated_and_saved_is_steered_once_it_has_learned(tmp_path, mo
     )
     cfg = settings(tmp_path / "run", steps=3 * STEPS_PER_UPDATE, eval_freq=STEPS_PER_UPDATE, keep_checkpoints=None)
     trainer = train(cfg)
-    evaluations = [line for line in metrics(tmp_path / "run") if line["kind"] == "evaluation"]
+    evaluations = metrics(tmp_path / "run", "evaluation")
     assert len(evaluations) == 4
     # Those at the start and after the first update, which was too early to learn, ask the policy alone: twelve
     # episodes of 80 steps, five at a time. The others ask for two steps at a time.
@@ -166,7 +160,11 @@ def test_what_is_evaluated_and_saved_is_steered_once_it_has_learned(tmp_path, mo
     folders = sorted((tmp_path / "run/checkpoints").glob("0*/pretrained_model"))
     # After the first update there is nothing to steer with.
     assert [folder.name for folder in folders if not (folder / STEERING).is_file()] == ["pretrained_model"]
-    assert with_steering(trainer.policy, None) is with_steering(trainer.policy, folders[0]) is trainer.policy
+    assert (
+        with_steering(trainer.run.agent.policy, None)
+        is with_steering(trainer.run.agent.policy, folders[0])
+        is trainer.run.agent.policy
+    )
     with caplog.at_level(logging.INFO):
         loaded = with_steering(NoisePolicy.from_pretrained(folders[-1]), folders[-1])
     assert "steering.safetensors chooses the policy's noise" in caplog.text
@@ -176,14 +174,14 @@ def test_what_is_evaluated_and_saved_is_steered_once_it_has_learned(tmp_path, mo
     for temperature in (0.0, 0.6):
         samples = [
             policy.sample_actions(batch, temperature=temperature, generator=torch.Generator().manual_seed(1))
-            for policy in (loaded, trainer.agent.acting)
+            for policy in (loaded, trainer.run.agent.acting)
         ]
         assert torch.equal(*(sample["actions"] for sample in samples))
     pushed = []
     monkeypatch.setattr(train_script, "publish_policy", lambda publish: pushed.extend(os.listdir(publish.path)))
     cfg.policy.push_to_hub, cfg.policy.repo_id, cfg.save_checkpoint = True, "me/steered", False
-    train_script.push_to_hub(cfg, trainer.agent, *identity_processors())
+    train_script.push_to_hub(trainer.run)
     assert {"config.json", "model.safetensors", "train_config.json", STEERING} <= set(pushed)
     (folders[-1] / STEERING).write_bytes(b"short")
     with pytest.raises(ValueError, match=r"steering\.safetensors is damaged"):
-        with_steering(trainer.policy, folders[-1])
+        with_steering(trainer.run.agent.policy, folders[-1])

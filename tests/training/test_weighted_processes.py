@@ -24,7 +24,7 @@ def update_own(processes, cfg, memories):
 
 def remembered(folder):
     """Of a run, what succeeded and what failed."""
-    segments = train(weighted(folder, "return", 0.2)).agent.memory.state_dict()
+    segments = train(weighted(folder, "return", 0.2)).run.agent.memory.state_dict()
     parts = [[segment for segment in segments if segment["success"] is one] for one in (True, False)]
     assert min(map(len, parts)) >= 3
     return parts

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from cronos_lerobot.scripts.subcommands import run_subcommand
-from cronos_lerobot.scripts.yaml_text import is_plain
 
 
 @dataclass
@@ -46,8 +45,3 @@ def test_all_else_is_read_as_ever(monkeypatch):
     assert (config.revision, config.count, config.words, config.dataset.root) == (None, 3, ["a", "b"], None)
     with pytest.raises(SystemExit, match=r"^error: "):
         parsed(monkeypatch, "--words=[a")
-
-
-def test_what_is_plain():
-    assert is_plain("outputs/x")
-    assert not any(is_plain(text) for text in ("a #b/x", "a: b", "[x", "1"))

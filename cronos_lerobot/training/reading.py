@@ -1,0 +1,145 @@
+"""The config of a run from flags and files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs import parser
+from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+
+from cronos_lerobot.command_line import parse_command_line
+from cronos_lerobot.evaluation.policy_source import PINNED, follow_last, load_policy_config, pin_policy
+from cronos_lerobot.training.config import AUTO, CronosTrainConfig
+from cronos_lerobot.training.run_folder import last_checkpoint
+
+CHOICES = ("env", "policy", "algorithm")
+"""Fields whose `type` says which config they are."""
+
+
+def load(path: str | Path, flags: Sequence[str] = ()) -> CronosTrainConfig:
+    """Read a saved config: a train_config.json, the folder that it lies in, or a YAML file.
+
+    Args:
+        path: of the file or folder.
+        flags: `--name=value`, which override it.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a flag does not exist.
+    """
+    file = Path(path) / TRAIN_CONFIG_NAME if Path(path).is_dir() else Path(path)
+    return parse_command_line(
+        CronosTrainConfig, [*parser.filter_arg("config_path", flags), f"--config_path={file}"]
+    )
+
+
+def read_config(arguments: Sequence[str]) -> CronosTrainConfig:
+    """Return the config that flags of `cronos-train` describe; of a resumed run its own, which they override.
+
+    Raises:
+        ValueError: a flag does not exist, contradicts another one or the run that is resumed.
+        OSError: a file that they name is not there.
+    """
+    arguments = list(arguments)
+    resume = (parser.parse_arg("resume", arguments) or "").lower()
+    if resume in ("true", AUTO) and (checkpoint := _find_checkpoint(resume, arguments)):
+        return _resumed(checkpoint, arguments, resume)
+    file = parser.parse_arg("config_path", arguments)
+    if file is None:
+        config = parse_command_line(CronosTrainConfig, arguments, {"algorithm": "ppo"})
+    else:
+        config = load(file, arguments)
+        if parser.parse_arg("wandb.run_id", arguments) is None:
+            # The new run is logged as one of its own.
+            config.wandb.run_id = None
+    _load_policy_config(config, arguments)
+    return config
+
+
+def _load_policy_config(config: CronosTrainConfig, arguments: list[str]) -> None:
+    """Read the config of the policy that `--policy.path` names, and say whether the run is pushed."""
+    overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy", arguments) or [])
+    given = {flag.removeprefix("--").split("=")[0] for flag in overrides}
+    if path := parser.get_path_arg("policy", arguments):
+        path, revision = pin_policy(path, parser.parse_arg(PINNED, overrides))
+        config.policy = load_policy_config(path, overrides, revision)
+        if "repo_id" not in given:
+            # That of the policy's own, which is not to be pushed over.
+            config.policy.repo_id = None
+    if config.policy is not None and "repo_id" in given and "push_to_hub" not in given:
+        config.policy.push_to_hub = True
+
+
+def _find_checkpoint(resume: str, arguments: list[str]) -> Path | None:
+    """The checkpoint that `--resume` means; None begins a run.
+
+    Raises:
+        ValueError: the flags do not say where it is, or it is not in the folder of its run.
+    """
+    output_dir, file = (parser.parse_arg(name, arguments) for name in ("output_dir", "config_path"))
+    if resume == "true" and file is not None:
+        folder = Path(file) if Path(file).is_dir() else Path(file).parent
+        found = folder.absolute().parent
+    elif output_dir is None:
+        raise ValueError(f"--resume={resume} needs --output_dir=<run>.")
+    else:
+        found = last_checkpoint(Path(output_dir).absolute())
+        if found is None and resume == "true":
+            raise ValueError(f"--output_dir={output_dir} has no checkpoint to resume from.")
+    if found is not None and found.resolve().parent.parent != found.parent.parent.resolve():
+        raise ValueError(f"{found} leads out of its run's folder: give the real path of the checkpoint.")
+    return found
+
+
+def _resumed(checkpoint: Path, arguments: list[str], resume: str) -> CronosTrainConfig:
+    """The config of a checkpoint's run, with the flags that override it."""
+    run_folder = checkpoint.parent.parent
+    file = checkpoint / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME
+    output_dir = parser.parse_arg("output_dir", arguments)
+    if output_dir is not None and Path(output_dir).resolve() != run_folder.resolve():
+        raise ValueError(
+            f"--output_dir={output_dir}, but the run that is resumed is {run_folder}, and stays there."
+        )
+    saved = _read_saved(file)
+    for name in CHOICES:
+        given, own = parser.get_type_arg(name, arguments), saved[name]["type"]
+        if given not in (None, own):
+            raise ValueError(f"--{name}.type={given}, but the run that is resumed has {own} and keeps it.")
+    config = load(file, _without_policy_path(arguments, saved["policy"].get("pretrained_path"), resume))
+    root, is_given = config.record.root, parser.parse_arg("record.root", arguments) is not None
+    if root is not None and not (is_given or root.resolve().is_relative_to(run_folder.resolve())):
+        raise ValueError(f"The run records to {root}, out of its folder: give --record.root={root} to allow it.")
+    config.output_dir, config.checkpoint_path = run_folder, checkpoint.resolve()
+    return config
+
+
+def _read_saved(file: Path) -> dict[str, Any]:
+    """What a run's train_config.json says."""
+    if not file.is_file():
+        raise FileNotFoundError(f"{file.parents[1]} is no checkpoint of a run: it has no {file.name}.")
+    try:
+        saved = json.loads(file.read_text())
+        if all(saved[name]["type"] for name in CHOICES):
+            return saved
+    except (ValueError, KeyError, TypeError):
+        pass
+    raise ValueError(f"{file} is damaged, or cronos-train did not write it.")
+
+
+def _without_policy_path(arguments: list[str], began_with: str | None, resume: str) -> list[str]:
+    """The flags without that of the policy that the run began with, which `--resume=auto` is given again."""
+    path = parser.parse_arg("policy.path", arguments)
+    if path is None:
+        return arguments
+    name = path if not Path(path).is_dir() else str(follow_last(Path(path)))
+    if resume != AUTO or name.partition("@")[0] != str(began_with):
+        raise ValueError(
+            f"--policy.path={path}, but the run that is resumed began with {began_with} and keeps it."
+        )
+    for flag in ("policy.path", f"policy.{PINNED}"):
+        arguments = parser.filter_arg(flag, arguments)
+    return arguments
