@@ -46,8 +46,8 @@ format: ## Format and fix
 	$(RUN) ruff format .
 	$(RUN) ruff check --fix .
 
-bench: setup ## Steps per second: physics, pixels, training
-	$(RUN) python -m cronos_lerobot.studies.speed
+bench: setup ## Steps per second of physics, pixels and training, as ratios
+	$(RUN) python benchmarks/speed.py
 
 wheels: $(UV) ## Build the wheels into dist/
 	$(UV) build --all-packages --wheel

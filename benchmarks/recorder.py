@@ -1,15 +1,14 @@
-"""What recording costs: our writer beside LeRobot's own on the same frames, and its share of a training run.
+"""What recording costs: our writer beside LeRobot's own on the same frames.
 
-    python -m cronos_lerobot.studies.recorder_speed [--skip train]
+    python benchmarks/recorder.py
 
-Frames/s are of wall time; on a machine with other work frames per CPU second compare better. Bytes are those of
-the whole dataset, with its numbers and statistics.
+Prints frames/s of wall time and per CPU second, bytes a frame, and how many times LeRobot's defaults that is. On a
+machine with other work, compare frames per CPU second. Bytes are those of the whole dataset.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import tempfile
 import time
@@ -23,14 +22,13 @@ import datasets
 import numpy as np
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import DEFAULT_FEATURES
-from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
+from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 
 from cronos_lerobot.agents.base import ActionSample
-from cronos_lerobot.data.drawing import LateCamera
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.video import fast_encoder
+from cronos_lerobot.data.writer import LateCamera
 from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import Step
 
@@ -48,9 +46,13 @@ class Cost:
     cpu_s: float
     num_bytes: int
 
-    def __str__(self) -> str:
-        speed = f"{self.frames / self.wall_s:6.0f} frames/s  {self.frames / self.cpu_s:6.0f} per CPU second"
-        return f"{speed}  {self.num_bytes / self.frames:6.0f} bytes a frame"
+    def text(self, theirs: Cost) -> str:
+        """Speeds and size, beside those of another writer."""
+        per_cpu, their_per_cpu = (cost.frames / cost.cpu_s for cost in (self, theirs))
+        speed = f"{self.frames / self.wall_s:6.0f} frames/s  {per_cpu:6.0f} per CPU second"
+        return (
+            f"{speed}  {self.num_bytes / self.frames:6.0f} bytes a frame  {per_cpu / their_per_cpu:5.1f} x LeRobot"
+        )
 
 
 class Recording:
@@ -81,7 +83,7 @@ class Recording:
             observation = following
 
     def write(self, recorder: StreamRecorder, *, drawn: bool = True) -> None:
-        """Hand all steps to a recorder, as the training loop does; if not `drawn`, states in place of pictures."""
+        """Hand all steps to a recorder, as the training loop does; if not `drawn`, states instead of pictures."""
         n = self.env.num_envs
         zeros, numbers, no = np.zeros(n, np.float32), np.zeros(n, np.int64), np.zeros(n, np.bool_)
         for t, (observation, action, reward, success) in enumerate(self.steps):
@@ -91,7 +93,7 @@ class Recording:
                 Step(
                     t, observation, self.env.instructions, ActionSample(action, zeros, zeros),
                     reward, success, diverged=no, cut=np.full(n, t == len(self.steps) - 1), piece=numbers,
-                    segments_since_reset=numbers, interventions=numbers, policy_version=0,
+                    segments_since_reset=numbers, interventions=numbers, policy_version=0, intervened=no,
                     preceded_by=np.full(n, Intervention.NONE if t else Intervention.INITIAL),
                 )
             )  # fmt: skip
@@ -103,7 +105,6 @@ class Recording:
         columns = dataset.hf_dataset.with_format("numpy")[:]
         names = [key for key in dataset.features if key in columns and key not in DEFAULT_FEATURES]
         dtypes = {name: dataset.features[name]["dtype"] for name in names}
-        assert dataset.meta.episodes is not None
         for stream, episode in enumerate(dataset.meta.episodes):
             frames = []
             for t, row in enumerate(range(episode["dataset_from_index"], episode["dataset_to_index"])):
@@ -123,30 +124,26 @@ def measure(frames: int, root: Path, write: Callable[[], None]) -> Cost:
     return Cost(frames, wall, cpu, num_bytes)
 
 
-def compare_writers(
-    num_streams: int, height: int, width: int, steps: int, folder: Path
-) -> Iterator[tuple[str, Cost]]:
+def compare_writers(num_streams: int, height: int, width: int, steps: int, folder: Path) -> dict[str, Cost]:
     """Write the same frames with the recorder, and with LeRobot's writer as it is and at its fastest."""
     recording = Recording(num_streams, height, width, steps)
-    frames, ours = num_streams * steps, folder / "ours"
+    frames, ours, drawn = num_streams * steps, folder / "ours", folder / "drawn"
     recorder = StreamRecorder.open(recording.env, REPO_ID, ours, segment_length=steps)
     features, fps = recorder.writer.features, int(recording.env.metadata["render_fps"])
-    yield "StreamRecorder", measure(frames, ours, partial(recording.write, recorder))
-    late = StreamRecorder.open(
-        recording.env, REPO_ID, folder / "drawn", segment_length=steps, cameras={"front": recording.camera}
-    )
+    costs = {"StreamRecorder": measure(frames, ours, partial(recording.write, recorder))}
+    cameras = {"front": recording.camera}
+    late = StreamRecorder.open(recording.env, REPO_ID, drawn, segment_length=steps, cameras=cameras)
     write = partial(recording.write, late, drawn=False)
-    yield "StreamRecorder, drawing too", measure(frames, folder / "drawn", write)
+    costs["StreamRecorder, drawing too"] = measure(frames, drawn, write)
     segments = list(recording.segments(ours))
-    names = ("LeRobot, its defaults", "LeRobot, streaming, our codec")
-    for is_fast, name in enumerate(names):
+    # A longer queue: with its own, LeRobot drops frames that the encoder has no time for.
+    fast = {"streaming_encoding": True, "rgb_encoder": fast_encoder(), "encoder_queue_maxsize": steps}
+    for name, options in {"LeRobot, its defaults": {}, "LeRobot, streaming, our codec": fast}.items():
         root = folder / name.replace(" ", "_")
-        fast: dict[str, Any] = {"streaming_encoding": True, "rgb_encoder": fast_encoder()}
-        # Its queue would drop frames that the encoder has no time for.
-        fast |= {"encoder_queue_maxsize": steps}
-        theirs = LeRobotDataset.create(REPO_ID, fps, features, root=root, **(fast if is_fast else {}))
-        yield name, measure(frames, root, partial(_write_with_lerobot, theirs, segments))
+        theirs = LeRobotDataset.create(REPO_ID, fps, features, root=root, **options)
+        costs[name] = measure(frames, root, partial(_write_with_lerobot, theirs, segments))
     recording.env.close()
+    return costs
 
 
 def _write_with_lerobot(dataset: LeRobotDataset, segments: list[tuple[str, list[dict[str, Any]]]]) -> None:
@@ -157,69 +154,18 @@ def _write_with_lerobot(dataset: LeRobotDataset, segments: list[tuple[str, list[
     dataset.finalize()
 
 
-def train(streams: str, filmed: int, steps: int) -> dict[str, float]:
-    """A run of `cronos-train` from pixels with a frozen encoder: steps/s, and steps per CPU second.
-
-    Args:
-        streams: how many of its 64 streams are recorded; "0" for none.
-        filmed: how many of them are filmed at 640 x 480 besides.
-        steps: interaction steps of each stream; those until the first update are not counted.
-    """
-    from lerobot.policies import make_policy_config
-
-    from cronos_lerobot.agents.ppo.config import PPOConfig
-    from cronos_lerobot.scripts.train import train as run
-    from cronos_lerobot.training.config import CronosTrainConfig
-    from cronos_lerobot.training.record_config import RecordConfig
-
-    policy = make_policy_config(
-        "pocketvla", device="cpu", push_to_hub=False, critic_observation="environment_state", freeze_encoder=True
-    )
-    cpu = time.process_time()
-    with tempfile.TemporaryDirectory() as folder:
-        config = CronosTrainConfig(
-            env=CronosEnvConfig(privileged_state=True),
-            policy=policy,
-            output_dir=Path(folder) / "run",
-            steps=64 * steps,
-            algorithm=PPOConfig(value_warmup_updates=0),
-            record=RecordConfig() if streams == "0" else RecordConfig(REPO_ID, None, streams, filmed),
-            eval_freq=0,
-            save_checkpoint=False,
-            tensorboard=False,
-        )
-        run(config)
-        lines = [json.loads(line) for line in (Path(folder) / "run/metrics.jsonl").read_text().splitlines()]
-    cpu = time.process_time() - cpu
-    # The first update pays for what is built lazily.
-    rows = [line for line in lines if line["kind"] == "update"][1:]
-    return {
-        "steps/s": float(np.mean([row["steps_per_s"] for row in rows])),
-        "steps per CPU second": 64 * steps / cpu,
-        "share of the loop": float(np.mean([row["time_share"]["record"] for row in rows])),
-    }
-
-
 def main() -> None:
     """Print one line for each measurement."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=40, help="frames of each stream that the writers write")
-    parser.add_argument("--train_steps", type=int, default=480, help="control steps of each stream in a training")
-    parser.add_argument("--repeats", type=int, default=2, help="trainings of each kind, in turns")
-    parser.add_argument("--skip", nargs="*", default=[], choices=["writers", "train"])
+    parser.add_argument("--steps", type=int, default=40, help="frames of each stream")
     args = parser.parse_args()
-    register_third_party_plugins()
     datasets.disable_progress_bars()
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
-    for size, shape in SIZES.items() if "writers" not in args.skip else ():
+    for size, shape in SIZES.items():
         with tempfile.TemporaryDirectory() as folder:
-            for name, cost in compare_writers(*shape, args.steps, Path(folder)):
-                print(f"{size}  {name:30s} {cost}", flush=True)
-    kinds = {"nothing": ("0", 0), "64 streams": ("all", 0), "64 streams, 4 of them at 640 x 480 too": ("all", 4)}
-    for _ in range(0 if "train" in args.skip else args.repeats):
-        for name, kind in kinds.items():
-            result = train(*kind, args.train_steps)
-            print(f"recorded: {name:40s}", ", ".join(f"{k} {v:.3g}" for k, v in result.items()), flush=True)
+            costs = compare_writers(*shape, args.steps, Path(folder))
+            for name, cost in costs.items():
+                print(f"{size}  {name:30s} {cost.text(costs['LeRobot, its defaults'])}", flush=True)
 
 
 if __name__ == "__main__":

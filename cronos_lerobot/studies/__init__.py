@@ -1,1 +1,0 @@
-"""Longer measurements, each a command."""
