@@ -9,7 +9,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import make_policy_processor_pipelines
-from lerobot_env_cronos import EpisodeGroup, SequentialVectorEnv
+from lerobot_env_cronos import EpisodeGroup
 
 NUM_BINS = 3
 
@@ -54,17 +54,6 @@ class DummyEnv:
         self.benchmark = SimpleNamespace(
             groups=lambda suite, split: EPISODES, source="dummies", fingerprint="0" * 16
         )
-        self.split, self.advance, self.window, self._sends_arm_home = "train", "window", 80, False
-        self._all, self._orderings = np.arange(num_envs), [TASKS[:1]] * num_envs
-        self.done, self._is_complete = np.ones(num_envs, bool), np.zeros(num_envs, bool)
-        self.chain_length, self.position, self._elapsed = (np.zeros(num_envs, int) for _ in range(3))
-
-    # An evaluation's chains, with the bookkeeping of the real environments.
-    start, apply, _begin_next_task = (
-        SequentialVectorEnv.start,
-        SequentialVectorEnv.apply,
-        SequentialVectorEnv._begin_next_task,
-    )
 
     @property
     def instructions(self):

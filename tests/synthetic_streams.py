@@ -46,6 +46,7 @@ def make_step(t, *, actions, log_prob, value, **changes) -> Step:
     rest = {
         "instructions": ["task"] * n, "reward": zeros, "success": no, "diverged": no, "cut": no, "piece": zeros,
         "segments_since_reset": zeros, "preceded_by": zeros, "interventions": zeros, "policy_version": 0,
+        "intervened": no,
     }  # fmt: skip
     return Step(t, action=action, **(rest | changes))
 
