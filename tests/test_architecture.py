@@ -39,7 +39,7 @@ def test_imports_point_one_way(package):
 
 FLOORS = {
     "cronos_lerobot": (
-        "lazy", "stopwatch", "registry", "processes", "provenance", "locks", "whole_files", "ranges",
+        "lazy", "stopwatch", "registry", "ranks", "provenance", "locks", "whole_files", "ranges",
         "command_line", "dataset_metadata", "statistics", "agents", "protocol", "data", "evaluation", "training",
         "film", "report", "experiments", "hub", "scripts", "__init__",
     ),

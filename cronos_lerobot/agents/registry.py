@@ -12,7 +12,7 @@ from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
 from cronos_lerobot.agents.base import LearningAgent
 from cronos_lerobot.agents.processing import PolicyProcessors
-from cronos_lerobot.processes import Processes
+from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.stopwatch import Stopwatch
 
 
@@ -39,7 +39,7 @@ class AgentContext:
     """Returns the torch generator of a name, on the policy's device, in the same way."""
     observation_shapes: dict[str, tuple[int, ...]] = field(default_factory=dict)
     """Of what the environment shows, without the batch, by LeRobot's names; none if they are not known."""
-    processes: Processes = field(default_factory=Processes)
+    ranks: Ranks = field(default_factory=Ranks)
     """Those that train together. Gradients are averaged over them by the agent."""
     stopwatch: Stopwatch = field(default_factory=Stopwatch)
     """To be told the time spent in `act` ("infer") and in `update` ("update")."""
@@ -47,7 +47,7 @@ class AgentContext:
     @property
     def streams(self) -> slice:
         """Of all N streams, those of this process."""
-        return self.processes.share_of(self.num_streams)
+        return self.ranks.share_of(self.num_streams)
 
 
 @dataclass

@@ -18,7 +18,7 @@ from cronos_lerobot.evaluation.actors import make_actor
 from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
 from cronos_lerobot.evaluation.results import Episode, describe_episodes, independent_results
 from cronos_lerobot.evaluation.suites import INDEPENDENT, make_chains, sampling_seed
-from cronos_lerobot.processes import Processes
+from cronos_lerobot.ranks import Ranks
 
 
 def run_independent(
@@ -30,7 +30,7 @@ def run_independent(
     split: str,
     temperature: float,
     seed: int,
-    processes: Processes | None = None,
+    ranks: Ranks | None = None,
     keeps_states: bool = False,
 ) -> tuple[list[ChainResult], bool]:
     """Run every task of the environment's benchmark with a policy, and leave everything else as it was.
@@ -52,15 +52,15 @@ def run_independent(
     Returns:
         The episodes, task by task, and whether any randomness was drawn: otherwise all seeds give the same ones.
     """
-    processes = processes or Processes()
+    ranks = ranks or Ranks()
     chains = make_chains(env.benchmark, INDEPENDENT, split, n_episodes)
     # What acts instead of a policy may have no modes.
     was_training, rng_state = getattr(policy, "training", None), get_rng_state()
     try:
         actor = make_actor(policy, processors, temperature)
-        actor.seed(processes.own_seed(seed))
+        actor.seed(ranks.own_seed(seed))
         seeded = serialize_rng_state()
-        own = chains[processes.rank :: processes.count]
+        own = chains[ranks.rank :: ranks.count]
         runner = ChainRunner(env, actor, keeps_states=keeps_states)
         results = runner.run(own, split, sampling_seed(seed, INDEPENDENT, split)) if own else []
         drawn = serialize_rng_state()
@@ -69,7 +69,7 @@ def run_independent(
         if was_training is not None:
             policy.train(was_training)
         set_rng_state(rng_state)
-    gathered = processes.gather((results, drew))
+    gathered = ranks.gather((results, drew))
     by_chain = {result.chain: result for some, _ in gathered for result in some}
     return [by_chain[chain] for chain in chains], any(has_drawn for _, has_drawn in gathered)
 

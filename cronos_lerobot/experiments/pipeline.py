@@ -84,7 +84,7 @@ class Runner:
     ) -> None:
         self._threads = threads
         self._show, self._log = show, log
-        self._processes: set[subprocess.Popen] = set()
+        self._ranks: set[subprocess.Popen] = set()
         self._stopping = threading.Event()
 
     def run(self, commands: Sequence[Command]) -> None:
@@ -102,10 +102,10 @@ class Runner:
     def stop(self) -> None:
         """Ask running commands to end, and wait until they have saved what they want to keep."""
         self._stopping.set()
-        for process in list(self._processes):
+        for process in list(self._ranks):
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGTERM)
-        for process in list(self._processes):
+        for process in list(self._ranks):
             # Not `process.wait`: the thread that we may have interrupted is in it, with its lock.
             with suppress(ChildProcessError):
                 os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
@@ -143,9 +143,9 @@ class Runner:
                 )
             finally:
                 signal.pthread_sigmask(signal.SIG_UNBLOCK, {WARNING})
-            self._processes.add(process)
+            self._ranks.add(process)
             code = process.wait()
-            self._processes.discard(process)
+            self._ranks.discard(process)
             return code
 
 

@@ -21,7 +21,7 @@ from lerobot.utils.utils import init_logging
 from cronos_lerobot.hub.config import PolicyConfig
 from cronos_lerobot.hub.push import PublishError, Target, explained
 from cronos_lerobot.locks import FolderLock
-from cronos_lerobot.processes import choose_gpu, join_processes
+from cronos_lerobot.ranks import choose_gpu, join_ranks
 from cronos_lerobot.scripts.errors import WORK_ERRORS, error_line, reason, stop
 from cronos_lerobot.scripts.publish import publish_policy
 from cronos_lerobot.training.checkpoint import read_state, save_model
@@ -47,17 +47,17 @@ def train(config: CronosTrainConfig) -> None:
         request = StopRequest()
         with request if config.save_checkpoint else nullcontext(), error_line(only=WORK_ERRORS):
             has_ended = trainer.train(request)
-    processes = trainer.run.processes
+    ranks = trainer.run.ranks
     if not has_ended:
-        processes.leave()
+        ranks.leave()
         # None: another of the processes was told.
         end_by(request.number or signal.SIGTERM)
     try:
-        if processes.is_main:
+        if ranks.is_main:
             with told_how_to_push(config):
                 push_to_hub(trainer.run)
     finally:
-        processes.leave()
+        ranks.leave()
 
 
 def _prepare(config: CronosTrainConfig, stack: ExitStack) -> Trainer | None:
@@ -74,11 +74,11 @@ def _prepare(config: CronosTrainConfig, stack: ExitStack) -> Trainer | None:
     assert config.policy is not None
     assert config.output_dir is not None
     # Nobody gets past this before all have looked at the output folder.
-    processes = join_processes(config.policy.device)
-    if processes.is_main:
+    ranks = join_ranks(config.policy.device)
+    if ranks.is_main:
         stack.enter_context(FolderLock(config.output_dir))
-    config.output_dir = processes.broadcast(config.output_dir)
-    init_logging(console_level="INFO" if processes.is_main else "ERROR")
+    config.output_dir = ranks.broadcast(config.output_dir)
+    init_logging(console_level="INFO" if ranks.is_main else "ERROR")
     if config.resume == AUTO and is_finished(config):
         logging.info(f"The run in {config.output_dir} is done; more --steps resume it.")
         return None
@@ -87,7 +87,7 @@ def _prepare(config: CronosTrainConfig, stack: ExitStack) -> Trainer | None:
         check_links(config.output_dir)
         state = read_state(config.checkpoint_path)
         check_resumed(config, state)
-    elif processes.is_main:
+    elif ranks.is_main:
         _claim(config)
     # Sums depend on it in their last digits: the run's config says it, and a resumed run keeps to it.
     config.torch_threads = config.torch_threads or torch.get_num_threads()
@@ -95,7 +95,7 @@ def _prepare(config: CronosTrainConfig, stack: ExitStack) -> Trainer | None:
     choose_gpu(config.policy.device)
     if config.policy.push_to_hub and config.policy.repo_id:
         logging.info(f"At its end the run is pushed to {config.policy.repo_id}.")
-    parts = make_parts(config, processes)
+    parts = make_parts(config, ranks)
     stack.callback(parts.env.close)
     trainer = Trainer(Run(config, parts), state)
     trainer.open()

@@ -71,7 +71,7 @@ def save_checkpoint(run: Run, observers: dict[str, Any], env_state: dict[str, np
     folder = output_dir / CHECKPOINTS_DIR
     final = folder / get_step_identifier(run.loop.n, run.config.total_steps)
     state = _collect(run, observers, env_state)
-    if not run.processes.is_main:
+    if not run.ranks.is_main:
         return final
     if not (output_dir / MANIFEST).is_file():
         raise FileNotFoundError(f"the run's folder {output_dir} is gone: the run cannot save and has stopped.")
@@ -178,10 +178,10 @@ def _collect(run: Run, observers: dict[str, Any], env_state: dict[str, np.ndarra
         "interaction_steps": run.loop.n,
         "interventions": run.loop.b,
         "config": run.config.to_dict(),
-        "num_processes": run.processes.count,
+        "num_processes": run.ranks.count,
         "loop": run.loop.state_dict(),
-        "generators": _merge(run.processes.gather_to_main(run.generators.state_dict())),
-        "rng": run.processes.gather_to_main(serialize_rng_state()),
+        "generators": _merge(run.ranks.gather_to_main(run.generators.state_dict())),
+        "rng": run.ranks.gather_to_main(serialize_rng_state()),
         "env": env_state,
         "strategies": own_states(run.strategies),
         "optimizer": None if optimizer is None else _states(optimizer),
@@ -216,7 +216,7 @@ def _restore(run: Run, state: dict[str, Any]) -> None:
     run.env.set_state(state["env"])
     run.agent.load_state_dict(state["agent"])
     load_own_states(run.strategies, state["strategies"])
-    rank = run.processes.rank
+    rank = run.ranks.rank
     if rank < len(state["rng"]) and not is_elsewhere:
         deserialize_rng_state(state["rng"][rank])
     else:
@@ -250,16 +250,16 @@ def _changes_device(state: dict[str, Any], run: Run) -> bool:
     """Whether the policy was on another kind of device; says that, and what other processes mean."""
     was, now = state["config"]["policy"].get("device"), getattr(run.config.policy, "device", None)
     is_elsewhere = bool(was and now) and torch.device(was).type != torch.device(now).type
-    if not run.processes.is_main:
+    if not run.ranks.is_main:
         return is_elsewhere
     if is_elsewhere:
         logging.warning(
             f"This run began on {was} and resumes on {now}, with other random numbers and another rounding: it "
             "will not be what it would have been there."
         )
-    if (count := state["num_processes"]) != run.processes.count:
+    if (count := state["num_processes"]) != run.ranks.count:
         logging.warning(
-            f"The checkpoint is of {count} processes, this run has {run.processes.count}: its random numbers are "
+            f"The checkpoint is of {count} processes, this run has {run.ranks.count}: its random numbers are "
             "others, and an optimizer step takes the minibatches of as many processes."
         )
     return is_elsewhere

@@ -32,7 +32,7 @@ from cronos_lerobot.evaluation.policy_env import (
 from cronos_lerobot.evaluation.policy_loading import load_policy
 from cronos_lerobot.evaluation.policy_source import UNDECISIVE, damage_named, load_policy_config
 from cronos_lerobot.evaluation.processor_classes import check_processor_classes
-from cronos_lerobot.processes import Processes
+from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.run import Parts
 
@@ -40,29 +40,29 @@ RENAME_STEP, DEVICE_STEP = "rename_observations_processor", "device_processor"
 """LeRobot's names of steps of a preprocessor."""
 
 
-def make_parts(config: CronosTrainConfig, processes: Processes) -> Parts:
+def make_parts(config: CronosTrainConfig, ranks: Ranks) -> Parts:
     """Return the environments, the policy on its device and its processors.
 
     Raises:
         ValueError: the policy was made for other observations or actions, or its files are damaged; or
             demonstrations are of another scene.
     """
-    share = processes.share_of(config.num_envs)
+    share = ranks.share_of(config.num_envs)
     num_envs = share.stop - share.start
     if config.record.repo_id is not None and config.record.filmed_streams > num_envs:
         raise ValueError(f"--record.filmed_streams must be <= {num_envs}, the streams of the first process.")
     set_seed(config.seed)
     policy, preprocessor, postprocessor = make_policy_and_processors(config)
-    if not processes.is_main:
-        set_seed(processes.own_seed(config.seed))
-    env = make_env(config, num_envs, processes.local_count)
+    if not ranks.is_main:
+        set_seed(ranks.own_seed(config.seed))
+    env = make_env(config, num_envs, ranks.local_count)
     if config.algorithm.type == "imitation" and not samples(policy):
         check_decision(policy, preprocessor, postprocessor, env)
 
     def make_own_eval_env(count: int) -> CronosVectorEnv:
-        return make_eval_env(config, count, processes.local_count)
+        return make_eval_env(config, count, ranks.local_count)
 
-    return Parts(env, make_own_eval_env, policy, preprocessor, postprocessor, processes)
+    return Parts(env, make_own_eval_env, policy, preprocessor, postprocessor, ranks)
 
 
 def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1) -> CronosVectorEnv:

@@ -10,13 +10,13 @@ from cronos_lerobot.agents.base import LearningAgent
 from cronos_lerobot.agents.processing import make_processors
 from cronos_lerobot.agents.registry import AgentContext, make_agent
 from cronos_lerobot.agents.state import agent_state, to_comparable
-from cronos_lerobot.processes import Processes, bit_sum
 from cronos_lerobot.protocol.loop_state import LoopState
 from cronos_lerobot.protocol.own_state import own_states
 from cronos_lerobot.protocol.resets import make_resets
 from cronos_lerobot.protocol.rf_mtrl import rf_mtrl
 from cronos_lerobot.protocol.run_context import RunContext
 from cronos_lerobot.protocol.task_orders import TaskSet, bind_task_order, find_inner, make_task_order
+from cronos_lerobot.ranks import Ranks, bit_sum
 from cronos_lerobot.stopwatch import Stopwatch
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.seeding import NamedGenerators
@@ -37,7 +37,7 @@ class Parts:
     """The policy's LeRobot preprocessor."""
     postprocessor: Any
     """The policy's LeRobot postprocessor."""
-    processes: Processes = field(default_factory=Processes)
+    ranks: Ranks = field(default_factory=Ranks)
     """Those that train together, this one among them; each assembles its own run."""
 
 
@@ -55,7 +55,7 @@ class Run:
 
     def __init__(self, config: CronosTrainConfig, parts: Parts) -> None:
         self.config = config
-        self.processes = parts.processes
+        self.ranks = parts.ranks
         self.make_eval_env = parts.make_eval_env
         self.preprocessor, self.postprocessor = parts.preprocessor, parts.postprocessor
         self.stopwatch = parts.env.timer = Stopwatch()
@@ -63,7 +63,7 @@ class Run:
         policy = parts.policy
         self.generators = NamedGenerators(config.seed, str(next(policy.parameters()).device))
         self.processors = make_processors(policy, parts.preprocessor, parts.postprocessor)
-        self.processes.copy_from_main([*policy.parameters(), *policy.buffers()])
+        self.ranks.copy_from_main([*policy.parameters(), *policy.buffers()])
         self.resets = make_resets(config.protocol, self.generators.for_numpy)
         task_rng = self.generators.for_numpy("task_order")
         self.task_order = make_task_order(config.protocol.task_order, task_rng, self.task_set)
@@ -71,7 +71,7 @@ class Run:
         self._drawn_alike = sorted(self.generators.state_dict()["numpy"])
         # Every named generator exists before a checkpoint is loaded into them.
         self.agent = self._make_agent(policy)
-        self.env = parts.env if self.processes.count == 1 else ShardedEnv(parts.env, self.processes)
+        self.env = parts.env if self.ranks.count == 1 else ShardedEnv(parts.env, self.ranks)
         context = RunContext(self.env, self.agent, self.task_set.tasks, config.protocol, config.total_steps)
         bind_task_order(self.task_order, context)
         self.resets.bind(context)
@@ -104,10 +104,10 @@ class Run:
         Raises:
             RuntimeError: they are not.
         """
-        if self.processes.count == 1:
+        if self.ranks.count == 1:
             return
         states = self.generators.state_dict()["numpy"]
-        self.processes.check_alike(
+        self.ranks.check_alike(
             {
                 "the loop's state": self.loop.state_dict(),
                 "the random numbers": {name: states[name] for name in self._drawn_alike},
@@ -117,7 +117,7 @@ class Run:
         )
 
     def _make_agent(self, policy: Any) -> LearningAgent:
-        own, env = self.processes.own, self.config.env
+        own, env = self.ranks.own, self.config.env
         shown = {} if env is None else {env.features_map[key]: f.shape for key, f in env.features.items()}
         agent = make_agent(
             AgentContext(
@@ -130,7 +130,7 @@ class Run:
                 rng=lambda name: self.generators.for_numpy(own(name)),
                 torch_rng=lambda name: self.generators.for_torch(own(name)),
                 observation_shapes={name: tuple(shape) for name, shape in shown.items()},
-                processes=self.processes,
+                ranks=self.ranks,
                 stopwatch=self.stopwatch,
             )
         )

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from cronos_lerobot.processes import Processes
 from cronos_lerobot.protocol.loop_state import Step
+from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.training.recording import FILM
 
 INFO = ("is_success", "is_grasped", "diverged", "intervened")
@@ -37,12 +37,12 @@ class ShardedEnv:
         timer: that of `env`; it is told the time spent in waiting for the others ("wait").
     """
 
-    def __init__(self, env: Any, processes: Processes) -> None:
+    def __init__(self, env: Any, ranks: Ranks) -> None:
         self._env = env
-        self._processes = processes
+        self._ranks = ranks
         self.timer: Callable[[str], AbstractContextManager] = env.timer
-        self.num_envs = env.num_envs * processes.count
-        self.mine = processes.share_of(self.num_envs)
+        self.num_envs = env.num_envs * ranks.count
+        self.mine = ranks.share_of(self.num_envs)
         self.scene = env.scene
         self.benchmark = env.benchmark
         self.metadata = env.metadata
@@ -103,11 +103,11 @@ class ShardedEnv:
     def put_back(self, stream: int, body: str, rng: np.random.Generator) -> None:
         """Put one body of a stream at a free place; `rng` goes on alike in all processes."""
         owner = stream // self._env.num_envs
-        if owner == self._processes.rank:
+        if owner == self._ranks.rank:
             self._env.put_back(stream - self.mine.start, body, rng)
         with self.timer("wait"):
             # How many numbers it takes to find a free place only the owner knows.
-            rng.bit_generator.state = self._processes.broadcast(rng.bit_generator.state, source=owner)
+            rng.bit_generator.state = self._ranks.broadcast(rng.bit_generator.state, source=owner)
 
     def positions(self, ids: np.ndarray) -> np.ndarray:
         """Generalised positions (k, nq) of the streams `ids`, all of this process.
@@ -140,10 +140,10 @@ class ShardedEnv:
 
     def _concatenate(self, array: np.ndarray) -> np.ndarray:
         with self.timer("wait"):
-            return self._processes.concatenate(array)
+            return self._ranks.concatenate(array)
 
 
-def whole_step(step: Step, processes: Processes, num_recorded: int) -> Step:
+def whole_step(step: Step, ranks: Ranks, num_recorded: int) -> Step:
     """Return `step` with the observations and actions of the recorded streams in the first process.
 
     Those are the first `num_recorded` of all N. If they are the first process's own, no observations are sent: the
@@ -151,11 +151,11 @@ def whole_step(step: Step, processes: Processes, num_recorded: int) -> Step:
     """
     own = len(step.action.action)
     own_arrays = {name: array for name in OWN if (array := getattr(step.action, name)) is not None}
-    action = replace(step.action, **{name: processes.collect(array) for name, array in own_arrays.items()})
+    action = replace(step.action, **{name: ranks.collect(array) for name, array in own_arrays.items()})
     if num_recorded <= own:
         return replace(step, action=action)
     seen = {name: value for name, value in step.observation.items() if name != FILM}
-    observation = step.observation | _map_arrays(seen, processes.collect)
+    observation = step.observation | _map_arrays(seen, ranks.collect)
     return replace(step, observation=observation, action=action)
 
 

@@ -73,7 +73,7 @@ class Trainer:
             OSError: a file cannot be written, or another process has the recording.
         """
         run, states = self.run, self._observers
-        if not run.processes.is_main:
+        if not run.ranks.is_main:
             return
         # First what may be refused: the logger cuts the metrics to where the checkpoint left them.
         self.recorder = StreamObserver.open(
@@ -83,7 +83,7 @@ class Trainer:
         self.logger = RunLogger(self.config, self.loop, states.get("logger", {}).get("offset"))
         if self.config.checkpoint_path is not None:
             point_last_at(self.config.checkpoint_path)
-        note_start(self.config, run.processes.count, self.loop.n)
+        note_start(self.config, run.ranks.count, self.loop.n)
 
     def train(self, stop: StopRequest | None = None) -> bool:
         """Run to the last step or the end of the budget; call `open` before.
@@ -150,7 +150,7 @@ class Trainer:
         The evaluation comes after the checkpoint: a run that resumes from it, with more steps or a larger budget,
         is as one that never ended, and has no evaluation here unless it was due.
         """
-        if self.run.processes.is_main and self.loop.n < self.config.total_steps:
+        if self.run.ranks.is_main and self.loop.n < self.config.total_steps:
             logging.warning(
                 f"The run ends after {self.loop.n:,} of {self.config.total_steps:,} steps: its "
                 f"{self.loop.b:,} interventions reach --protocol.reset_budget={self.config.protocol.reset_budget}."
@@ -162,7 +162,7 @@ class Trainer:
             self.logger.log("end", {})
         if self._evaluations.last < self.loop.n:
             self._evaluate()
-        if self.run.processes.is_main:
+        if self.run.ranks.is_main:
             note_end(self.config)
 
     @property
@@ -171,7 +171,7 @@ class Trainer:
 
     def _is_stopped(self, stop: StopRequest) -> bool:
         """Whether any process was told to stop; all of them then do, but not where the run ends anyway."""
-        asked = self.run.processes.concatenate(np.array([stop.number is not None])).any()
+        asked = self.run.ranks.concatenate(np.array([stop.number is not None])).any()
         return bool(asked) and self.loop.n < self.config.total_steps
 
     def _is_evaluation_due(self) -> bool:
@@ -184,7 +184,7 @@ class Trainer:
 
     def _filmed_env(self) -> Any:
         record = self.config.record
-        films = record.repo_id is not None and record.filmed_streams and self.run.processes.is_main
+        films = record.repo_id is not None and record.filmed_streams and self.run.ranks.is_main
         return FilmedEnv(self.run.env, record.filmed_streams) if films else self.run.env
 
     def _observe(self, event: Event) -> None:
@@ -193,7 +193,7 @@ class Trainer:
             self.run.agent.end_step(event.success)
             with self.run.stopwatch("record"):
                 if self._num_recorded:
-                    self.recorder.on_step(whole_step(event, self.run.processes, self._num_recorded))
+                    self.recorder.on_step(whole_step(event, self.run.ranks, self._num_recorded))
         elif isinstance(event, Update):
             self._update = event.metrics
         elif isinstance(event, SegmentEnd):
@@ -220,7 +220,7 @@ class Trainer:
             return
         options, run = self.config.eval, self.run
         if self._eval_env is None:
-            num_episodes = -(-len(run.task_set.tasks) * options.n_episodes // run.processes.count)
+            num_episodes = -(-len(run.task_set.tasks) * options.n_episodes // run.ranks.count)
             self._eval_env = run.make_eval_env(min(options.batch_size, num_episodes))
         result = evaluate_independent(
             self._eval_env,
@@ -231,7 +231,7 @@ class Trainer:
             split=options.split,
             temperature=options.temperature,
             seed=options.seed,
-            processes=run.processes,
+            ranks=run.ranks,
         )
         self.logger.log("evaluation", result | {"at_interventions": reached})
         run.stopwatch.lap()

@@ -16,7 +16,7 @@ from cronos_lerobot.agents.imitation.weights import (
     discounted_returns,
     effective_share,
 )
-from cronos_lerobot.processes import Processes
+from cronos_lerobot.ranks import Ranks
 
 
 def segment(task, rewards):
@@ -44,7 +44,7 @@ def test_weights_by_hand():
     assert effective_share(np.array([1, 0, 0]), np.array([3, 2, 1])) == pytest.approx(0.5)
 
 
-class BesideOneThatFailed(Processes):
+class BesideOneThatFailed(Ranks):
     """The first of two processes, the second of which has failed at task a once, in four frames."""
 
     count = 2
@@ -68,7 +68,7 @@ def test_processes_weigh_all_that_they_remember():
     advantages = by_advantage(everyone.returns, everyone.instructions, 0.25, 20.0)
     assert advantages == pytest.approx([e ** (2 / 3), e ** (-1 / 3), 1, e ** (-1 / 3)])
     # By itself it is a process like any other, and one with nothing has no weights.
-    assert by_return(Remembered.of(memory, Processes(), 0.5).returns, 0.25) == pytest.approx(own)
+    assert by_return(Remembered.of(memory, Ranks(), 0.5).returns, 0.25) == pytest.approx(own)
     nothing = Remembered.of(SegmentMemory(2**20), BesideOneThatFailed(), 0.5)
     assert [len(part) for part in nothing.split(by_return(nothing.returns, 0.25))] == [0, 1]
     assert nothing.masses(np.ones(1)).tolist() == [0, 4]

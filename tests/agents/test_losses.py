@@ -10,7 +10,7 @@ from cronos_lerobot.agents.ppo.losses import (
     kl_to_base,
     value_error,
 )
-from cronos_lerobot.processes import Processes
+from cronos_lerobot.ranks import Ranks
 
 
 @pytest.mark.parametrize(
@@ -81,4 +81,4 @@ def test_metrics_are_means_by_weight_or_maxima_whatever_they_are_called():
     metrics.add_means({"steps_max": 5.0}, weight=1)
     metrics.add_maxima({"ratio": 2.0})
     metrics.add_maxima({"ratio": 1.0})
-    assert metrics.result(Processes()) == {"steps_max": 2.0, "ratio": 2.0}
+    assert metrics.result(Ranks()) == {"steps_max": 2.0, "ratio": 2.0}

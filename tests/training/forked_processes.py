@@ -17,7 +17,7 @@ import torch
 from dummies import DummyEnv, DummyPolicy
 from runs import DIVERGES, KilledError
 
-from cronos_lerobot.processes import join_processes
+from cronos_lerobot.ranks import join_ranks
 
 SERVER = multiprocessing.get_context("forkserver")
 """Forks a process that has imported LeRobot and done nothing else: no child inherits the threads and locks of the
@@ -69,7 +69,7 @@ def _child(rank, count, port, results, work, stacks):
         faulthandler.dump_traceback_later(PATIENCE_S - 10, file=file)
         try:
             function, args = cloudpickle.loads(work)
-            joined = join_processes("cpu")
+            joined = join_ranks("cpu")
             answer = function(joined, *args), None
             joined.leave()
         except BaseException:

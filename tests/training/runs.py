@@ -48,13 +48,13 @@ def resumed(folder, checkpoint="last", **options):
     return cfg
 
 
-def make_trainer(cfg, env=None, policy=None, processes=None):
+def make_trainer(cfg, env=None, policy=None, ranks=None):
     """A trainer that has opened its files; a policy of another seed must come from the checkpoint."""
     set_seed(cfg.seed)
     policy = policy or DummyPolicy(seed=8 if cfg.checkpoint_path else 0)
     parts = Parts(env or DummyEnv(STREAMS, diverge_at=DIVERGES), DummyEnv, policy, *identity_processors())
-    if processes is not None:
-        parts.processes = processes
+    if ranks is not None:
+        parts.ranks = ranks
     trainer = Trainer(Run(cfg, parts), read_state(cfg.checkpoint_path) if cfg.checkpoint_path else None)
     trainer.open()
     return trainer

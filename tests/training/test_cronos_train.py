@@ -21,7 +21,7 @@ from lerobot_env_cronos import CronosEnvConfig
 from safetensors.torch import load_file
 
 from cronos_lerobot.locks import FolderLock
-from cronos_lerobot.processes import Processes, choose_gpu
+from cronos_lerobot.ranks import Ranks, choose_gpu
 from cronos_lerobot.scripts import train as script
 from cronos_lerobot.training.checkpoint import read_state
 from cronos_lerobot.training.config import CronosTrainConfig
@@ -285,7 +285,7 @@ def test_a_full_disk_is_one_line(tmp_path, monkeypatch):
     assert not list(run.glob("checkpoints/*"))
 
 
-class Alone(Processes):
+class Alone(Ranks):
     """One process that says when it has left."""
 
     left = False
@@ -304,14 +304,14 @@ def pushed(monkeypatch, folder, error, **options):
     policy = DummyPolicyConfig(push_to_hub=True, repo_id="me/rl", private=True)
     config = CronosTrainConfig(CronosEnvConfig(), policy, folder, **options)
     made = SimpleNamespace(save_pretrained=lambda folder: None)
-    run = SimpleNamespace(config=config, agent=made, preprocessor=made, postprocessor=made, processes=Alone())
+    run = SimpleNamespace(config=config, agent=made, preprocessor=made, postprocessor=made, ranks=Alone())
     trainer = SimpleNamespace(run=run, train=lambda stop: True)
     monkeypatch.setattr(script, "_prepare", lambda config, stack: trainer)
     monkeypatch.setattr(script, "publish_policy", publish)
     try:
         script.train(config)
     finally:
-        assert run.processes.left
+        assert run.ranks.left
 
 
 def test_a_run_that_the_hub_refuses_says_what_pushes_it(tmp_path, monkeypatch):

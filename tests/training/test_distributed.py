@@ -21,9 +21,9 @@ from runs import STEPS_PER_UPDATE, STREAMS, KilledError, assert_same_run, config
 from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
 
 from cronos_lerobot.agents.ppo.config import PPOConfig
-from cronos_lerobot.processes import Processes
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.task_orders import TASK_ORDERS
+from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.stopwatch import Stopwatch
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.factory import make_env
@@ -32,13 +32,13 @@ from cronos_lerobot.training.sharding import ShardedEnv
 from cronos_lerobot.training.stopping import StopRequest
 
 
-def train(processes, cfg, policy_class=ScriptedPolicy, dies_at=None):
+def train(ranks, cfg, policy_class=ScriptedPolicy, dies_at=None):
     """Train in this process; returns what all processes should agree on, or None if it died."""
-    mine = processes.share_of(cfg.num_envs)
+    mine = ranks.share_of(cfg.num_envs)
     env = WanderingEnv(mine.stop - mine.start, mine.start, dies_at)
     # The processes begin with the weights of the first one.
-    policy = policy_class(seed=processes.rank)
-    trainer = make_trainer(cfg, env, policy, processes)
+    policy = policy_class(seed=ranks.rank)
+    trainer = make_trainer(cfg, env, policy, ranks)
     try:
         trainer.train()
     except KilledError:
@@ -72,7 +72,7 @@ def columns(folder):
 def test_two_processes_are_one_run(tmp_path, algorithm):
     """Counters, draws, logs, recordings, evaluations and, but for rounding, the policy."""
     options = {"record": RecordConfig(repo_id="me/stream", streams="all"), "algorithm": algorithm}
-    loop, policy = train(Processes(), settings(tmp_path / "one", 32, **options))
+    loop, policy = train(Ranks(), settings(tmp_path / "one", 32, **options))
     answers = together(train, settings(tmp_path / "two", 16, **options))
     assert answers[0] == answers[1]
     assert answers[0][0] == loop
@@ -103,25 +103,25 @@ def test_resumed_run_of_two_processes_equals_the_unbroken_one(tmp_path):
 def test_a_run_of_two_processes_goes_on_in_one(tmp_path, caplog):
     together(train, settings(tmp_path / "run", 16, steps=2 * STEPS_PER_UPDATE))
     resumed = settings(tmp_path / "run", 32, resume=(tmp_path / "run/checkpoints/last").resolve())
-    loop, policy = train(Processes(), resumed)
+    loop, policy = train(Ranks(), resumed)
     assert "of 2 processes, this run has 1" in caplog.text
-    expected, weights = train(Processes(), settings(tmp_path / "one", 32))
+    expected, weights = train(Ranks(), settings(tmp_path / "one", 32))
     assert loop == expected
     assert policy == pytest.approx(weights, rel=1e-3, abs=1e-5)
 
 
-def first_draws(processes, cfg):
+def first_draws(ranks, cfg):
     """What Python's, NumPy's and PyTorch's own generators give after the run's checkpoint was loaded."""
-    mine = processes.share_of(cfg.num_envs)
-    make_trainer(cfg, WanderingEnv(mine.stop - mine.start, mine.start), ScriptedPolicy(), processes)
+    mine = ranks.share_of(cfg.num_envs)
+    make_trainer(cfg, WanderingEnv(mine.stop - mine.start, mine.start), ScriptedPolicy(), ranks)
     return random.random(), float(np.random.random()), float(torch.rand(1))
 
 
 def test_a_process_that_joins_a_resumed_run_has_random_numbers_of_its_own(tmp_path):
     """The same ones each time; the first process goes on with the run's."""
-    train(Processes(), settings(tmp_path / "run", 32, steps=2 * STEPS_PER_UPDATE))
+    train(Ranks(), settings(tmp_path / "run", 32, steps=2 * STEPS_PER_UPDATE))
     resumed = settings(tmp_path / "run", 16, resume=(tmp_path / "run/checkpoints/last").resolve())
-    alone = first_draws(Processes(), resumed)
+    alone = first_draws(Ranks(), resumed)
     first, second = together(first_draws, resumed)
     assert first == alone
     assert all(one != other for one, other in zip(first, second, strict=True))
@@ -139,11 +139,11 @@ class SignallingEnv(WanderingEnv):
         return super().step(actions)
 
 
-def stopped(processes, cfg):
+def stopped(ranks, cfg):
     """Train until it ends; whether that is the run's end, the signal of this process, and the steps done."""
-    mine = processes.share_of(cfg.num_envs)
-    env = (SignallingEnv if processes.rank == 1 else WanderingEnv)(mine.stop - mine.start, mine.start)
-    trainer = make_trainer(cfg, env, ScriptedPolicy(), processes)
+    mine = ranks.share_of(cfg.num_envs)
+    env = (SignallingEnv if ranks.rank == 1 else WanderingEnv)(mine.stop - mine.start, mine.start)
+    trainer = make_trainer(cfg, env, ScriptedPolicy(), ranks)
     with StopRequest() as stop:
         return trainer.train(stop), stop.number, trainer.loop.n
 
@@ -156,9 +156,9 @@ def test_one_process_that_is_told_to_stop_stops_both(tmp_path):
 
 
 def test_every_process_draws_its_own_actions(tmp_path):
-    def first_actions(processes, cfg):
-        mine = processes.share_of(cfg.num_envs)
-        run = make_trainer(cfg, DummyEnv(mine.stop - mine.start), DummyPolicy(), processes).run
+    def first_actions(ranks, cfg):
+        mine = ranks.share_of(cfg.num_envs)
+        run = make_trainer(cfg, DummyEnv(mine.stop - mine.start), DummyPolicy(), ranks).run
         tau = [TASKS[0].instruction] * cfg.num_envs
         return run.agent.act(run.env.observe(), tau).action.tolist()
 
@@ -170,9 +170,9 @@ def test_every_process_draws_its_own_actions(tmp_path):
 def test_mean_of_gradients_by_hand():
     """In buckets of two numbers; the last parameter is used by the second process only, the one before by none."""
 
-    @patch("cronos_lerobot.processes.BUCKET_BYTES", 8)
-    def average(processes):
-        rank = processes.rank
+    @patch("cronos_lerobot.ranks.BUCKET_BYTES", 8)
+    def average(ranks):
+        rank = ranks.rank
         parameters = [torch.zeros(2), torch.zeros(1), torch.zeros(3).bfloat16(), torch.zeros(1), torch.zeros(1)]
         grads = [
             torch.tensor([1.0, 2.0]) + rank, torch.full((1,), 4.0 * rank), torch.full((3,), 1.0 - rank).bfloat16(),
@@ -180,17 +180,17 @@ def test_mean_of_gradients_by_hand():
         ]  # fmt: skip
         for parameter, grad in zip(parameters, grads, strict=True):
             parameter.grad = grad
-        processes.average_gradients(parameters)
+        ranks.average_gradients(parameters)
         return [None if p.grad is None else p.grad.tolist() for p in parameters]
 
     assert together(average) == [[[1.5, 2.5], [2.0], [0.5, 0.5, 0.5], None, [3.0]]] * 2
 
 
 def test_processes_that_drift_apart_are_stopped():
-    def drift(processes):
-        processes.check_alike({"the policy": 1, "the loop's state": {"t": 8}})
+    def drift(ranks):
+        ranks.check_alike({"the policy": 1, "the loop's state": {"t": 8}})
         try:
-            processes.check_alike({"the policy": processes.rank, "the loop's state": {"t": 8}})
+            ranks.check_alike({"the policy": ranks.rank, "the loop's state": {"t": 8}})
         except RuntimeError as error:
             return str(error)
 
@@ -207,21 +207,21 @@ def test_a_task_order_that_decides_by_itself_is_stopped(tmp_path, monkeypatch):
             return self.rng.integers(loop.num_tasks, size=loop.num_streams)
 
     @patch.dict("cronos_lerobot.protocol.task_orders.TASK_ORDERS", alone=Alone)
-    def train_alone(processes, cfg):
+    def train_alone(ranks, cfg):
         with pytest.raises(RuntimeError, match="the loop's state"):
-            train(processes, cfg)
+            train(ranks, cfg)
 
     monkeypatch.setitem(TASK_ORDERS, "alone", Alone)
     together(train_alone, settings(tmp_path / "run", 16, task_order="alone"))
 
 
 def test_a_process_films_its_own_streams():
-    def film(processes):
+    def film(ranks):
         env = DummyEnv(2)
         env.timer = Stopwatch()
         env.positions = lambda ids: [f"local {i}" for i in ids]
-        sharded = ShardedEnv(env, processes)
-        own = sharded.positions(np.arange(2) + 2 * processes.rank)
+        sharded = ShardedEnv(env, ranks)
+        own = sharded.positions(np.arange(2) + 2 * ranks.rank)
         with pytest.raises(ValueError, match=r"\[1, 2\]"):
             sharded.positions(np.array([1, 2]))
         return own
@@ -238,24 +238,24 @@ def test_help_is_known_in_all_processes_and_actions_where_they_were_executed():
                 "intervened": np.array([False, self.x[0] > 1]),
             }
 
-    def step(processes):
+    def step(ranks):
         env = Helped(2)
         env.timer = Stopwatch()
-        env.x[:] = 2 * processes.rank
-        *_, info = ShardedEnv(env, processes).step(np.full((2, 7), processes.rank, np.float32))
+        env.x[:] = 2 * ranks.rank
+        *_, info = ShardedEnv(env, ranks).step(np.full((2, 7), ranks.rank, np.float32))
         return info["intervened"].tolist(), info["executed_action"][:, 0].tolist()
 
     assert together(step) == [([False, False, False, True], [n, n]) for n in (1, 2)]
 
 
 def test_exchange_keeps_types_and_order():
-    def exchange(processes):
-        mine = np.arange(4).reshape(2, 2) + 10 * processes.rank
+    def exchange(ranks):
+        mine = np.arange(4).reshape(2, 2) + 10 * ranks.rank
         return (
-            processes.concatenate(mine).tolist(),
-            processes.concatenate(mine > 10, axis=1).tolist(),
-            processes.broadcast({"rank": processes.rank}, source=1),
-            processes.collect(mine).tolist(),
+            ranks.concatenate(mine).tolist(),
+            ranks.concatenate(mine > 10, axis=1).tolist(),
+            ranks.broadcast({"rank": ranks.rank}, source=1),
+            ranks.collect(mine).tolist(),
         )
 
     rows, flags = [[0, 1], [2, 3], [10, 11], [12, 13]], [[False, False, False, True], [False, False, True, True]]
@@ -264,10 +264,10 @@ def test_exchange_keeps_types_and_order():
 
 
 def test_streams_that_cannot_be_shared_out_are_refused():
-    processes = Processes()
-    processes.count = 3
+    ranks = Ranks()
+    ranks.count = 3
     with pytest.raises(ValueError, match="num_envs"):
-        processes.share_of(64)
+        ranks.share_of(64)
 
 
 @pytest.mark.parametrize(("num_threads", "local_processes", "expected"), [(0, 3, 2), (0, 12, 1), (4, 3, 4)])

@@ -18,7 +18,7 @@ from tiny_checkpoints import STATE, record_one, save_policy, write_train_config
 from cronos_lerobot.agents.imitation.config import DemosConfig, ImitationConfig
 from cronos_lerobot.evaluation.policy_env import check_observations
 from cronos_lerobot.evaluation.processor_classes import check_processor_classes
-from cronos_lerobot.processes import Processes
+from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.factory import check_pictures, make_parts, make_policy_and_processors
 
@@ -124,7 +124,7 @@ def act_config():
 def test_one_decision_at_the_start_draws_nothing(monkeypatch):
     drawn = []
     for _ in range(2):
-        make_parts(act_config(), Processes()).env.close()
+        make_parts(act_config(), Ranks()).env.close()
         drawn.append((torch.rand(1).item(), np.random.rand()))
         monkeypatch.setattr("cronos_lerobot.training.factory.check_decision", lambda *parts: None)
     assert drawn[0] == drawn[1]
@@ -138,4 +138,4 @@ def test_a_policy_that_cannot_act_is_refused_in_a_sentence(monkeypatch):
 
     monkeypatch.setattr("lerobot.policies.act.modeling_act.ACTPolicy.select_action", select_action)
     with pytest.raises(ValueError, match=r"--policy\.type=act"):
-        make_parts(act_config(), Processes())
+        make_parts(act_config(), Ranks())

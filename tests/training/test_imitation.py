@@ -20,7 +20,7 @@ from cronos_lerobot.agents.imitation.config import ImitationConfig
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.evaluation.actors import SelectingPolicy
 from cronos_lerobot.evaluation.independent import evaluate_independent
-from cronos_lerobot.processes import Processes
+from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig, record_demos
 
 
@@ -64,11 +64,11 @@ def settings(folder, resumes=False, **options):
     return cfg
 
 
-def train(cfg, env_class=DummyEnv, processes=None):
-    processes = processes or Processes()
-    mine = processes.share_of(cfg.num_envs)
+def train(cfg, env_class=DummyEnv, ranks=None):
+    ranks = ranks or Ranks()
+    mine = ranks.share_of(cfg.num_envs)
     env = env_class(mine.stop - mine.start, diverge_at={(5, 1)})
-    trainer = make_trainer(cfg, env, ClonedPolicy(8 if cfg.checkpoint_path else 0), processes)
+    trainer = make_trainer(cfg, env, ClonedPolicy(8 if cfg.checkpoint_path else 0), ranks)
     try:
         trainer.train()
     except KilledError:
@@ -160,8 +160,8 @@ def test_an_average_costs_only_what_is_trained(tmp_path):
     assert set(trainer.run.agent.state_dict()["learner"]) == {"actor.weight", "actor.bias", "running_mean"}
 
 
-def in_processes(processes, cfg, env_class=DummyEnv):
-    trainer = train(cfg, env_class, processes)
+def in_processes(ranks, cfg, env_class=DummyEnv):
+    trainer = train(cfg, env_class, ranks)
     if trainer is None:
         return None
     weights = [
@@ -184,11 +184,11 @@ def test_two_processes_learn_together_and_resume(tmp_path):
     assert_same_run(tmp_path / "unbroken", tmp_path / "broken")
 
 
-def update_once(processes, cfg, segments, rank=0):
+def update_once(ranks, cfg, segments, rank=0):
     """An update of which one process has all that is remembered."""
-    mine = processes.share_of(cfg.num_envs)
-    agent = make_trainer(cfg, DummyEnv(mine.stop - mine.start), ClonedPolicy(), processes).run.agent
-    if processes.rank == rank:
+    mine = ranks.share_of(cfg.num_envs)
+    agent = make_trainer(cfg, DummyEnv(mine.stop - mine.start), ClonedPolicy(), ranks).run.agent
+    if ranks.rank == rank:
         agent.memory.load_state_dict(segments)
     torch.manual_seed(0)
     return agent.update(), agent.policy.actor.weight.tolist(), agent.policy.running_mean.tolist()
@@ -198,7 +198,7 @@ def test_a_process_without_a_success_takes_the_steps_of_the_others(tmp_path):
     cfg = settings(tmp_path / "run")
     segments = train(cfg).run.agent.memory.state_dict()
     cfg.output_dir = tmp_path / "other"
-    alone, first = update_once(Processes(), cfg, segments), together(update_once, cfg, segments)
+    alone, first = update_once(Ranks(), cfg, segments), together(update_once, cfg, segments)
     assert alone[0]["optimizer_steps"] == 5
     for update, *learned in first:
         # The loss and the gradient are of the one that has a batch, and not half of it.

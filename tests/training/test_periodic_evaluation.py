@@ -16,7 +16,7 @@ from cronos_lerobot.evaluation.config import CronosEvalConfig, SuitesConfig
 from cronos_lerobot.evaluation.independent import run_independent
 from cronos_lerobot.evaluation.results import describe_episodes
 from cronos_lerobot.evaluation.runner import Evaluation
-from cronos_lerobot.processes import Processes
+from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.factory import make_eval_env, make_policy_and_processors
 
@@ -62,14 +62,14 @@ def policy(checkpoint):
     return config
 
 
-def of_cronos_train(processes, checkpoint, batch_size):
+def of_cronos_train(ranks, checkpoint, batch_size):
     """The same of the evaluation during a training."""
     config = CronosTrainConfig(CronosEnvConfig(**STATE), policy(checkpoint))
     network, *pipelines = make_policy_and_processors(config)
-    env = make_eval_env(config, batch_size, processes.local_count)
+    env = make_eval_env(config, batch_size, ranks.local_count)
     results, _ = run_independent(
         env, network, make_processors(network, *pipelines), n_episodes=N_EPISODES, split="held_out",
-        temperature=TEMPERATURE, seed=SEED, processes=processes, keeps_states=True,
+        temperature=TEMPERATURE, seed=SEED, ranks=ranks, keeps_states=True,
     )  # fmt: skip
     return by_episode(results)
 
@@ -86,7 +86,7 @@ def check_the_same(found, expected):
 
 @pytest.mark.parametrize("batch_size", [1, 3, 64])
 def test_an_episode_is_the_same_in_both_evaluations_at_any_batch_size(checkpoint, of_cronos_eval, batch_size):
-    check_the_same(of_cronos_train(Processes(), checkpoint, batch_size), of_cronos_eval)
+    check_the_same(of_cronos_train(Ranks(), checkpoint, batch_size), of_cronos_eval)
 
 
 def test_processes_share_the_episodes_out_and_all_know_the_whole_result(checkpoint, of_cronos_eval):

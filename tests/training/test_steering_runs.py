@@ -26,7 +26,7 @@ from safetensors.torch import load_file
 
 from cronos_lerobot.agents.steering.config import SteeringConfig
 from cronos_lerobot.agents.steering.steered import STEERING, SteeredPolicy, with_steering
-from cronos_lerobot.processes import Processes
+from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.scripts import train as train_script
 
 
@@ -86,11 +86,11 @@ def settings(folder, resumes=False, **options):
     return cfg
 
 
-def train(cfg, env_class=DummyEnv, processes=None):
-    processes = processes or Processes()
-    mine = processes.share_of(cfg.num_envs)
+def train(cfg, env_class=DummyEnv, ranks=None):
+    ranks = ranks or Ranks()
+    mine = ranks.share_of(cfg.num_envs)
     env = env_class(mine.stop - mine.start, diverge_at={(5, 1)})
-    trainer = make_trainer(cfg, env, NoisePolicy(seed=8 if cfg.checkpoint_path else 0), processes)
+    trainer = make_trainer(cfg, env, NoisePolicy(seed=8 if cfg.checkpoint_path else 0), ranks)
     try:
         trainer.train()
     except KilledError:
@@ -124,8 +124,8 @@ def test_a_resumed_run_equals_the_unbroken_one(tmp_path, memory_size):
     assert weights(unbroken)["weight"].item() == 1.0
 
 
-def in_processes(processes, cfg, env_class=DummyEnv):
-    trainer = train(cfg, env_class, processes)
+def in_processes(ranks, cfg, env_class=DummyEnv):
+    trainer = train(cfg, env_class, ranks)
     if trainer is None:
         return None
     return [param.sum().item() for param in trainer.run.agent.sac.parameters()], len(trainer.run.agent.memory)

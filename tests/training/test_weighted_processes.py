@@ -8,7 +8,7 @@ from forked_processes import together
 from test_imitation import settings, train, update_once
 
 from cronos_lerobot.agents.imitation.config import ImitationConfig
-from cronos_lerobot.processes import Processes
+from cronos_lerobot.ranks import Ranks
 
 
 def weighted(folder, weighting, beta):
@@ -18,8 +18,8 @@ def weighted(folder, weighting, beta):
     return settings(folder, algorithm=algorithm)
 
 
-def update_own(processes, cfg, memories):
-    return update_once(processes, cfg, memories[processes.rank], processes.rank)
+def update_own(ranks, cfg, memories):
+    return update_once(ranks, cfg, memories[ranks.rank], ranks.rank)
 
 
 def remembered(folder):
@@ -38,7 +38,7 @@ def test_a_process_that_has_only_failed_clones_next_to_nothing_of_it(tmp_path):
     for segment in lost:
         segment["columns"]["next.reward"][:] = 0
     cfg = replace(weighted(tmp_path / "run", "return", 0.01), output_dir=tmp_path / "other")
-    alone = update_once(Processes(), cfg, won)
+    alone = update_once(Ranks(), cfg, won)
     assert alone[0]["optimizer_steps"] == 5
     first, second = together(update_own, cfg, [won, lost])
     assert first[1:] == second[1:]
@@ -54,7 +54,7 @@ def test_a_process_that_has_only_failed_clones_next_to_nothing_of_it(tmp_path):
 def test_the_effective_share_is_that_of_one_process_with_all_of_it(tmp_path, weighting):
     won, lost = remembered(tmp_path / "run")
     cfg = replace(weighted(tmp_path / "run", weighting, 0.2), output_dir=tmp_path / "other")
-    alone = update_once(Processes(), cfg, [*won, *lost])[0]
+    alone = update_once(Ranks(), cfg, [*won, *lost])[0]
     first, second = together(update_own, cfg, [won, lost])
     assert 0 < alone["effective_share"] < 1
     for found in (first[0], second[0]):

@@ -57,7 +57,7 @@ class ImitationAgent(LearningAgent):
         # What the optimizer trains: the policy itself, or where the policy is an average over its steps, a copy.
         self._learner = copy_trained(self.policy) if self.config.ema_decay else self.policy
         self._average = get_ema_multi_avg_fn(self.config.ema_decay)
-        self._processors, self._processes = context.processors, context.processes
+        self._processors, self._ranks = context.processors, context.ranks
         self._stopwatch, self._streams = context.stopwatch, context.streams
         self._rng = context.rng("imitation")
         self._player = self._make_player(context.torch_rng("actions"))
@@ -111,7 +111,7 @@ class ImitationAgent(LearningAgent):
         """Take the update's optimizer steps, once there are enough successes or if there are demonstrations."""
         memory = self.memory
         successes = sum(segment.success for segment in memory.segments)
-        found = self._processes.concatenate(np.array([[successes, memory.num_frames, len(memory)]]))
+        found = self._ranks.concatenate(np.array([[successes, memory.num_frames, len(memory)]]))
         metrics = {"segments": float(found[:, 0].sum()), "frames": float(found[:, 1].sum())}
         metrics |= self._weigh()
         # Failed segments that are remembered may push successes out again.
@@ -123,13 +123,13 @@ class ImitationAgent(LearningAgent):
             return metrics | {"optimizer_steps": 0.0}
         with self._stopwatch("update"):
             self._learner.train()
-            own = float(shares[self._processes.rank])
+            own = float(shares[self._ranks.rank])
             steps = [self._step(own) for _ in range(self.config.steps_per_update)]
             self._learner.eval()
             # Running means, as those of batch normalization, are each process's own of the batches that it had.
             for module in dict.fromkeys((self._learner, self.policy)):
-                self._processes.copy_from(int(shares.argmax()), module.buffers())
-        losses, norms = self._processes.concatenate(np.array([steps])).mean(axis=1).T
+                self._ranks.copy_from(int(shares.argmax()), module.buffers())
+        losses, norms = self._ranks.concatenate(np.array([steps])).mean(axis=1).T
         # That of a process counts by as much as its gradient does, not at all without a batch (NaN).
         loss = np.average(losses[shares > 0], weights=shares[shares > 0])
         metrics |= {"loss": float(loss), "grad_norm": float(norms.mean())}
@@ -146,14 +146,14 @@ class ImitationAgent(LearningAgent):
             params = self.policy.named_parameters(remove_duplicate=False)
             frozen = {name for name, param in params if not param.requires_grad}
             learner = {name: value for name, value in self._learner.state_dict().items() if name not in frozen}
-        memory = self._processes.gather_to_main(self.memory.state_dict())
+        memory = self._ranks.gather_to_main(self.memory.state_dict())
         return {"memory": memory, "learner": learner, "is_warm": self._is_warm}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on with the segments of this process, or with its share if there are more or fewer processes now."""
-        processes = self._processes
+        ranks = self._ranks
         self._is_warm = state["is_warm"]
-        self.memory.load_state_dict(own_share(state["memory"], processes.rank, processes.count))
+        self.memory.load_state_dict(own_share(state["memory"], ranks.rank, ranks.count))
         if self.config.ema_decay:
             self._learner.load_state_dict(self.policy.state_dict() | state["learner"])
 
@@ -207,8 +207,8 @@ class ImitationAgent(LearningAgent):
         if config.weighting == "none":
             return {}
         failed = sum(not segment.success for segment in memory.segments)
-        metrics = {"failed_segments": float(sum(self._processes.gather(failed))), "effective_share": 0.0}
-        everyone = Remembered.of(memory, self._processes, config.gamma)
+        metrics = {"failed_segments": float(sum(self._ranks.gather(failed))), "effective_share": 0.0}
+        everyone = Remembered.of(memory, self._ranks, config.gamma)
         self._weights = self._masses = None
         if len(everyone.returns):
             if config.weighting == "return":
@@ -217,7 +217,7 @@ class ImitationAgent(LearningAgent):
                 weights = by_advantage(
                     everyone.returns, everyone.instructions, config.weighting_beta, config.max_weight
                 )
-            self._weights = everyone.split(weights)[self._processes.rank]
+            self._weights = everyone.split(weights)[self._ranks.rank]
             self._masses = everyone.masses(weights)
             metrics["effective_share"] = effective_share(weights, everyone.lengths)
         return metrics
@@ -259,7 +259,7 @@ class ImitationAgent(LearningAgent):
                 raise FloatingPointError(f"The loss is {loss.item()}.")
             (share * loss).backward()
             value = loss.item()
-        self._processes.average_gradients(self._trained)
+        self._ranks.average_gradients(self._trained)
         norm = torch.nn.utils.clip_grad_norm_(self._trained, self._max_grad_norm or float("inf"))
         for optimizer in self._optimizers:
             optimizer.step()

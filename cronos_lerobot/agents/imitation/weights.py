@@ -9,7 +9,7 @@ import numpy as np
 from lerobot.utils.constants import REWARD
 
 from cronos_lerobot.agents.imitation.memory import Segment, SegmentMemory
-from cronos_lerobot.processes import Processes
+from cronos_lerobot.ranks import Ranks
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class Remembered:
     """(processes,) segments of each."""
 
     @classmethod
-    def of(cls, memory: SegmentMemory, processes: Processes, gamma: float | None = None) -> Remembered:
+    def of(cls, memory: SegmentMemory, ranks: Ranks, gamma: float | None = None) -> Remembered:
         """What this process remembers and the others; all call it, with the discount factor of the returns."""
         instructions = np.array([segment.instruction for segment in memory.segments], dtype=np.str_)
         returns = np.zeros(len(memory)) if gamma is None else discounted_returns(memory.segments, gamma)
-        parts = processes.gather((instructions, memory.lengths, returns))
+        parts = ranks.gather((instructions, memory.lengths, returns))
         columns = (np.concatenate(column) for column in zip(*parts, strict=True))
         return cls(*columns, counts=np.array([len(part[0]) for part in parts]))
 

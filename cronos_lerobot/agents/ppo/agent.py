@@ -17,7 +17,7 @@ from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
 from cronos_lerobot.agents.processing import observation_columns, to_array
 from cronos_lerobot.agents.state import map_leaves
-from cronos_lerobot.processes import Processes
+from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.stopwatch import Stopwatch
 
 
@@ -105,7 +105,7 @@ class PPOAgent(DecidingAgent):
         with self.stopwatch("infer"):
             columns = self.history.followed_by(observation_columns(o_t), range(len(mine)))
             values = self.look(columns, mine)
-        return self.ppo.processes.concatenate(values)
+        return self.ppo.ranks.concatenate(values)
 
     def shared_tensors(self) -> Iterable[torch.Tensor]:
         """The policy's parameters and those beside it."""
@@ -119,7 +119,7 @@ class PPOAgent(DecidingAgent):
             "config": {"policy_lr": ppo.config.policy_lr, "value_lr": ppo.config.value_lr},
             "base_policy": {} if ppo.base_policy is None else ppo.base_policy.parameters,
             "adapter": {} if self._adapter is None else self._adapter.own_parameters(),
-            "rollout": join_rollouts(self.buffer.state_dict(), ppo.processes),
+            "rollout": join_rollouts(self.buffer.state_dict(), ppo.ranks),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -133,7 +133,7 @@ class PPOAgent(DecidingAgent):
         self.buffer.load_state_dict(state["rollout"], self.streams)
 
 
-def join_rollouts(rollout: dict[str, Any], processes: Processes) -> dict[str, Any]:
+def join_rollouts(rollout: dict[str, Any], ranks: Ranks) -> dict[str, Any]:
     """The rollouts of all processes as one, in the first of them; they number instructions each in its own way.
 
     Args:
@@ -142,10 +142,10 @@ def join_rollouts(rollout: dict[str, Any], processes: Processes) -> dict[str, An
     """
     if not rollout:
         return {}
-    texts = sorted(set().union(*processes.gather(rollout["instructions"])))
+    texts = sorted(set().union(*ranks.gather(rollout["instructions"])))
     numbers = np.array([texts.index(text) for text in rollout["instructions"]])
     rollout = rollout | {"instruction_ids": numbers[rollout["instruction_ids"]]}
-    return map_leaves(rollout, np.ndarray, processes.collect) | {"instructions": texts}
+    return map_leaves(rollout, np.ndarray, ranks.collect) | {"instructions": texts}
 
 
 def set_optimizer(

@@ -29,10 +29,10 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
     if config.critic_observation == "environment_state":
         policy = _with_privileged_critic(policy, context)
     if isinstance(policy, Adapter):
-        context.processes.copy_from_main([*policy.own_parameters().values()])
+        context.ranks.copy_from_main([*policy.own_parameters().values()])
     mine = context.streams
     # Every process draws its own minibatches and actions.
-    ppo = PPO(policy, context.processors, config, context.rng("minibatches"), context.processes)
+    ppo = PPO(policy, context.processors, config, context.rng("minibatches"), context.ranks)
     steps = decision_steps(policy, context.task_switch_interval)
     buffer = RolloutBuffer(context.update_interval // steps, mine.stop - mine.start)
     return PPOAgent(ppo, buffer, context.torch_rng("actions"), context.stopwatch, mine)

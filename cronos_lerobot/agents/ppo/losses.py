@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from cronos_lerobot.agents.ppo.config import PPOConfig
-from cronos_lerobot.processes import Processes
+from cronos_lerobot.ranks import Ranks
 
 LOG_RATIO_LIMIT = 20.0
 """Largest |log r|: e^20 times any advantage is finite in float32, and any early stop stops long before."""
@@ -101,10 +101,10 @@ class UpdateMetrics:
         for name, value in values.items():
             self._maxima[name] = max(value, self._maxima.get(name, value))
 
-    def result(self, processes: Processes) -> dict[str, float]:
+    def result(self, ranks: Ranks) -> dict[str, float]:
         """Return the mean over the processes of their means, and the maxima of all."""
         together = UpdateMetrics()
-        for means, maxima in processes.gather((self._means(), self._maxima)):
+        for means, maxima in ranks.gather((self._means(), self._maxima)):
             together.add_means(means)
             together.add_maxima(maxima)
         return together._means() | together._maxima

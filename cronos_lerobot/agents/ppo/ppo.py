@@ -31,7 +31,7 @@ from cronos_lerobot.agents.ppo.losses import (
 from cronos_lerobot.agents.ppo.rollout_buffer import Minibatch, RolloutBuffer
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.agents.weights import check_precision
-from cronos_lerobot.processes import Processes
+from cronos_lerobot.ranks import Ranks
 
 
 @dataclass(frozen=True)
@@ -74,13 +74,13 @@ class PPO:
         processors: PolicyProcessors,
         config: PPOConfig,
         rng: np.random.Generator,
-        processes: Processes | None = None,
+        ranks: Ranks | None = None,
     ) -> None:
         self.policy = policy
         self.processors = processors
         self.config = config
         self.rng = rng
-        self.processes = processes or Processes()
+        self.ranks = ranks or Ranks()
         self.num_updates = 0
         lrs = {"policy": config.policy_lr, "value": config.value_lr}
         self._max_norms = {"policy": config.max_grad_norm, "value": config.value_max_grad_norm}
@@ -121,7 +121,7 @@ class PPO:
         """
         config = self.config
         buffer.compute_advantages(config.gamma, config.gae_lambda)
-        rollout = {name: self.processes.concatenate(array, axis=1) for name, array in buffer.results().items()}
+        rollout = {name: self.ranks.concatenate(array, axis=1) for name, array in buffer.results().items()}
         own = ~rollout.pop("intervened")
         if self._num_own(buffer) == 0:
             return {"policy_epochs": 0.0, "policy_lr": self.policy_lr, "value_lr": config.value_lr}
@@ -136,7 +136,7 @@ class PPO:
         epochs = 0 if warming_up else self._train_policy(buffer, metrics)
         self._train_value(buffer, metrics, max(config.value_epochs, config.epochs * warming_up))
         self.num_updates += 1
-        described |= metrics.result(self.processes)
+        described |= metrics.result(self.ranks)
         return described | {"policy_epochs": epochs, "policy_lr": self.policy_lr, "value_lr": config.value_lr}
 
     @property
@@ -203,7 +203,7 @@ class PPO:
 
     def _num_own(self, buffer: RolloutBuffer) -> int:
         """Decisions that every process learns from: as many in all, or they would not step together."""
-        return int(self.processes.concatenate(np.array([buffer.num_own])).min())
+        return int(self.ranks.concatenate(np.array([buffer.num_own])).min())
 
     def _accumulate(
         self,
@@ -226,7 +226,7 @@ class PPO:
             metrics.add_means(loss.means, len(minibatch.indices))
             metrics.add_maxima(loss.maxima)
             if loss.kl is not None:
-                kl += weight * float(self.processes.concatenate(np.array([loss.kl])).mean())
+                kl += weight * float(self.ranks.concatenate(np.array([loss.kl])).mean())
             if kl > kl_limit:
                 self.optimizer.zero_grad(set_to_none=True)
                 return kl
@@ -279,7 +279,7 @@ class PPO:
 
     def _optimizer_step(self, metrics: UpdateMetrics) -> dict[str, float]:
         """Step along the mean gradient of all processes; returns its norm in each group that has one."""
-        self.processes.average_gradients(self._params["policy"] + self._params["value"])
+        self.ranks.average_gradients(self._params["policy"] + self._params["value"])
         norms = {}
         for name, params in self._params.items():
             if any(param.grad is not None for param in params):

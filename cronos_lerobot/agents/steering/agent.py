@@ -43,7 +43,7 @@ class SteeringAgent(DecidingAgent):
         steerable = make_steerable(self.policy).eval().requires_grad_(False)
         super().__init__(steerable, self.config.gamma, context.streams, context.stopwatch)
         decision_steps(steerable, context.task_switch_interval)
-        self._processors, self._processes = context.processors, context.processes
+        self._processors, self._ranks = context.processors, context.ranks
         self._rng, self._generator = context.rng("minibatches"), context.torch_rng("actions")
         observation = resolve_observation(self.config.observation, self.policy.config)
         shape = SteeringShape(
@@ -58,11 +58,11 @@ class SteeringAgent(DecidingAgent):
         device = self._processors.device
         self.sac = SAC(
             self.config, self.steered.actor, self.steered.whitening, shape.features, self.steered.dims, device,
-            context.torch_rng("critics"), self._processes,
+            context.torch_rng("critics"), self._ranks,
         )  # fmt: skip
-        self._processes.copy_from_main(self.sac.trained())
+        self._ranks.copy_from_main(self.sac.trained())
         self.optimizer = self.sac.optimizers
-        self.memory = ReplayMemory(-(-self.config.memory_size // self._processes.count))
+        self.memory = ReplayMemory(-(-self.config.memory_size // self._ranks.count))
         self.num_steps = 0
         self._new = 0
         self._waiting: Columns = {}
@@ -127,20 +127,20 @@ class SteeringAgent(DecidingAgent):
     def update(self) -> dict[str, float]:
         """Take the optimizer steps that the decisions since the last update are worth."""
         assert not self._waiting
-        counts = self._processes.concatenate(np.array([[self._new, len(self.memory)]])).sum(axis=0)
+        counts = self._ranks.concatenate(np.array([[self._new, len(self.memory)]])).sum(axis=0)
         new, self._new = int(counts[0]), 0
         metrics = {"decisions": float(counts[1]), "optimizer_steps": 0.0}
         if metrics["decisions"] < min(self.config.warmup_decisions, self.config.memory_size):
             return metrics
         with self.stopwatch("update"):
             if not self.num_steps:
-                moments = self._processes.concatenate(self.memory.moments()[None]).mean(0)
+                moments = self._ranks.concatenate(self.memory.moments()[None]).mean(0)
                 self.steered.whitening.fit(*torch.from_numpy(moments).to(self._processors.device))
             steps = max(1, round(self.config.utd * new))
             done = [self.sac.step(self.memory.draw(self.config.batch_size, self._rng)) for _ in range(steps)]
         self.num_steps += steps
         means = np.array([[np.mean([step[name] for step in done]) for name in done[0]]])
-        means = self._processes.concatenate(means).mean(0)
+        means = self._ranks.concatenate(means).mean(0)
         metrics |= dict(zip(done[0], means.tolist(), strict=True))
         return metrics | {"alpha": float(self.sac.log_alpha.detach().exp()), "optimizer_steps": float(steps)}
 
@@ -152,9 +152,9 @@ class SteeringAgent(DecidingAgent):
         """Actor, critics and the memory; see `LearningAgent`."""
         return {
             "num_steps": self.num_steps,
-            "new": self._new * self._processes.count,
+            "new": self._new * self._ranks.count,
             "sac": self.sac.state_dict(),
-            "memory": map_leaves(self.memory.state_dict(), np.ndarray, self._processes.collect),
+            "memory": map_leaves(self.memory.state_dict(), np.ndarray, self._ranks.collect),
             "gamma": self.gamma,
         }
 
@@ -169,11 +169,11 @@ class SteeringAgent(DecidingAgent):
                 f"--algorithm.gamma={self.gamma}: the decisions that the run remembers are discounted by {gamma}."
             )
         self.num_steps = state["num_steps"]
-        self._new = state["new"] // self._processes.count
+        self._new = state["new"] // self._ranks.count
         self.sac.load_state_dict(state["sac"])
         memory = state["memory"]
-        share = len(memory.get("reward", ())) // self._processes.count
-        mine = slice(self._processes.rank * share, (self._processes.rank + 1) * share)
+        share = len(memory.get("reward", ())) // self._ranks.count
+        mine = slice(self._ranks.rank * share, (self._ranks.rank + 1) * share)
         self.memory.load_state_dict({name: column[mine] for name, column in memory.items()})
 
     def _remember(self, next_features: np.ndarray) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from cronos_lerobot.agents.steering.config import SteeringConfig
 from cronos_lerobot.agents.steering.networks import Critics, NoiseActor, Whitening
-from cronos_lerobot.processes import Processes
+from cronos_lerobot.ranks import Ranks
 
 Metrics = dict[str, float]
 
@@ -40,10 +40,10 @@ class SAC(nn.Module):
         dims: int,
         device: torch.device | str = "cpu",
         generator: torch.Generator | None = None,
-        processes: Processes | None = None,
+        ranks: Ranks | None = None,
     ) -> None:
         super().__init__()
-        self.config, self.generator, self.processes = config, generator, processes or Processes()
+        self.config, self.generator, self.ranks = config, generator, ranks or Ranks()
         self.actor, self.whitening = actor, whitening
         self.critics = Critics(features, dims, config.hidden_width, config.num_critics)
         self.log_alpha = nn.Parameter(torch.tensor(math.log(config.initial_alpha)))
@@ -126,7 +126,7 @@ class SAC(nn.Module):
         optimizer.zero_grad()
         loss.backward()
         params = [self.log_alpha] if network is None else list(network.parameters())
-        self.processes.average_gradients(params)
+        self.ranks.average_gradients(params)
         limit = math.inf if network is None else self.config.max_grad_norm
         norm = nn.utils.clip_grad_norm_(params, limit)
         optimizer.step()

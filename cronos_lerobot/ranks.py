@@ -23,7 +23,7 @@ BUCKET_BYTES = 64 * 2**20
 """Gradients travel in pieces of about this size."""
 
 
-class Processes:
+class Ranks:
     """One process: what it shares with the others is its own."""
 
     rank = 0
@@ -104,7 +104,7 @@ class Processes:
         """Part from the other processes."""
 
 
-class LaunchedProcesses(Processes):
+class LaunchedRanks(Ranks):
     """Processes that run in step: every method but `share_of` and `own` waits until all have called it.
 
     Args:
@@ -190,21 +190,21 @@ class LaunchedProcesses(Processes):
         dist.destroy_process_group()
 
 
-def join_processes(device: str | None) -> Processes:
+def join_ranks(device: str | None) -> Ranks:
     """Join the processes that `accelerate launch` (or torchrun) started; one process without it.
 
     Args:
         device: of the policy; `cpu` keeps Accelerate from taking a GPU.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        return Processes()
+        return Ranks()
     from accelerate import Accelerator, InitProcessGroupKwargs
 
     accelerator = Accelerator(cpu=device == "cpu", kwargs_handlers=[InitProcessGroupKwargs(timeout=TIMEOUT)])
     if accelerator.num_processes == 1:
-        return Processes()
+        return Ranks()
     local_count = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    return LaunchedProcesses(accelerator.process_index, accelerator.num_processes, local_count)
+    return LaunchedRanks(accelerator.process_index, accelerator.num_processes, local_count)
 
 
 def choose_gpu(device: str | None) -> None:
