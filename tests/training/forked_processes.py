@@ -11,6 +11,7 @@ from pathlib import Path
 
 import cloudpickle
 import faster  # noqa: F401
+import lerobot_policy_pocketvla  # noqa: F401  (a server that another test has started may not have it)
 import numpy as np
 import pytest
 import torch
