@@ -13,6 +13,7 @@ from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 from cronos_lerobot.agents.base import LearningAgent
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.ranks import Ranks
+from cronos_lerobot.registry import Registry
 from cronos_lerobot.stopwatch import Stopwatch
 
 
@@ -68,7 +69,7 @@ class AgentConfig(RLAlgorithmConfig):
 
 AgentFactory = Callable[[AgentContext], LearningAgent]
 
-AGENTS: dict[str, AgentFactory] = {}
+AGENTS: Registry[AgentFactory] = Registry("--algorithm.type", "cronos_lerobot.register_agent")
 """What makes the agent of an `--algorithm.type`."""
 
 
@@ -83,13 +84,7 @@ def register_agent(name: str) -> Callable[[AgentFactory], AgentFactory]:
         ValueError: the name is taken.
     """
 
-    def register(factory: AgentFactory) -> AgentFactory:
-        if name in AGENTS:
-            raise ValueError(f"there is an agent {name!r} already; taken names: {sorted(AGENTS)}.")
-        AGENTS[name] = factory
-        return factory
-
-    return register
+    return AGENTS.register(name)
 
 
 def agent_names() -> list[str]:

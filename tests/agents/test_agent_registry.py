@@ -1,5 +1,6 @@
 """Agents by name."""
 
+from copy import copy
 from types import SimpleNamespace
 
 import pytest
@@ -11,7 +12,7 @@ assert builtin
 
 
 def test_a_name_is_taken_once_and_needs_a_config_to_be_offered(monkeypatch):
-    monkeypatch.setattr(registry, "AGENTS", dict(registry.AGENTS))
+    monkeypatch.setattr(registry, "AGENTS", copy(registry.AGENTS))
     made = registry.register_agent("of_a_test")(lambda context: ("made of", context))
     context = SimpleNamespace(config=SimpleNamespace(type="of_a_test"))
     assert registry.make_agent(context) == ("made of", context)

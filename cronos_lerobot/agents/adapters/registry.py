@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from cronos_lerobot.agents.base import Batch, missing_methods
+from cronos_lerobot.registry import Registry
 
 
 class Critic(nn.Module):
@@ -116,7 +117,7 @@ class Steerable(Protocol):
 
 AdapterFactory = Callable[[Any, AdapterOptions], Adapter]
 
-ADAPTERS: dict[str, AdapterFactory] = {}
+ADAPTERS: Registry[AdapterFactory] = Registry("--policy.type", "cronos_lerobot.register_adapter")
 """What makes a LeRobot policy of a type trainable."""
 
 
@@ -129,13 +130,7 @@ def register_adapter(policy_type: str) -> Callable[[AdapterFactory], AdapterFact
         ValueError: the type has an adapter.
     """
 
-    def register(factory: AdapterFactory) -> AdapterFactory:
-        if policy_type in ADAPTERS:
-            raise ValueError(f"there is an adapter for {policy_type!r} already; types: {sorted(ADAPTERS)}.")
-        ADAPTERS[policy_type] = factory
-        return factory
-
-    return register
+    return ADAPTERS.register(policy_type)
 
 
 def make_trainable(policy: Any, options: AdapterOptions) -> Any:
