@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+import yaml
 
 PAPER, WIDE, ONE = "paper", "wide", "one_configuration"
 """Base policies by where their demonstrations begin: in the 64 training configurations, as the paper's do; all
@@ -10,19 +13,6 @@ over the reach of the arm and in the middle of streams; in the first training co
 
 SHORT, LONG = 1_300_000, 2_900_000
 """S of the paper's two kinds of run [interaction steps]: Sections 6.1 to 6.4 and 6.6, and Sections 6.5 and 6.7."""
-
-LABELS = {
-    "protocol.end_effector_reset": "EER",
-    "protocol.curriculum": "CL",
-    "protocol.learned_reset": "LSR",
-    "protocol.heuristic_reset": "HSR",
-    "protocol.reset_phase": "{}",
-    "protocol.task_order": "{} order",
-    "protocol.num_configurations": "{} configuration",
-    "algorithm.kl_decay_updates": "decaying KL target",
-    "eval.n_episodes": "",
-}
-"""What a row's label says of its flags; `{}` is the flag's value."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +29,20 @@ class Row:
     @property
     def label(self) -> str:
         """What tables and figures call it, such as `T = 1280, EER, CL`."""
-        words = []
-        for flag in self.flags:
-            name, value = flag.removeprefix("--").split("=", 1)
-            if name == "protocol.scene_reset_interval":
-                words.append("no scene resets" if value == "null" else f"T = {value}")
-            elif value != "false":
-                words.append(LABELS.get(name, f"{name}={{}}").format(value))
-        return ", ".join(filter(None, words))
+        from cronos_lerobot.report.runs import describe_protocol
+
+        given = dict(flag.removeprefix("--").split("=", 1) for flag in self.flags)
+        protocol = {name: value for name, value in given.items() if name.startswith("protocol.")}
+        own = {name.removeprefix("protocol."): _value(value) for name, value in protocol.items()}
+        others = [
+            f"{name.rpartition('.')[2]}={value}" for name, value in given.items() if name.startswith("algorithm.")
+        ]
+        return ", ".join([describe_protocol({"task_switch_interval": 80} | own), *others])
+
+
+def _value(text: str) -> Any:
+    """A flag's value. That of a curriculum, which has a share of the steps, stays a text."""
+    return text if "{" in text else yaml.safe_load(text)
 
 
 @dataclass(frozen=True)
@@ -84,7 +80,8 @@ def _row(name: str, interval: int | None, *flags: str, eer: bool = True, base: s
 CL = "--protocol.curriculum=[[{0.5},320]]"
 """T = 320 up to 0.65 M of 1.3 M interaction steps (Table 1, Section 6.3)."""
 LSR, HSR = "--protocol.learned_reset=true", "--protocol.heuristic_reset=true"
-ONE_CONFIGURATION = ("--protocol.num_configurations=1", "--eval.n_episodes=1")
+ONE_CONFIGURATION = ("--protocol.num_configurations=1", "--eval.n_episodes=1", "--eval.repetitions=64")
+"""As many episodes from the one configuration as from all 64."""
 
 EPISODIC = _row("t80", 80, eer=False)
 PERIODIC = _row("t320_eer", 320)

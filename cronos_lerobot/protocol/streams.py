@@ -46,23 +46,3 @@ class Streams(Protocol):
     def scene_reset(self, ids: np.ndarray, configurations: np.ndarray, split: str = "train") -> None:
         """Put every body of the streams `ids` at configurations (k,) of a split, and the arm home."""
         ...
-
-
-class SendsArmHome(Protocol):
-    """Streams for `--protocol.end_effector_reset=true`."""
-
-    def end_effector_reset(self, ids: np.ndarray) -> None:
-        """Put the arm of the streams `ids` home, its gripper open."""
-        ...
-
-
-class PutsBack(Protocol):
-    """Streams for `--protocol.heuristic_reset=true`."""
-
-    def unsuitable_bodies(self) -> np.ndarray:
-        """Return the bodies that no task can reach any more, (N, bodies) bool."""
-        ...
-
-    def put_back(self, stream: int, body: str, rng: np.random.Generator) -> None:
-        """Put one body of a stream at a free place."""
-        ...

@@ -49,8 +49,12 @@ def check_links(folder: Path) -> None:
 
 
 def clear_unfinished(folder: Path) -> None:
-    """Remove what a run has left in `folder` that was killed before its first checkpoint."""
-    if not (folder / MANIFEST).is_file():
+    """Remove what a run has left in `folder` that was killed before its first checkpoint.
+
+    Raises:
+        ValueError: the folder has a manifest of something else.
+    """
+    if not read_manifest(folder)["starts"]:
         return
     logging.warning(f"The run in {folder} has no checkpoint: it begins anew.")
     for path in (folder / METRICS, folder / TENSORBOARD, *folder.glob(f"{STREAMS}*"), folder / MANIFEST):

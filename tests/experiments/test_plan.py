@@ -31,7 +31,8 @@ def test_labels_say_what_the_paper_calls_a_row():
         "T = 1280, EER, CL, LSR, HSR",
     ]
     assert EXPERIMENTS["figure2"].rows[1].label == "T = 1280, EER, CL, HSR, random order"
-    assert EXPERIMENTS["baselines"].rows[-1].label == "T = 4400, EER, staggered, CL, decaying KL target"
+    assert EXPERIMENTS["figure4"].rows[3].label == "T = 320, EER, 1 configuration(s)"
+    assert EXPERIMENTS["baselines"].rows[-1].label == "T = 4400, staggered, EER, CL, kl_decay_updates=10"
 
 
 def test_table1_at_the_papers_scale_is_the_papers_setting():

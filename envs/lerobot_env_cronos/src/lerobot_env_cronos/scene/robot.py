@@ -13,7 +13,6 @@ HOME_QPOS = np.array([-0.01840777, 0.0398835, 0.22242722, -0.00460194, 1.3652429
 """Start pose of the six arm joints, measured on the Bridge set-up by SimplerEnv [rad]."""
 
 ARM_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
-FINGER_JOINTS = ("left_finger", "right_finger")
 FINGER_OPEN, FINGER_CLOSED = 0.037, 0.015
 """Joint positions of the left finger; the right one mirrors it [m]."""
 
@@ -26,9 +25,6 @@ EE_LOW, EE_HIGH = np.array([0.10, -0.30, 0.0]), np.array([0.50, 0.30, 0.35])
 
 FINGERTIP_REACH = 0.031
 """How far the fingertips extend beyond the end-effector site along the fingers [m]."""
-
-PAD_SURFACE_Y = 0.012
-"""Distance of the pad's gripping surface from the finger frame, towards the other finger [m]."""
 
 ARM_KP, ARM_ARMATURE = 400.0, 0.1
 GRIPPER_KP, GRIPPER_FORCE_LIMIT = 1000.0, 20.0

@@ -19,7 +19,6 @@ from lerobot_env_cronos.scene.visuals.meshes import (
     stadium,
 )
 
-SERVO_BEVEL = 0.003
 FINGER_END = PAD_POS[0] + PAD_HALF_SIZE[0]
 
 
