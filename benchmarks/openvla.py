@@ -21,7 +21,7 @@ from lerobot_policy_openvla.architecture import HALF, IMAGENET_MEAN, IMAGENET_ST
 from lerobot_policy_openvla.building import finish_network, resolve_dtype
 from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
-from lerobot_policy_openvla.network_loading import empty_network
+from lerobot_policy_openvla.network import empty_network
 
 CAMERA = "observation.images.front"
 ACTION_TOKENS = 7

@@ -25,7 +25,6 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.utils.constants import OBS_IMAGES, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch.utils.flop_counter import FlopCounterMode
 
-from cronos_lerobot.agents.adapters import builtin as _builtin  # noqa: F401 -- registers them
 from cronos_lerobot.agents.adapters.registry import AdapterOptions, make_trainable
 
 EXPERT_ONLY = {"train_expert_only": True, "freeze_vision_encoder": True}

@@ -1,8 +1,9 @@
-"""What the reset-free loop asks of a policy and of an agent. A policy plugin never imports this module."""
+"""What is asked of a policy, of who acts, and of who learns. A policy plugin never imports this module."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -23,6 +24,9 @@ Columns = dict[str, np.ndarray]
 Batch = dict[str, Any]
 """A batch by LeRobot's names, after the policy's preprocessor: `observation.*` (B, ...), `task`: B strings.
 Images are (B, 3, H, W), floats in [0, 1] or, for a policy with `takes_uint8_images`, uint8 in 0..255."""
+
+StreamSeed = Sequence[int]
+"""Non-negative integers that seed the randomness of one stream."""
 
 POLICY_METHODS = ("sample_actions", "evaluate_actions", "predict_values", "rl_parameter_groups")
 
@@ -118,6 +122,11 @@ def decision_steps(policy: Any, task_switch_interval: int | None = None) -> int:
     return n
 
 
+def observation_steps(policy: Any) -> int:
+    """How many observations a TrainablePolicy looks at."""
+    return int(getattr(policy, "observation_steps", 1))
+
+
 @dataclass(frozen=True)
 class ActionSample:
     """Actions for one control step of this process's streams, and what a recording says of them."""
@@ -131,6 +140,39 @@ class ActionSample:
     """(N,) float32, that policy's value of the observation that was decided on; None if unknown."""
     intervened: np.ndarray | None = None
     """(N,) bool, of all processes' streams: a person or a script chose the action. None where nobody can."""
+
+
+class Actor(Protocol):
+    """Who acts in evaluations, videos and recordings, in some of the streams. The caller numbers the streams."""
+
+    is_per_stream: bool = True
+    """Whether it keeps the streams apart. If not, `act` gets all streams, and `begin` forgets all of them."""
+    temperature: float | None = None
+    """Sampling temperature; None if it does not sample at one."""
+
+    def seed(self, seed: int) -> None:
+        """Seed the randomness that all streams share."""
+        return
+
+    def begin(self, ids: np.ndarray, seeds: Sequence[StreamSeed] | None = None) -> None:
+        """Begin a new task in streams `ids`: forget plans and past observations.
+
+        Args:
+            ids: (k,) streams.
+            seeds: k seeds of their own randomness; None continues with the randomness that they have.
+        """
+        return
+
+    @abstractmethod
+    def act(self, observation: dict[str, Any], instructions: list[str], ids: np.ndarray) -> ActionSample:
+        """Choose the next action of streams `ids` (k,).
+
+        Args:
+            observation: raw, k rows.
+            instructions: k current instructions.
+            ids: (k,) streams.
+        """
+        ...
 
 
 class Agent(Protocol):

@@ -1,4 +1,4 @@
-"""LeRobot policies that plan chunks of actions or look back, with a memory for every stream of its own.
+"""Policies that plan chunks of actions or look back, with a memory for every stream of its own.
 
 A policy's `select_action` has one queue for its whole batch. Of streams that switch tasks, diverge or end at
 different times it would play the old task's actions to one of them.
@@ -7,20 +7,61 @@ different times it would play the old task's actions to one of them.
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from lerobot.policies.utils import populate_queues
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 from torch import Tensor
 
 from cronos_lerobot.agents.base import Columns
-from cronos_lerobot.agents.history import ObservationHistory
 from cronos_lerobot.agents.processing import PolicyProcessors
 
 PLANS_FROM_PLANS = ("tdmpc", "lingbot_va")
 """Types of policies whose plans depend on the plans before them."""
+
+
+class ObservationHistory:
+    """The last observations of every stream, its own; streams are numbered by whoever asks.
+
+    Where a stream has not seen so many since it began, the first one is repeated, as LeRobot's policies do.
+
+    Args:
+        length: H, how many observations a policy looks at; with 1 columns stay as they are.
+    """
+
+    def __init__(self, length: int = 1) -> None:
+        self.length = length
+        self._past: dict[int, Columns] = {}
+
+    def begin(self, ids: Iterable[int]) -> None:
+        """What streams `ids` see from now on has nothing to do with what they saw before."""
+        for i in ids:
+            self._past.pop(int(i), None)
+
+    def see(self, columns: Columns, ids: Sequence[int]) -> Columns:
+        """Remember the observations (k, ...) of streams `ids` (k,); returns `followed_by` them."""
+        seen = self.followed_by(columns, ids)
+        if self.length > 1:
+            for row, i in enumerate(ids):
+                self._past[int(i)] = {name: col[row] for name, col in seen.items()}
+        return seen
+
+    def followed_by(self, columns: Columns, ids: Sequence[int]) -> Columns:
+        """What streams `ids` have seen once they see these observations (k, ...): (k, H, ...), oldest first."""
+        if self.length == 1:
+            return columns
+        return {
+            name: np.stack([self._row(name, col[row], int(i)) for row, i in enumerate(ids)])
+            for name, col in columns.items()
+        }
+
+    def _row(self, name: str, newest: np.ndarray, i: int) -> np.ndarray:
+        if i not in self._past:
+            return np.repeat(newest[None], self.length, axis=0)
+        return np.concatenate([self._past[i][name][1:], newest[None]])
 
 
 class ChunkPlayer:

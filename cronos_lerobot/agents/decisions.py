@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from cronos_lerobot.agents.base import ActionSample, Columns, LearningAgent, decision_steps
-from cronos_lerobot.agents.history import ObservationHistory, observation_steps
+from cronos_lerobot.agents.base import ActionSample, Columns, LearningAgent, decision_steps, observation_steps
+from cronos_lerobot.agents.chunk_player import ObservationHistory
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.stopwatch import Stopwatch
 

@@ -161,22 +161,8 @@ def _check_absolute(policy: Any, preprocessor: Any) -> None:
         )
 
 
-def to_array(name: str, tensor: torch.Tensor) -> np.ndarray:
-    """What a policy returned under `name`, as it is kept until an update.
-
-    Raises:
-        TypeError: NumPy has no such type.
-    """
-    if tensor.dtype is torch.bfloat16:
-        raise TypeError(
-            f"the policy's {name!r} is bfloat16, which NumPy has not: return it as float32, or its bits as "
-            "`.view(torch.int16)`"
-        )
-    return tensor.cpu().numpy()
-
-
 def _to_columns(batch: Batch) -> Columns:
-    return {name: to_array(name, value) for name, value in batch.items() if isinstance(value, torch.Tensor)}
+    return {name: value.cpu().numpy() for name, value in batch.items() if isinstance(value, torch.Tensor)}
 
 
 def _history_length(columns: Columns) -> int:

@@ -87,32 +87,11 @@ def register_agent(name: str) -> Callable[[AgentFactory], AgentFactory]:
     return AGENTS.register(name)
 
 
-def agent_names() -> list[str]:
-    """The valid values of `--algorithm.type`: those with an agent and a config."""
-    return sorted(AGENTS.keys() & RLAlgorithmConfig.get_known_choices().keys())
-
-
-def check_agent(name: str) -> None:
-    """Raise a ValueError that lists the valid names, unless `name` is one of them."""
-    if name not in AGENTS:
-        raise ValueError(
-            f"--algorithm.type must be one of {agent_names()}, got {name!r}. Register your own with "
-            "cronos_lerobot.agents.registry.register_agent, in a module named by --discover_packages_path."
-        )
-
-
-def check_reward(config: Any, reward: str) -> None:
-    """Raise a ValueError, if the agent makes no sense of this `--protocol.reward`, as its config says."""
-    check = getattr(config, "check_reward", None)
-    if check is not None:
-        check(reward)
-
-
 def make_agent(context: AgentContext) -> LearningAgent:
     """Return the agent of the context's config.
 
     Raises:
         ValueError: there is no agent of that name, or the policy cannot be trained by it.
     """
-    check_agent(context.config.type)
+    AGENTS.check(context.config.type)
     return AGENTS[context.config.type](context)

@@ -68,12 +68,7 @@ def train_in_float32(policy: Any, path: str | Path | None = None, revision: str 
 
 
 def check_precision(params: Iterable[torch.Tensor], config: Any, algorithm: str) -> None:
-    """Check that weights can hold the small steps of fine-tuning, and of an average.
-
-    Args:
-        params: those that are trained.
-        config: the policy's.
-        algorithm: its `--algorithm.type`.
+    """Check that the weights that are trained can hold the small steps of fine-tuning, and of an average.
 
     Raises:
         ValueError: some have fewer bits than float32.

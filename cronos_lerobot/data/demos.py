@@ -9,7 +9,7 @@ from lerobot.utils.constants import ACTION, DONE, REWARD
 from lerobot_env_cronos import CronosVectorEnv, Scene, Task
 from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW
 
-from cronos_lerobot.agents.actor import Actor
+from cronos_lerobot.agents.base import Actor
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.data.demo_starts import FREE_LAYOUTS, StartConfig, check_starts, other_tasks, tasks_before
 from cronos_lerobot.data.perturbations import (

@@ -19,10 +19,8 @@ from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 
-from cronos_lerobot.agents.actor import Actor, StreamSeed
-from cronos_lerobot.agents.base import ActionSample, Columns, samples
-from cronos_lerobot.agents.chunk_player import make_player
-from cronos_lerobot.agents.history import ObservationHistory, observation_steps
+from cronos_lerobot.agents.base import ActionSample, Actor, Columns, StreamSeed, observation_steps, samples
+from cronos_lerobot.agents.chunk_player import ObservationHistory, make_player
 from cronos_lerobot.agents.processing import PolicyProcessors, make_processors, observation_columns
 from cronos_lerobot.agents.steering.steered import with_steering
 from cronos_lerobot.agents.weights import train_in_float32

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from lerobot_env_cronos import STEPS_PER_TASK, Task
 
-from cronos_lerobot.agents.actor import Actor, StreamSeed
+from cronos_lerobot.agents.base import Actor, StreamSeed
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from lerobot_env_cronos import CronosVectorEnv
 from tqdm import tqdm
 
-from cronos_lerobot.agents.actor import Actor
+from cronos_lerobot.agents.base import Actor
 from cronos_lerobot.evaluation.actors import ExpertActor, load_actor
 from cronos_lerobot.evaluation.chains import Chain, ChainResult, ChainRunner
 from cronos_lerobot.evaluation.config import CronosEvalConfig, check_same

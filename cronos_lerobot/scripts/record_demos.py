@@ -25,7 +25,7 @@ from lerobot_env_cronos.episodic import find_task
 from lerobot_env_cronos.simulation.gl import RenderingError
 from tqdm import tqdm
 
-from cronos_lerobot.agents.actor import Actor
+from cronos_lerobot.agents.base import Actor
 from cronos_lerobot.command_line import parse_command_line
 from cronos_lerobot.data.demo_starts import check_starts
 from cronos_lerobot.data.demos import DemoCollector, DemoConfig, ExpertError, tasks_of

@@ -22,7 +22,7 @@ from lerobot_env_cronos.config import is_of_this_package
 
 from cronos_lerobot.agents import builtin  # noqa: F401  (registers the agents)
 from cronos_lerobot.agents.ppo.config import PPOConfig
-from cronos_lerobot.agents.registry import check_agent, check_reward
+from cronos_lerobot.agents.registry import AGENTS
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.resets import EXTRA_RESETS
 from cronos_lerobot.protocol.task_orders import TASK_ORDERS
@@ -205,10 +205,10 @@ def check(config: CronosTrainConfig) -> None:
     TASK_ORDERS.check(config.protocol.task_order)
     for name in config.protocol.extra_resets:
         EXTRA_RESETS.check(name)
-    check_agent(config.algorithm.type)
-    check_reward(config.algorithm, config.protocol.reward)
+    AGENTS.check(config.algorithm.type)
+    config.algorithm.check_reward(config.protocol.reward)
     if not config.checkpoint_path:
-        getattr(config.algorithm, "check_start", lambda: None)()
+        config.algorithm.check_start()
     check_configurations(config, load_benchmark(env.benchmark, env.scene), str(env.benchmark or env.scene))
     config.record.check(config.num_envs, env, config.protocol.task_switch_interval)
 

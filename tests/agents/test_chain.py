@@ -8,7 +8,7 @@ import torch
 from lerobot.policies.common.flow_matching import euler_integrate
 from torch import nn
 
-from cronos_lerobot.agents.adapters.chain import Scored, chain_log_prob, sample_chain
+from cronos_lerobot.agents.adapters.denoising import Scored, chain_log_prob, sample_chain
 from cronos_lerobot.agents.adapters.flow import FlowAdapter
 from cronos_lerobot.agents.adapters.registry import AdapterOptions
 

@@ -9,7 +9,7 @@ from test_diffusion_adapter import HORIZON, STEPS, make_batch, make_diffusion
 
 from cronos_lerobot.agents.adapters.diffusion import DiffusionAdapter
 from cronos_lerobot.agents.adapters.registry import AdapterOptions
-from cronos_lerobot.agents.history import ObservationHistory
+from cronos_lerobot.agents.chunk_player import ObservationHistory
 from cronos_lerobot.agents.processing import PolicyProcessors
 
 

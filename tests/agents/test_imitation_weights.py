@@ -8,9 +8,10 @@ import torch
 from tiny_pocketvla import make_pocketvla
 
 from cronos_lerobot.agents.imitation.batches import draw_batch, segment_batch
-from cronos_lerobot.agents.imitation.memory import Segment, SegmentMemory
-from cronos_lerobot.agents.imitation.weights import (
+from cronos_lerobot.agents.imitation.memory import (
     Remembered,
+    Segment,
+    SegmentMemory,
     by_advantage,
     by_return,
     discounted_returns,

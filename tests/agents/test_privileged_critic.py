@@ -5,7 +5,6 @@ import pytest
 import torch
 from tiny_vlas import STATE, make_batch, make_processors, make_vla
 
-from cronos_lerobot.agents.adapters import builtin  # noqa: F401 -- registers the adapters
 from cronos_lerobot.agents.adapters.privileged import FEATURES, PrivilegedCritic, text_vector
 from cronos_lerobot.agents.adapters.registry import AdapterOptions, make_trainable
 from cronos_lerobot.agents.processing import make_processors as around

@@ -15,9 +15,8 @@ from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.agents.registry import AgentContext
 from cronos_lerobot.agents.steering.agent import SteeringAgent
 from cronos_lerobot.agents.steering.config import SteeringConfig
-from cronos_lerobot.agents.steering.networks import NoiseActor, Whitening
 from cronos_lerobot.agents.steering.replay import ReplayMemory
-from cronos_lerobot.agents.steering.sac import SAC
+from cronos_lerobot.agents.steering.sac import SAC, NoiseActor, Whitening
 from cronos_lerobot.agents.steering.steered import SteeredPolicy, SteeringShape
 
 

@@ -17,7 +17,6 @@ from tiny_vlas import (
     make_vla,
 )
 
-from cronos_lerobot.agents.adapters import builtin  # noqa: F401 -- registers the adapters
 from cronos_lerobot.agents.adapters.registry import AdapterOptions, make_trainable
 from cronos_lerobot.agents.ppo.agent import PPOAgent
 from cronos_lerobot.agents.ppo.config import PPOConfig

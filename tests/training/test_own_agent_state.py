@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from runs import STEPS_PER_UPDATE, assert_same_run, config, make_trainer, resumed, train
 
-from cronos_lerobot.agents.ppo.agent import PPOAgent
-from cronos_lerobot.agents.ppo.factory import make_ppo_agent
+from cronos_lerobot.agents.ppo.agent import PPOAgent, make_ppo_agent
 from cronos_lerobot.agents.registry import AGENTS
 
 

@@ -10,18 +10,16 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor, nn
 from torch.distributions import Normal
 
-from cronos_lerobot.agents.adapters.registry import Adapter, AdapterOptions, Critic, register_adapter
+from cronos_lerobot.agents.adapters.registry import AdapterOptions, CriticAdapter, register_adapter
 from cronos_lerobot.agents.base import Batch
 from cronos_lerobot.agents.weights import unwrapped
 
-FEATURES = "features"
-"""What the critic reads, in a batch that `value_inputs` made."""
 LOG_STD_RANGE = (-5.0, 1.0)
 """Of the deviation's logarithm [nats]; where a step of the optimizer leads beyond, it ends there."""
 
 
 @register_adapter("act")
-class ACTAdapter(Adapter):
+class ACTAdapter(CriticAdapter):
     """A decision is the first n_action_steps of the chunk, each drawn around ACT's; a factor is one action.
 
     ACT's latent is 0, as when it acts. The deviation is one number for each action dimension, learned. The critic
@@ -36,7 +34,6 @@ class ACTAdapter(Adapter):
     """
 
     def __init__(self, policy: Any, options: AdapterOptions) -> None:
-        super().__init__(policy)
         config = policy.config
         if config.temporal_ensemble_coeff is not None:
             raise ValueError(
@@ -49,13 +46,12 @@ class ACTAdapter(Adapter):
                 f"--algorithm.noise_std must be {low} to {high} for --policy.type=act, which learns it between "
                 f"them, got {options.noise_std}."
             )
-        self.decision_steps = config.n_action_steps
-        self._vectors = [name for name in (OBS_STATE, OBS_ENV_STATE) if name in config.input_features]
-        width = config.dim_model + sum(config.input_features[name].shape[0] for name in self._vectors)
+        vectors = [name for name in (OBS_STATE, OBS_ENV_STATE) if name in config.input_features]
+        super().__init__(policy, config.dim_model + sum(config.input_features[name].shape[0] for name in vectors))
+        self.decision_steps, self._vectors = config.n_action_steps, vectors
         device = next(policy.parameters()).device
         std = torch.full(config.action_feature.shape, options.noise_std, device=device)
         self.log_std = nn.Parameter(std.log())
-        self.critic = Critic(width).to(device)
 
     def sample_actions(
         self, batch: Batch, *, temperature: float = 1.0, generator: torch.Generator | None = None
@@ -82,22 +78,14 @@ class ACTAdapter(Adapter):
             "value": self.critic(features),
         }
 
-    def predict_values(self, batch: Batch) -> Tensor:
-        """See `TrainablePolicy`."""
-        return self.critic(batch[FEATURES] if FEATURES in batch else self._forward(batch)[1])
+    def features(self, batch: Batch) -> Tensor:
+        """See `CriticAdapter`."""
+        return self._forward(batch)[1]
 
-    def value_inputs(self, batch: Batch) -> Batch:
-        """What the critic reads."""
-        return {FEATURES: self._forward(batch)[1]}
-
-    def rl_parameter_groups(self) -> list[dict[str, Any]]:
-        """What of ACT is trained, but not the encoder of its latent, which acting does not use; noise; critic."""
+    def policy_parameters(self) -> list[nn.Parameter]:
+        """What of ACT is trained, but not the encoder of its latent, which acting does not use; the noise."""
         named = self.policy.named_parameters()
-        policy = [p for name, p in named if p.requires_grad and ".vae_encoder" not in name]
-        return [
-            {"name": "policy", "params": [*policy, self.log_std]},
-            {"name": "value", "params": [*self.critic.parameters()]},
-        ]
+        return [*(p for name, p in named if p.requires_grad and ".vae_encoder" not in name), self.log_std]
 
     @property
     def _std(self) -> Tensor:

@@ -8,8 +8,7 @@ import torch
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
-from cronos_lerobot.agents.adapters.chain import Step
-from cronos_lerobot.agents.adapters.denoising import DenoisingAdapter
+from cronos_lerobot.agents.adapters.denoising import DenoisingAdapter, Step
 from cronos_lerobot.agents.adapters.registry import AdapterOptions, register_adapter
 from cronos_lerobot.agents.base import Batch
 
@@ -62,11 +61,6 @@ class DiffusionAdapter(DenoisingAdapter):
         """See `DenoisingAdapter`."""
         given = self.policy.diffusion._prepare_global_conditioning(self._with_history(batch))
         return given, given.detach()
-
-    @torch.no_grad()
-    def features(self, batch: Batch) -> Tensor:
-        """See `DenoisingAdapter`."""
-        return self.observe(batch)[1]
 
     def step(self, context: Tensor, temperature: float) -> Step:
         """The scheduler's steps; see above."""

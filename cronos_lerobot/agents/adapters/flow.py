@@ -22,8 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cronos_lerobot.agents.adapters.chain import Step, sample_chain, step_log_prob
-from cronos_lerobot.agents.adapters.denoising import DenoisingAdapter
+from cronos_lerobot.agents.adapters.denoising import DenoisingAdapter, Step, sample_chain, step_log_prob
 from cronos_lerobot.agents.adapters.registry import AdapterOptions
 
 
@@ -35,11 +34,11 @@ class FlowAdapter(DenoisingAdapter):
     differentiates J evaluations of the network instead of S - 1 (pi_RL's mixed steps).
 
     Args:
-        policy: the LeRobot policy, on its device.
+        policy: see `DenoisingAdapter`, as the others.
         options: of the noise.
-        shape: (H, D) of the chunk as the network sees it, with padded dimensions.
-        num_steps: S, as the policy's own integration has.
-        feature_width: F, of what the critic reads; None if the subclass has values of its own.
+        shape: (H, D) of the chunk.
+        num_steps: S.
+        feature_width: F.
 
     Raises:
         ValueError: noise at more steps than can have it.
@@ -55,16 +54,12 @@ class FlowAdapter(DenoisingAdapter):
         feature_width: int | None,
     ) -> None:
         super().__init__(policy, shape=shape, num_steps=num_steps, feature_width=feature_width)
-        if num_steps < 2:
-            raise ValueError(
-                "--policy.num_inference_steps must be at least 2 for PPO: the last step has no noise."
-            )
         self.noise_level = options.noise_level
         self.noise_steps = num_steps - 1 if options.noise_steps is None else options.noise_steps
-        if self.noise_steps >= num_steps:
+        if not 0 < self.noise_steps < num_steps:
             raise ValueError(
-                f"--algorithm.noise_steps must be at most {num_steps - 1}, got {self.noise_steps}: the policy has "
-                f"{num_steps} steps, the last without noise."
+                f"--algorithm.noise_steps must be 1 to {num_steps - 1}, got {self.noise_steps}: of the policy's "
+                f"{num_steps} steps (--policy.num_inference_steps) the last has no noise."
             )
 
     @abstractmethod

@@ -14,11 +14,7 @@ from cronos_lerobot.agents.base import Batch
 
 @register_adapter("pocketvla")
 class PocketVLAFlowAdapter(FlowAdapter):
-    """Values are the policy's own, and saved with it.
-
-    Args:
-        policy: a policy with `flow_context`, `flow_velocity` and `flow_values`, on its device.
-        options: of the noise.
+    """The policy has `flow_context`, `flow_velocity` and `flow_values`. Values are its own, and saved with it.
 
     Raises:
         ValueError: the policy has another head.

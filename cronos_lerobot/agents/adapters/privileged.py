@@ -13,15 +13,13 @@ import torch
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
-from cronos_lerobot.agents.adapters.registry import Adapter, Critic
+from cronos_lerobot.agents.adapters.registry import Adapter, CriticAdapter
 from cronos_lerobot.agents.base import Batch
 
-FEATURES = "features"
-"""What the critic reads, in a batch that `value_inputs` made."""
 TEXT_WIDTH = 32
 
 
-class PrivilegedCritic(Adapter):
+class PrivilegedCritic(CriticAdapter):
     """An adapter whose values are those of a critic on the privileged state (asymmetric; Pinto et al., 2018).
 
     The critic reads `observation.environment_state`, `observation.state` and the instruction: a vector for each of
@@ -36,16 +34,14 @@ class PrivilegedCritic(Adapter):
     """
 
     def __init__(self, adapter: Adapter, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        super().__init__(adapter.policy)
         if missing := {OBS_ENV_STATE, OBS_STATE} - shapes.keys():
             raise ValueError(
                 f"--algorithm.critic_observation=environment_state reads {', '.join(sorted(missing))}, which the "
                 f"environment does not show: --env.privileged_state=true does beside pixels."
             )
+        super().__init__(adapter.policy, shapes[OBS_ENV_STATE][0] + shapes[OBS_STATE][0] + TEXT_WIDTH)
         self.adapter: Any = adapter
         self.decision_steps, self.observation_steps = adapter.decision_steps, adapter.observation_steps
-        width = shapes[OBS_ENV_STATE][0] + shapes[OBS_STATE][0] + TEXT_WIDTH
-        self.critic = Critic(width).to(next(adapter.policy.parameters()).device)
 
     def sample_actions(self, batch: Batch, **options: Any) -> dict[str, Tensor]:
         """See `TrainablePolicy`; options are the adapter's own."""
@@ -58,18 +54,12 @@ class PrivilegedCritic(Adapter):
         evaluated = self.adapter.evaluate_actions(batch, trace, temperature=temperature)
         return evaluated | {"value": self.predict_values(batch)}
 
-    def predict_values(self, batch: Batch) -> Tensor:
-        """See `TrainablePolicy`."""
-        return self.critic(self.value_inputs(batch)[FEATURES])
-
-    def value_inputs(self, batch: Batch) -> Batch:
-        """What the critic reads; as it is, if that is what the batch holds."""
-        if FEATURES in batch:
-            return batch
+    def features(self, batch: Batch) -> Tensor:
+        """See `CriticAdapter`."""
         texts = np.stack([text_vector(self.adapter.instruction(text)) for text in batch["task"]])
         # Of a history the latest.
         vectors = [x[:, -1] if x.ndim > 2 else x for x in (batch[OBS_ENV_STATE], batch[OBS_STATE])]
-        return {FEATURES: torch.cat([*vectors, torch.from_numpy(texts).to(vectors[0])], dim=1)}
+        return torch.cat([*vectors, torch.from_numpy(texts).to(vectors[0])], dim=1)
 
     def rl_parameter_groups(self) -> list[dict[str, Any]]:
         """See `TrainablePolicy`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -11,6 +12,9 @@ from torch import Tensor, nn
 
 from cronos_lerobot.agents.base import Batch, missing_methods
 from cronos_lerobot.registry import Registry
+
+FEATURES = "features"
+"""What a critic reads, in a batch that `value_inputs` made."""
 
 
 class Critic(nn.Module):
@@ -47,8 +51,7 @@ class AdapterOptions:
     noise_level: float = 1.0
     """DDIM's eta of the denoising of a flow or diffusion policy, 0 (no noise) to 1 (that of DDPM)."""
     noise_steps: int | None = None
-    """At how many steps of a flow policy's denoising there is noise; None is all but the
-    last."""
+    """At how many steps of a flow policy's denoising there is noise; None is all but the last."""
 
 
 class Adapter(nn.Module):
@@ -95,6 +98,44 @@ class Adapter(nn.Module):
         """Go on with `own_parameters` of a checkpoint."""
         for name, param in self.own_parameters().items():
             param.copy_(parameters[name])
+
+
+class CriticAdapter(Adapter):
+    """An adapter with a critic of its own, whose loss does not train the policy.
+
+    Args:
+        policy: see `Adapter`.
+        feature_width: F, of what the critic reads; None if the subclass has values of another kind.
+    """
+
+    def __init__(self, policy: Any, feature_width: int | None) -> None:
+        super().__init__(policy)
+        if feature_width is not None:
+            self.critic = Critic(feature_width).to(next(policy.parameters()).device)
+
+    @abstractmethod
+    def features(self, batch: Batch) -> Tensor:
+        """Return what the critic reads (B, F), detached."""
+
+    def policy_parameters(self) -> list[nn.Parameter]:
+        """What the policy's loss trains."""
+        return [param for param in self.policy.parameters() if param.requires_grad]
+
+    @torch.no_grad()
+    def value_inputs(self, batch: Batch) -> Batch:
+        """What the critic reads; as it is, if that is what the batch holds."""
+        return batch if FEATURES in batch else {FEATURES: self.features(batch)}
+
+    def predict_values(self, batch: Batch) -> Tensor:
+        """See `TrainablePolicy`."""
+        return self.critic(self.value_inputs(batch)[FEATURES])
+
+    def rl_parameter_groups(self) -> list[dict[str, Any]]:
+        """See `TrainablePolicy`."""
+        return [
+            {"name": "policy", "params": self.policy_parameters()},
+            {"name": "value", "params": [*self.critic.parameters()]},
+        ]
 
 
 @runtime_checkable

@@ -12,19 +12,19 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from cronos_lerobot.agents.base import (
-    ActionSample,
-    Batch,
-    Columns,
-    LearningAgent,
-    samples,
-)
+from cronos_lerobot.agents.base import ActionSample, Batch, Columns, LearningAgent, observation_steps, samples
 from cronos_lerobot.agents.chunk_player import ChunkPlayer, SharedPlayer, make_player
-from cronos_lerobot.agents.history import observation_steps
 from cronos_lerobot.agents.imitation.batches import Demonstrations, draw_batch
 from cronos_lerobot.agents.imitation.config import ImitationConfig
-from cronos_lerobot.agents.imitation.memory import OpenSegments, SegmentMemory, own_share
-from cronos_lerobot.agents.imitation.weights import Remembered, by_advantage, by_return, effective_share
+from cronos_lerobot.agents.imitation.memory import (
+    OpenSegments,
+    Remembered,
+    SegmentMemory,
+    by_advantage,
+    by_return,
+    effective_share,
+    own_share,
+)
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.agents.registry import AgentContext, register_agent
 from cronos_lerobot.agents.weights import check_precision
@@ -159,11 +159,6 @@ class ImitationAgent(LearningAgent):
 
     def _make_player(self, generator: torch.Generator) -> ChunkPlayer | SharedPlayer:
         if not samples(self.policy):
-            if self.config.temperature != 1:
-                raise ValueError(
-                    f"--algorithm.temperature={self.config.temperature} is not for --policy.type="
-                    f"{self.policy.config.type}, which does not sample at a temperature."
-                )
             return make_player(self.policy, self._processors)
 
         def plan(columns: Columns, instructions: list[str]) -> Tensor:

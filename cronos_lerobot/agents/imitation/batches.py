@@ -114,28 +114,21 @@ def _check_columns(config: DemosConfig, policy: PreTrainedConfig, features: Mapp
     Images may have another size than the policy's own: policies scale them.
     """
     # LeRobot adds a camera that no dataset has, and the policy makes its picture.
-    taken = {
-        name: feature
-        for name, feature in (policy.input_features or {}).items()
-        if not name.startswith(EMPTY_CAMERA)
-    }
-    wanted = {*taken, ACTION}
-    if policy.reward_delta_indices is not None:
-        wanted.add(REWARD)
+    inputs = policy.input_features or {}
+    taken = {name: feature for name, feature in inputs.items() if not name.startswith(EMPTY_CAMERA)}
+    wanted = {*taken, ACTION} | ({REWARD} if policy.reward_delta_indices is not None else set())
     if missing := sorted(wanted - features.keys()):
         raise ValueError(
             f"--algorithm.demos.repo_id={config.repo_id} has no {', '.join(missing)}, which the policy reads; "
             f"it has {sorted(features)}."
         )
     for name, feature in sorted(taken.items()):
-        if name.startswith(OBS_IMAGES) or feature is None:
-            continue
-        wants, has = tuple(feature.shape), tuple(features[name]["shape"])
-        if wants != has:
+        has = tuple(features[name]["shape"])
+        if feature is not None and not name.startswith(OBS_IMAGES) and tuple(feature.shape) != has:
             raise ValueError(
-                f"--algorithm.demos.repo_id={config.repo_id} has {name} of shape {has}, the policy takes {wants}: "
-                "record the demonstrations with the environment of the run, as with its --env.scene and "
-                "--env.task_observation."
+                f"--algorithm.demos.repo_id={config.repo_id} has {name} of shape {has}, the policy takes "
+                f"{feature.shape}: record the demonstrations with the environment of the run, as with its "
+                "--env.scene and --env.task_observation."
             )
     return wanted
 

@@ -9,13 +9,15 @@ import numpy as np
 import torch
 from torch.optim import Optimizer
 
-from cronos_lerobot.agents.adapters.registry import Adapter
-from cronos_lerobot.agents.base import Columns
+from cronos_lerobot.agents.adapters.privileged import PrivilegedCritic
+from cronos_lerobot.agents.adapters.registry import Adapter, AdapterOptions, make_trainable
+from cronos_lerobot.agents.base import Columns, decision_steps
 from cronos_lerobot.agents.decisions import DecidingAgent, Decision
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
-from cronos_lerobot.agents.processing import observation_columns, to_array
+from cronos_lerobot.agents.processing import observation_columns
+from cronos_lerobot.agents.registry import AgentContext, register_agent
 from cronos_lerobot.agents.state import map_leaves
 from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.stopwatch import Stopwatch
@@ -28,8 +30,7 @@ class PPOAgent(DecidingAgent):
         ppo: holds the policy, its processors and the optimizer.
         buffer: holds the decisions since the last update.
         generator: draws the actions.
-        stopwatch: see `DecidingAgent`.
-        streams: see `DecidingAgent`.
+        stopwatch: see `DecidingAgent`, as `streams`.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class PPOAgent(DecidingAgent):
             encoded = {name: column.copy() for name, column in encoded.items()}
         return Decision(
             actions=processors.physical_actions(actions.flatten(0, 1)).reshape(actions.shape),
-            trace=to_array("trace", sample["trace"]),
+            trace=sample["trace"].cpu().numpy(),
             log_prob=sample["log_prob"].float().cpu().numpy(),
             value=sample["value"].float().cpu().numpy(),
             inputs=encoded,
@@ -133,12 +134,45 @@ class PPOAgent(DecidingAgent):
         self.buffer.load_state_dict(state["rollout"], self.streams)
 
 
+@register_agent("ppo")
+@register_agent("ppo_paper")
+def make_ppo_agent(context: AgentContext) -> PPOAgent:
+    """Return the agent.
+
+    Raises:
+        ValueError: the policy does not say how likely its decisions were, decides beyond a task switch, or has a
+            critic of its own where the config asks for a privileged one.
+    """
+    config = context.config
+    options = AdapterOptions(config.noise_std, config.noise_level, config.noise_steps)
+    policy = make_trainable(context.policy, options)
+    if config.critic_observation == "environment_state":
+        policy = _with_privileged_critic(policy, context)
+    if isinstance(policy, Adapter):
+        context.ranks.copy_from_main([*policy.own_parameters().values()])
+    mine = context.streams
+    # Every process draws its own minibatches and actions.
+    ppo = PPO(policy, context.processors, config, context.rng("minibatches"), context.ranks)
+    steps = decision_steps(policy, context.task_switch_interval)
+    buffer = RolloutBuffer(context.update_interval // steps, mine.stop - mine.start)
+    return PPOAgent(ppo, buffer, context.torch_rng("actions"), context.stopwatch, mine)
+
+
+def _with_privileged_critic(policy: Any, context: AgentContext) -> PrivilegedCritic:
+    if not isinstance(policy, Adapter):
+        raise ValueError(
+            f"--algorithm.critic_observation is for policies without a critic; --policy.type={policy.config.type} "
+            "has its own, and perhaps a --policy.critic_observation."
+        )
+    return PrivilegedCritic(policy, context.observation_shapes)
+
+
 def join_rollouts(rollout: dict[str, Any], ranks: Ranks) -> dict[str, Any]:
     """The rollouts of all processes as one, in the first of them; they number instructions each in its own way.
 
     Args:
         rollout: of `RolloutBuffer.state_dict`, as long in every process.
-        processes: all call it.
+        ranks: all call it.
     """
     if not rollout:
         return {}

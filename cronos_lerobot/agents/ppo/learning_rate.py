@@ -36,10 +36,6 @@ class AdaptiveLR:
 
     A KL divergence says something of the learning rate only after a step with a gradient: until there was one in
     an update, the learning rate holds.
-
-    Args:
-        optimizer: with a group named `policy`.
-        config: see PPOConfig.
     """
 
     def __init__(self, optimizer: Optimizer, config: PPOConfig) -> None:

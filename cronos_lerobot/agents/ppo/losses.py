@@ -1,10 +1,14 @@
-"""What PPO minimises (Schulman et al., 2017), and what it measures."""
+"""What PPO minimises (Schulman et al., 2017), the policy that it holds on to, and what it measures."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.func import functional_call
 from torch.nn.functional import huber_loss
 
 from cronos_lerobot.agents.ppo.config import PPOConfig
@@ -48,15 +52,10 @@ def approximate_kl(log_ratio: Tensor) -> Tensor:
 
 
 def kl_to_base(new_log_prob: Tensor, old_log_prob: Tensor, base_log_prob: Tensor) -> Tensor:
-    """KL(new || base) from samples of old, (B,), never negative [nats].
+    """KL(new || base) from samples of old, (B,), never negative [nats]; of log-probabilities (B,).
 
     With r = new / old and s = base / new it is r ((s - 1) - log s): its mean over samples of old is the
     divergence, and the mean of its gradient r (log new - log base) grad log new is the divergence's gradient.
-
-    Args:
-        new_log_prob: (B,) of the policy that is trained, differentiable.
-        old_log_prob: (B,) of the policy that drew the samples.
-        base_log_prob: (B,) of the policy that is held on to.
     """
     ratio = bounded_log_ratio(new_log_prob, old_log_prob).exp()
     return ratio * approximate_kl(bounded_log_ratio(base_log_prob, new_log_prob))
@@ -111,3 +110,53 @@ class UpdateMetrics:
 
     def _means(self) -> dict[str, float]:
         return {name: total / self._weights[name] for name, total in self._sums.items()}
+
+
+class BasePolicy:
+    """The policy that a run began with; it shares all buffers and what is not trained with what it is now.
+
+    Args:
+        policy: a TrainablePolicy.
+        params: those of its parameters that will be trained and that the actions depend on; copied.
+
+    Attributes:
+        parameters: the copies by the policy's names of them; a checkpoint holds them.
+    """
+
+    def __init__(self, policy: nn.Module, params: Sequence[Tensor]) -> None:
+        wanted = {id(param) for param in params}
+        own = {name: param for name, param in policy.named_parameters() if id(param) in wanted}
+        self.parameters = {name: param.detach().clone() for name, param in own.items()}
+        names = {id(param): name for name, param in own.items()}
+        self._evaluate = _Evaluate(policy)
+        # Each attribute of each module once, whatever names it has: a policy may stand twice within its adapters,
+        # and swapping it twice would put the copies back in the end.
+        self._attributes = {
+            f"{module_name}.{name}": names[id(param)]
+            for module_name, module in self._evaluate.named_modules()
+            for name, param in module.named_parameters(recurse=False, remove_duplicate=False)
+            if id(param) in wanted
+        }
+
+    @torch.no_grad()
+    def log_prob(self, batch: Any, trace: Tensor, temperature: float) -> Tensor:
+        """Log-probability of decisions, (B,) or (B, L) [nats]."""
+        parameters = {attribute: self.parameters[name] for attribute, name in self._attributes.items()}
+        arguments = (batch, trace, temperature)
+        return functional_call(self._evaluate, parameters, arguments, tie_weights=False)
+
+    def load(self, parameters: dict[str, Tensor]) -> None:
+        """Go on with the parameters of a checkpoint."""
+        for name, param in self.parameters.items():
+            param.copy_(parameters[name])
+
+
+class _Evaluate(nn.Module):
+    """`functional_call` calls `forward`."""
+
+    def __init__(self, policy: Any) -> None:
+        super().__init__()
+        self.policy: Any = policy
+
+    def forward(self, batch: Any, trace: Tensor, temperature: float) -> Tensor:
+        return self.policy.evaluate_actions(batch, trace, temperature=temperature)["log_prob"]

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from cronos_lerobot.agents.base import Columns
-from cronos_lerobot.agents.ppo.base_policy import BasePolicy
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.ppo.learning_rate import AdaptiveLR, target_kl
 from cronos_lerobot.agents.ppo.losses import (
+    BasePolicy,
     UpdateMetrics,
     approximate_kl,
     bounded_log_ratio,
@@ -61,7 +61,7 @@ class PPO:
         processors: from stored observations to the policy's batches.
         config: see PPOConfig.
         rng: draws the order of the minibatches.
-        processes: each learns from its own rollout, in minibatches of its own; they take every optimizer step
+        ranks: each process learns from its own rollout, in minibatches of its own; they take every optimizer step
             together, with the mean of their gradients. Their rollouts have the same size.
 
     Raises:
@@ -87,8 +87,6 @@ class PPO:
         self._params: dict[str, list[Tensor]] = {"policy": [], "value": []}
         groups = policy.rl_parameter_groups()
         for group in groups:
-            if group["name"] not in lrs:
-                raise ValueError(f"Parameter groups are named {sorted(lrs)}, got {group['name']!r}.")
             group["lr"] = lrs[group["name"]]
             group["params"] = [p for p in group["params"] if p.requires_grad]
             self._params[group["name"]] += group["params"]

@@ -141,11 +141,9 @@ class RolloutBuffer:
             intervened: (N,) bool or one, a person or a script acted at any of them.
 
         Raises:
-            RuntimeError: the buffer is full.
+            IndexError: the buffer is full.
             TypeError: a column has another type than in the rows before.
         """
-        if self.rows == self.num_rows:
-            raise RuntimeError(f"The rollout buffer is full: it holds {self.num_rows} rows; update and clear it.")
         if self.traces is None:
             self._allocate(decision)
         assert self.traces is not None

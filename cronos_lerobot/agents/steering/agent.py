@@ -16,10 +16,14 @@ from cronos_lerobot.agents.decisions import DecidingAgent, Decision
 from cronos_lerobot.agents.registry import AgentContext, register_agent
 from cronos_lerobot.agents.state import map_leaves
 from cronos_lerobot.agents.steering.config import SteeringConfig
-from cronos_lerobot.agents.steering.observation import feature_width, resolve_observation
 from cronos_lerobot.agents.steering.replay import ReplayMemory
 from cronos_lerobot.agents.steering.sac import SAC
-from cronos_lerobot.agents.steering.steered import SteeredPolicy, SteeringShape
+from cronos_lerobot.agents.steering.steered import (
+    SteeredPolicy,
+    SteeringShape,
+    feature_width,
+    resolve_observation,
+)
 
 
 @register_agent("steering")

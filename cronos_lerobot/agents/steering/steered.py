@@ -9,18 +9,19 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from lerobot.utils.hub import HubMixin
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from cronos_lerobot.agents.adapters import builtin as _builtin  # noqa: F401 -- registers them
+from cronos_lerobot.agents.adapters.privileged import text_vector
 from cronos_lerobot.agents.adapters.registry import make_steerable
-from cronos_lerobot.agents.base import Batch
-from cronos_lerobot.agents.history import observation_steps
-from cronos_lerobot.agents.steering.networks import NoiseActor, Whitening
-from cronos_lerobot.agents.steering.observation import state_features
+from cronos_lerobot.agents.base import Batch, Columns, observation_steps
+from cronos_lerobot.agents.processing import PolicyProcessors
+from cronos_lerobot.agents.steering.sac import NoiseActor, Whitening
 
 STEERING = "steering.safetensors"
 """The actor, beside the policy in `pretrained_model`. LeRobot does not look at it and plays the frozen policy."""
@@ -127,3 +128,58 @@ def with_steering(policy: Any, folder: Path | None) -> Any:
         raise ValueError(f"{path} is damaged, or of another policy: {error}") from error
     logging.info(f"The actor in {path} chooses the policy's noise; LeRobot's own commands play it without.")
     return steered
+
+
+def resolve_observation(observation: str, policy: Any) -> str:
+    """Return `policy` or `state` for a SteeringConfig's observation.
+
+    Raises:
+        ValueError: `state` of a policy that observes no vector.
+    """
+    vectors = vector_names(policy)
+    if observation == "auto":
+        return "state" if OBS_ENV_STATE in vectors else "policy"
+    if observation == "state" and not vectors:
+        raise ValueError(
+            f"--algorithm.observation=state needs a policy that observes {OBS_STATE} or {OBS_ENV_STATE}, this one "
+            f"observes {sorted(policy.input_features or {})}: give --algorithm.observation=policy."
+        )
+    return observation
+
+
+def vector_names(policy: Any) -> list[str]:
+    """The vectors that a policy observes, by LeRobot's names."""
+    return [name for name in (OBS_STATE, OBS_ENV_STATE) if name in (policy.input_features or {})]
+
+
+def state_features(steerable: Any, batch: Batch) -> Tensor:
+    """The vectors that a policy observes and its instructions, (B, F) float32.
+
+    Args:
+        steerable: the policy or its adapter.
+        batch: preprocessed.
+    """
+    vectors = [batch[name].flatten(1).float() for name in vector_names(steerable.config)]
+    instruction = getattr(steerable, "instruction", str)
+    texts = np.stack([text_vector(instruction(text)) for text in batch["task"]])
+    return torch.cat([*vectors, torch.from_numpy(texts).to(vectors[0].device)], 1)
+
+
+@torch.inference_mode()
+def feature_width(observation: str, steerable: Any, processors: PolicyProcessors) -> int:
+    """F, the width of what `observation` names, found by showing the policy nothing."""
+    batch = processors.batch(blank_columns(steerable), ["put it there"])
+    features = state_features(steerable, batch) if observation == "state" else steerable.observe(batch)[1]
+    return features.shape[1]
+
+
+def blank_columns(policy: Any) -> Columns:
+    """One observation in which there is nothing: zeros (1, ...) for all that `policy` reads."""
+    columns: Columns = {}
+    history = (steps,) if (steps := observation_steps(policy)) > 1 else ()
+    for name, feature in (policy.config.input_features or {}).items():
+        shape, kind = feature.shape, np.float32
+        if name.startswith(OBS_IMAGES):
+            shape, kind = (*shape[1:], shape[0]), np.uint8
+        columns[name] = np.zeros((1, *history, *shape), kind)
+    return columns

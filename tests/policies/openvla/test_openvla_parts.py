@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 from lerobot_policy_openvla.action_statistics import ActionStatisticsProcessorStep, choose_statistics
-from lerobot_policy_openvla.action_tokens import ActionTokenizer
+from lerobot_policy_openvla.action_tokens import ActionTokenizer, TokenDistribution
 from lerobot_policy_openvla.architecture import Architecture
-from lerobot_policy_openvla.distribution import TokenDistribution
 from lerobot_policy_openvla.images import centre_crop, prepare_images
 from lerobot_policy_openvla.prompt import PromptTokenizer
 from PIL import Image
@@ -81,8 +80,6 @@ def test_dimensions_that_never_change():
     # Recorded with LeRobot: what the arm did not do is 0, what the gripper did not do stays as it was.
     same = {"action": {side: np.array([0.25, 1.0]) for side in ("min", "max", "q01", "q99")}}
     assert choose_statistics("dataset", {}, same)["unused"] == [True, False]
-    with pytest.raises(ValueError, match=r"dimension 0: q01 1\.0 must not be above q99 0\.5"):
-        ActionStatisticsProcessorStep(q01=[1.0], q99=[0.5], mask=[True])
 
 
 def test_prompt(published):
@@ -145,5 +142,3 @@ def test_quantiles_of_the_distribution():
     greedy = TokenDistribution(LOGITS.repeat(6, 1), slice(3, 6), 0.0)
     assert greedy.quantile(uniform).tolist() == [5] * 6
     assert greedy.log_prob(torch.full((6, 1), 5)).tolist() == [0.0] * 6
-    with pytest.raises(ValueError, match="temperature"):
-        greedy.log_probs()

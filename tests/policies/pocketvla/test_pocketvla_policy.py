@@ -72,7 +72,7 @@ def test_a_privileged_critic_is_not_asked_for_actions():
     torch.testing.assert_close(
         policy.select_action(blind, temperature=0.0), policy.select_action(batch, temperature=0.0)
     )
-    with pytest.raises(ValueError, match=r"observation\.environment_state"):
+    with pytest.raises(KeyError, match=r"observation\.environment_state"):
         policy.predict_values(blind)
     moved = batch | {"observation.environment_state": batch["observation.environment_state"] + 1}
     assert not torch.allclose(policy.predict_values(moved), policy.predict_values(batch))

@@ -41,8 +41,6 @@ def choose_statistics(
     if key not in published:
         raise ValueError(f"unnorm_key={key!r} is not one of {sorted(published)}, nor is it {DATASET!r}")
     entry = published[key]
-    if missing := [side for side in ("q01", "q99") if side not in entry]:
-        raise ValueError(f"the action statistics {key!r} lack {missing}; they have {sorted(entry)}")
     mask = entry.get("mask", [True] * len(entry["q01"]))
     return _statistics(key, entry, ("q01", "q99"), [bool(m) for m in mask])
 
@@ -77,9 +75,6 @@ class ActionStatisticsProcessorStep(ProcessorStep):
 
     A step of its own, not statistics of LeRobot's normaliser: `lerobot-train --policy.path` replaces those by the
     new data set's, and the bins would come to mean other actions.
-
-    Raises:
-        ValueError: the statistics differ in length, q01 is above q99, or an action has another width.
     """
 
     q01: list[float] = field(default_factory=list)
@@ -94,19 +89,8 @@ class ActionStatisticsProcessorStep(ProcessorStep):
     """False: physical to normalised (preprocessor). True: normalised to physical (postprocessor)."""
 
     def __post_init__(self) -> None:
-        """Check the statistics at once."""
-        if not len(self.q01) == len(self.q99) == len(self.mask) > 0:
-            raise ValueError(
-                "q01, q99 and mask need one entry a dimension, got "
-                f"{len(self.q01)}, {len(self.q99)} and {len(self.mask)}"
-            )
-        if not self.unused:
-            self.unused = [False] * len(self.q01)
-        if len(self.unused) != len(self.q01):
-            raise ValueError(f"unused needs {len(self.q01)} entries, one a dimension, got {len(self.unused)}")
-        for dim, (low, high, mapped) in enumerate(zip(self.q01, self.q99, self.mask, strict=True)):
-            if mapped and not low <= high:
-                raise ValueError(f"action dimension {dim}: q01 {low} must not be above q99 {high}")
+        """Fill in what is not given."""
+        self.unused = self.unused or [False] * len(self.q01)
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Convert the transition's action, if it has one."""
@@ -122,8 +106,6 @@ class ActionStatisticsProcessorStep(ProcessorStep):
 
         A dimension with q01 = q99 comes back as that constant, whatever its token.
         """
-        if action.shape[-1] != len(self.q01):
-            raise ValueError(f"action has {action.shape[-1]} dimensions, the statistics have {len(self.q01)}")
         action = action.float()
         low, high = (
             torch.tensor(side, dtype=torch.float32, device=action.device) for side in (self.q01, self.q99)

@@ -61,7 +61,7 @@ class Architecture:
         with; without the file they are ImageNet's for the first tower and 0.5 for the second.
 
         Raises:
-            ValueError: it is another kind of network, or a field is missing.
+            ValueError: it is another kind of network.
         """
         for name, value in SUPPORTED.items():
             if config.get(name, value) != value or "model_type" not in config:
@@ -72,9 +72,6 @@ class Architecture:
                     f"preprocessor_config.json has {name}={preprocessor[name]!r}; only {value!r} is supported: "
                     "images would not be what the network was trained with."
                 )
-        needed = ("timm_model_ids", "image_sizes", "text_config", "n_action_bins", "pad_to_multiple_of")
-        if missing := [name for name in needed if name not in config]:
-            raise ValueError(f"config.json of the checkpoint lacks {missing}.")
         sizes = set(config["image_sizes"])
         if len(sizes) != 1 or len(config["timm_model_ids"]) != 2:
             raise ValueError(

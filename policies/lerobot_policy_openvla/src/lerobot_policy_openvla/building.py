@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 import torch
+from torch import nn
 
 from lerobot_policy_openvla.adapters import add_lora, linear_names, load_adapter
 from lerobot_policy_openvla.architecture import Architecture
 from lerobot_policy_openvla.checkpoint import read_checkpoint
 from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
-from lerobot_policy_openvla.network import OpenVLANetwork
-from lerobot_policy_openvla.network_loading import load_network
+from lerobot_policy_openvla.network import OpenVLANetwork, load_network
 from lerobot_policy_openvla.prompt import PromptTokenizer
-from lerobot_policy_openvla.quantization import quantize
 
 
 def resolve_dtype(config: OpenVLAConfig) -> torch.dtype:
@@ -24,13 +24,8 @@ def resolve_dtype(config: OpenVLAConfig) -> torch.dtype:
 
 
 def build(config: OpenVLAConfig) -> tuple[OpenVLANetwork, PromptTokenizer]:
-    """Return the network and the tokenizer as `config` asks for them.
-
-    Raises:
-        ValueError: the config names no checkpoint.
-    """
-    if config.checkpoint is None:
-        raise ValueError("choose the weights to build on: --policy.checkpoint=openvla/openvla-7b")
+    """Return the network and the tokenizer as `config` asks for them."""
+    assert config.checkpoint is not None
     checkpoint = read_checkpoint(config.checkpoint, config.checkpoint_revision)
     device = config.device or "cpu"
     # What is to be quantised waits in ordinary memory: a GPU that needs it may not hold it as it is.
@@ -71,3 +66,35 @@ def architecture_of(config: OpenVLAConfig) -> Architecture:
     fields: dict[str, Any] | None = config.architecture
     assert fields is not None
     return Architecture.from_dict(fields)
+
+
+def quantize(network: OpenVLANetwork, kind: str, device: str | torch.device) -> None:
+    """Replace the linear layers of Llama's blocks, which are most of the network, by frozen quantised ones.
+
+    Args:
+        network: on any device; it ends on `device`.
+        kind: `int8` (LLM.int8) or `nf4` (QLoRA's 4-bit format).
+        device: where the layers are quantised.
+
+    Raises:
+        ImportError: bitsandbytes is not installed.
+    """
+    library = import_module("bitsandbytes")
+    blocks = network.language_model.model.layers
+    for name, layer in [(n, m) for n, m in blocks.named_modules() if isinstance(m, nn.Linear)]:
+        blocks.set_submodule(name, _quantized(library, layer, kind).to(device))
+    network.to(device)
+
+
+def _quantized(library: Any, layer: nn.Linear, kind: str) -> nn.Module:
+    sizes: tuple[int, int] = (layer.in_features, layer.out_features)
+    weight, dtype = layer.weight.detach(), layer.weight.dtype
+    if kind == "int8":
+        with torch.device("meta"):
+            new = library.nn.Linear8bitLt(*sizes, bias=False, has_fp16_weights=False)
+        new.weight = library.nn.Int8Params(weight, requires_grad=False, has_fp16_weights=False)
+    else:
+        with torch.device("meta"):
+            new = library.nn.Linear4bit(*sizes, bias=False, compute_dtype=dtype, quant_type="nf4")
+        new.weight = library.nn.Params4bit(weight, requires_grad=False, quant_type="nf4")
+    return new

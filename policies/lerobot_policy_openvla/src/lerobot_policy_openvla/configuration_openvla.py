@@ -113,12 +113,6 @@ class OpenVLAConfig(PreTrainedConfig):
                 raise ValueError(f"{name}={getattr(self, name)} must be at least {least}")
         if self.merge_adapter and not self.adapter:
             raise ValueError("merge_adapter=true adds an adapter to the weights: give it as adapter")
-        if self.lora_alpha is not None and not (self.lora_rank and self.lora_alpha > 0):
-            raise ValueError(
-                f"lora_alpha={self.lora_alpha} must be above 0, beside a lora_rank above 0, got {self.lora_rank}"
-            )
-        if not 0 <= self.lora_dropout < 1:
-            raise ValueError(f"lora_dropout={self.lora_dropout} must be at least 0 and below 1")
         if self.adapter and not self.merge_adapter and self.lora_rank:
             raise ValueError(
                 f"lora_rank={self.lora_rank} makes fresh adapters beside {self.adapter!r}: train that one further "

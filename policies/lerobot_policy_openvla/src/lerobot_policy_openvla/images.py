@@ -51,12 +51,7 @@ def prepare_images(images: Tensor, architecture: Architecture, crop: bool) -> Te
         images: uint8, or floats in [0, 1].
         architecture: tells the size and the normalisation of each tower.
         crop: keep the middle only, see `centre_crop`; otherwise see `resize`.
-
-    Raises:
-        ValueError: the shape is another one.
     """
-    if images.ndim != 4 or images.shape[1] != 3:
-        raise ValueError(f"Images must be (B, 3, height, width), got {tuple(images.shape)}.")
     levels = images if images.dtype == torch.uint8 else images.float() * 255
     pixels = (centre_crop if crop else resize)(levels, architecture.image_size) / 255
     towers = []

@@ -15,15 +15,14 @@ from lerobot.utils.constants import ACTION, OBS_STR
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
-from lerobot_policy_openvla.action_tokens import ActionTokenizer
+from lerobot_policy_openvla.action_tokens import ActionTokenizer, TokenDistribution
 from lerobot_policy_openvla.adapters import has_adapter, is_adapter_tensor, linear_names, save_adapter
 from lerobot_policy_openvla.building import architecture_of, build, resolve_dtype
 from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
-from lerobot_policy_openvla.distribution import TokenDistribution
 from lerobot_policy_openvla.images import prepare_images
 from lerobot_policy_openvla.loading import config_for, load_saved_tensors
+from lerobot_policy_openvla.network import ValueHead
 from lerobot_policy_openvla.sequence import Prompts, generate_actions, prompt_hidden, score_actions
-from lerobot_policy_openvla.value_head import ValueHead
 
 Batch = Mapping[str, Any]
 """A batch after the preprocessor: `observation.images.<camera>` (B, 3, H, W), uint8 or floats in [0, 1]; `task`,
@@ -94,9 +93,7 @@ class OpenVLAPolicy(PreTrainedPolicy):
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.dtype == torch.bfloat16)
 
     def _prompts(self, batch: Batch) -> Prompts:
-        texts = batch.get("task")
-        if texts is None:
-            raise ValueError(f"the batch lacks 'task', the instructions; it has {sorted(batch)}")
+        texts = batch["task"]
         texts = [texts] if isinstance(texts, str) else texts
         return Prompts.of([self.prompt_tokenizer(text) for text in texts], self.device)
 
@@ -105,10 +102,7 @@ class OpenVLAPolicy(PreTrainedPolicy):
         if FEATURES in batch:
             kept = batch[FEATURES]
             return kept.view(torch.bfloat16) if kept.dtype == torch.int16 else kept
-        camera = self.config.camera
-        if camera not in batch:
-            raise ValueError(f"the batch lacks {camera!r}; it has {sorted(batch)}")
-        pixels = prepare_images(batch[camera], self.architecture, self.config.center_crop)
+        pixels = prepare_images(batch[self.config.camera], self.architecture, self.config.center_crop)
         with nullcontext() if self._trains_vision else torch.no_grad():
             return self.network.vision_backbone(pixels.to(self.dtype))
 
@@ -242,13 +236,7 @@ class OpenVLAPolicy(PreTrainedPolicy):
         self.prompt_tokenizer.save(save_directory)
 
     def save_adapter(self, folder: Path) -> None:
-        """Write the LoRA adapter in PEFT's format, under the names of the published model class.
-
-        Raises:
-            ValueError: there is no adapter.
-        """
-        if not has_adapter(self.network):
-            raise ValueError("the policy has no LoRA adapter to save; it is made with --policy.lora_rank=32")
+        """Write the LoRA adapter, if there is one, in PEFT's format, by the names of the published model class."""
         save_adapter(self.network, folder, self.config.checkpoint)
 
     # What an actor-critic trainer needs (structurally; nothing is imported from it).

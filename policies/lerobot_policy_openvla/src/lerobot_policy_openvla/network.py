@@ -1,19 +1,35 @@
-"""The network: two vision towers, a projector and Llama, under the names of the published checkpoints."""
+"""The network and its weights: two vision towers, a projector and Llama, by the names of published checkpoints.
+
+It needs timm, which takes seconds to import.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Generator
+import re
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import timm
 import torch
+from accelerate import init_empty_weights
+from accelerate.utils import set_module_tensor_to_device
+from safetensors import safe_open
 from timm.models import VisionTransformer
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 from transformers import LlamaConfig, LlamaForCausalLM
 
 from lerobot_policy_openvla.architecture import Architecture
+from lerobot_policy_openvla.checkpoint import WEIGHTS, WEIGHTS_INDEX, Checkpoint, read_json, timm_name
+
+UNUSED = re.compile(
+    r"vision_backbone\.(fused_)?featurizer\.(norm|fc_norm|head|attn_pool)\.|.*rotary_emb\.inv_freq$"
+)
+"""Published tensors that come after what the network looks at, or that are computed."""
+VISION_BLOCK = re.compile(r"vision_backbone\.(featurizer|fused_featurizer)\.blocks\.(\d+)\.")
+VALUE_WIDTHS = (512, 128)
 
 
 def depth_of(tower: Any) -> int:
@@ -43,8 +59,6 @@ class VisionTower(nn.Module):
             tower.attn_pool = None
             towers.append(tower)
         self.featurizer, self.fused_featurizer = towers
-        if self.featurizer.patch_embed.num_patches != self.fused_featurizer.patch_embed.num_patches:
-            raise ValueError(f"The towers {architecture.timm_model_ids} cut an image into different patches.")
 
     @property
     def width(self) -> int:
@@ -129,3 +143,78 @@ class OpenVLANetwork(nn.Module):
         finally:
             for layer, mode in zip(layers, modes, strict=True):
                 layer.training = mode
+
+
+class ValueHead(nn.Module):
+    """The critic: three layers with GELU between, float32, zero at the start.
+
+    Args:
+        width: of the hidden state where the first action token is predicted.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        first, second = VALUE_WIDTHS
+        out = nn.Linear(second, 1)
+        nn.init.zeros_(out.weight)
+        nn.init.zeros_(out.bias)
+        self.layers = nn.Sequential(nn.Linear(width, first), nn.GELU(), nn.Linear(first, second), nn.GELU(), out)
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        """Hidden states (B, width) to values (B,)."""
+        return self.layers(hidden.float()).squeeze(-1)
+
+
+def empty_network(architecture: Architecture, attention: str) -> OpenVLANetwork:
+    """Return a network whose parameters take no memory yet."""
+    with init_empty_weights(include_buffers=False):
+        return OpenVLANetwork(architecture, attention)
+
+
+def load_network(
+    checkpoint: Checkpoint, attention: str, dtype: torch.dtype, device: str | torch.device
+) -> OpenVLANetwork:
+    """Return the checkpoint's network in evaluation mode.
+
+    One tensor at a time goes from the files to the device, so there is never a second copy in memory.
+
+    Raises:
+        ValueError: names or shapes in the files are not those of the network.
+    """
+    network = empty_network(checkpoint.architecture, attention)
+    missing = dict(network.state_dict())
+    for name, tensor in _tensors(checkpoint):
+        if _is_unused(name, network):
+            continue
+        expected = missing.pop(name, None)
+        if expected is None or expected.shape != tensor.shape:
+            shape = "no such tensor" if expected is None else tuple(expected.shape)
+            raise ValueError(f"{checkpoint.folder} has {name} {tuple(tensor.shape)}, the network has {shape}.")
+        set_module_tensor_to_device(network, name, device, tensor, dtype=dtype)
+    if missing:
+        raise ValueError(f"{checkpoint.folder} lacks {len(missing)} tensors: {sorted(missing)[:5]} ...")
+    return network.to(device).eval()
+
+
+def _tensors(checkpoint: Checkpoint) -> Iterator[tuple[str, Tensor]]:
+    for path in _weight_files(checkpoint.folder):
+        with safe_open(path, framework="pt") as file:
+            for key in file.keys():  # noqa: SIM118  (it is not a dict)
+                if key.startswith(checkpoint.prefix):
+                    yield timm_name(key.removeprefix(checkpoint.prefix)), file.get_tensor(key)
+
+
+def _weight_files(folder: Path) -> list[Path]:
+    if (folder / WEIGHTS_INDEX).is_file():
+        shards = read_json(folder / WEIGHTS_INDEX)["weight_map"].values()
+        return [folder / shard for shard in sorted(set(shards))]
+    if (folder / WEIGHTS).is_file():
+        return [folder / WEIGHTS]
+    raise FileNotFoundError(f"{folder} has neither {WEIGHTS} nor {WEIGHTS_INDEX}.")
+
+
+def _is_unused(name: str, network: OpenVLANetwork) -> bool:
+    if block := VISION_BLOCK.match(name):
+        tower = getattr(network.vision_backbone, block[1])
+        return int(block[2]) >= depth_of(tower)
+    return UNUSED.match(name) is not None

@@ -25,16 +25,13 @@ class PromptTokenizer:
         bos_token_id: first token of every prompt.
 
     Raises:
-        FileNotFoundError: the folder has no tokenizer.json.
         ValueError: the tokenizer has no token for a lone space.
     """
 
     def __init__(self, folder: Path, bos_token_id: int) -> None:
         self.path = folder / TOKENIZER
-        if not self.path.is_file():
-            raise FileNotFoundError(f"{folder} has no {TOKENIZER}.")
-        self._tokenizer = Tokenizer.from_file(str(self.path))
         self._json = self.path.read_bytes()
+        self._tokenizer = Tokenizer.from_file(str(self.path))
         self.bos_token_id = bos_token_id
         space = self._tokenizer.token_to_id(SPACE)
         if space is None:

@@ -45,8 +45,7 @@ class ActionBoundsProcessorStep(ProcessorStep):
     to mean other actions. The bounds are part of the step's saved JSON.
 
     Raises:
-        ValueError: when the bounds differ in length, a low is not below its high, or an action of another
-            width than the bounds arrives.
+        ValueError: a low is not below its high.
     """
 
     low: list[float] = field(default_factory=list)
@@ -58,10 +57,6 @@ class ActionBoundsProcessorStep(ProcessorStep):
 
     def __post_init__(self) -> None:
         """Check the bounds at once."""
-        if len(self.low) != len(self.high) or not self.low:
-            raise ValueError(
-                f"low has {len(self.low)} entries and high {len(self.high)}: both need one a dimension"
-            )
         for dim, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
             if not low < high:
                 raise ValueError(f"action dimension {dim}: low {low} must be below high {high}")
@@ -80,8 +75,6 @@ class ActionBoundsProcessorStep(ProcessorStep):
 
         What is beyond [-1, 1], as a chain of noise may end, becomes an end of the box.
         """
-        if action.shape[-1] != len(self.low):
-            raise ValueError(f"action has {action.shape[-1]} dimensions, the bounds have {len(self.low)}")
         low = torch.as_tensor(self.low, dtype=torch.float32, device=action.device)
         high = torch.as_tensor(self.high, dtype=torch.float32, device=action.device)
         if self.inverse:

@@ -34,8 +34,6 @@ class BinDistribution:
 
     def log_probs(self, temperature: float = 1.0) -> Tensor:
         """Log-probability of every bin, softmax(logits / temperature), shape (B, D, bins)."""
-        if not temperature > 0:
-            raise ValueError(f"temperature must be above 0 for a log-probability, got {temperature}")
         return torch.log_softmax(self.logits / temperature, dim=-1)
 
     def mode(self) -> Tensor:
