@@ -116,25 +116,6 @@ def test_streams_in_step_do_what_lerobots_select_action_does(name):
     assert (expected[0] - expected[1]).abs().max() > 1e-4
 
 
-@torch.no_grad()
-def test_a_late_stream_does_what_it_does_alone():
-    """ACT: stream 1 begins anew at step 4, in the middle of a chunk."""
-    policy, processors = tiny("act"), make_processors()
-    seen = list(observations(8, 2))
-    player = make_player(policy, processors)
-    found = []
-    for step, columns in enumerate(seen):
-        if step == 4:
-            player.begin([1])
-        found.append(player.act(columns, ["go"] * 2, [0, 1]))
-    for stream, begins in ((0, [0]), (1, [0, 4])):
-        for step, columns in enumerate(seen):
-            if step in begins:
-                policy.reset()
-            own = processors.batch({name: col[[stream]] for name, col in columns.items()}, ["go"])
-            torch.testing.assert_close(found[step][stream], policy.select_action(own)[0], rtol=0, atol=1e-5)
-
-
 def test_groot_plays_as_many_actions_as_it_queues():
     """Its `select_action` queues `_action_queue_steps`, which may be fewer than `n_action_steps`."""
     config = SimpleNamespace(type="groot", n_action_steps=4)

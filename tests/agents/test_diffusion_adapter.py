@@ -9,7 +9,6 @@ from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 
 from cronos_lerobot.agents.adapters.diffusion import DiffusionAdapter
-from cronos_lerobot.agents.adapters.privileged import PrivilegedCritic
 from cronos_lerobot.agents.adapters.registry import AdapterOptions, Steerable, make_trainable
 
 STEPS, DIMS, HORIZON, CHAIN = 2, 3, 4, 5
@@ -171,23 +170,6 @@ def test_the_value_does_not_train_the_policy(adapter):
     assert {id(p) for p in policy} == {id(p) for p in adapter.policy.parameters()}
     assert {id(p) for p in value} == {id(p) for p in adapter.critic.parameters()}
     assert set(adapter.own_parameters()) == {f"critic.{name}" for name, _ in adapter.critic.named_parameters()}
-
-
-def test_a_privileged_critic_reads_the_latest_of_a_history():
-    adapter = make_trainable(make_diffusion(2), AdapterOptions())
-    shapes = {name: feature.shape for name, feature in adapter.config.input_features.items()}
-    privileged = PrivilegedCritic(adapter, shapes)
-    assert (privileged.observation_steps, privileged.decision_steps) == (2, STEPS)
-    torch.nn.init.normal_(privileged.critic.layers[-1].weight)
-    batch = make_batch(adapter.policy, history=(2,)) | {"task": ["go"] * 3}
-    with torch.no_grad():
-        value = privileged.sample_actions(batch)["value"]
-        other = {
-            name: x if name == "task" else torch.stack([0 * x[:, 0], x[:, 1]], 1) for name, x in batch.items()
-        }
-        torch.testing.assert_close(privileged.predict_values(other), value)
-        other["observation.environment_state"][:, 1] += 1
-        assert (privileged.predict_values(other) - value).abs().min() > 1e-4
 
 
 def test_what_cannot_be_trained_is_told_what_can():

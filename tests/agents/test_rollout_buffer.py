@@ -52,17 +52,6 @@ def test_columns_of_a_minibatch_belong_together():
         np.testing.assert_array_equal(minibatch.advantage, buffer.advantages[row, stream])
 
 
-def test_normalised_advantages():
-    buffer = filled(rows=4)
-    buffer.compute_advantages(0.99, 0.95)
-    returns = buffer.returns.copy()
-    advantages = buffer.results()["advantages"]
-    buffer.normalize_advantages(advantages.mean(), advantages.std())
-    assert abs(buffer.advantages[:4].mean()) < 1e-6
-    assert buffer.advantages[:4].std() == pytest.approx(1, abs=1e-5)
-    np.testing.assert_array_equal(buffer.returns, returns)
-
-
 @pytest.mark.parametrize(("max_bytes", "pieces"), [(10**6, 1), (1, 2 * N), (16 * 2 * N, 1), (16 * 2 * N - 1, 2)])
 def test_a_minibatch_is_split_by_the_size_of_its_observations(max_bytes, pieces):
     """2 N observations of a number, four bytes, and a picture of 2 x 2 x 3."""

@@ -22,8 +22,6 @@ from cronos_lerobot.agents.ppo.agent import PPOAgent
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
-from cronos_lerobot.agents.processing import make_processors as around
-from cronos_lerobot.agents.weights import train_in_float32
 
 OPTIONS = AdapterOptions(noise_level=0.8)
 THAWED = {"smolvla": {"train_expert_only": False, "freeze_vision_encoder": False}}
@@ -44,32 +42,6 @@ def kind(request):
 @pytest.fixture
 def adapter(kind, tmp_path):
     return make_trainable(make_vla(kind, tmp_path, **THAWED.get(kind, {})), OPTIONS)
-
-
-def test_smolvla_in_bfloat16_is_trained_in_float32(tmp_path):
-    """As the published model's weights are read: the network beside the action expert stays as it is."""
-    policy = make_vla("smolvla", tmp_path)
-    whole = make_trainable(policy, OPTIONS).sample_actions(make_batch(), generator=generator())
-    expert = policy.model.vlm_with_expert
-    expert.bfloat16()
-    with pytest.raises(ValueError, match=r"bfloat16 cannot hold the small steps"):
-        PPO(
-            make_trainable(policy, OPTIONS),
-            around(policy, *[lambda x: x] * 2),
-            PPOConfig(),
-            np.random.default_rng(0),
-        )
-    train_in_float32(policy)
-    assert {param.dtype for param in policy.parameters() if param.requires_grad} == {torch.float32}
-    assert {param.dtype for param in expert.vlm.parameters()} == {torch.bfloat16}
-    adapter = make_trainable(policy, OPTIONS)
-    PPO(adapter, around(policy, *[lambda x: x] * 2), PPOConfig(), np.random.default_rng(0))
-    sample = adapter.sample_actions(make_batch(), generator=generator())
-    torch.testing.assert_close(sample["actions"], whole["actions"], rtol=0, atol=0.05)
-    result = adapter.evaluate_actions(make_batch(), sample["trace"])
-    torch.testing.assert_close(result["log_prob"], sample["log_prob"])
-    result["log_prob"].sum().backward()
-    assert all(param.grad is not None for param in expert.lm_expert.layers.parameters())
 
 
 @torch.no_grad()

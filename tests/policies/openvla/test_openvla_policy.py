@@ -1,6 +1,5 @@
 """The policy against timm and transformers called by hand, and its two ways of computing against each other."""
 
-import numpy as np
 import pytest
 import torch
 from lerobot_policy_openvla.images import prepare_images
@@ -149,25 +148,6 @@ def test_bfloat16_is_close_and_its_adapters_are_float32(published):
     assert kinds == {torch.float32}
     assert policies[1].network.projector.fc1.base_layer.weight.dtype == torch.bfloat16
     assert rough.dtype == torch.float32
-
-
-def test_cloning_learns_the_demonstrated_tokens(published):
-    torch.manual_seed(0)
-    policy = make_policy(published, stir=False, lora_rank=8, lora_modules=["language"])
-    action = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (2, 7)).astype(np.float32))
-    batch = make_batch(2) | {"action": action}
-    optimizer = torch.optim.Adam(policy.get_optim_params()[0]["params"], lr=3e-2)
-    first, _ = policy.forward(batch)
-    for _ in range(70):
-        loss, metrics = policy.forward(batch)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    assert loss < 0.1 * first
-    assert metrics["token_accuracy"] == 1.0
-    # Half a bin is 1 / 255.
-    error = (policy.select_action(batch, temperature=0.0) - action).abs().max()
-    assert error <= 1.01 / 255
 
 
 def test_loss_is_the_mean_over_the_tokens_of_the_whole_vocabulary(base, parts):
