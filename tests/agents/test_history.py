@@ -3,14 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from dummies import identity_processors
 from test_decisions import Chunks, at, make_agent, play
-from test_diffusion_adapter import HORIZON, STEPS, make_batch, make_diffusion
-
-from cronos_lerobot.agents.adapters.diffusion import DiffusionAdapter
-from cronos_lerobot.agents.adapters.registry import AdapterOptions
-from cronos_lerobot.agents.chunk_player import ObservationHistory
-from cronos_lerobot.agents.processing import PolicyProcessors
 
 
 class LookingBack(Chunks):
@@ -96,29 +89,3 @@ def test_a_task_that_is_given_now_is_judged_by_its_first_observation(agent):
     play(agent, 1, [[0, 0]])
     agent.predict_values(at(50, 150), ["a", "b"])
     assert agent.act(at(2, 102), ["a", "b"]).action[:, 0].tolist() == [11, 1011]
-
-
-@torch.no_grad()
-@pytest.mark.parametrize("images", [False, True])
-def test_diffusion_remembers_what_it_does_in_lerobot(images):
-    policy = make_diffusion(3, images)
-    adapter, history = DiffusionAdapter(policy, AdapterOptions()), ObservationHistory(3)
-    assert adapter.observation_steps == 3
-    processors = PolicyProcessors(*identity_processors())
-    policy.reset()
-    generator = torch.Generator().manual_seed(0)
-    decided = None
-    for t in range(6):
-        batch = {name: torch.rand(value.shape, generator=generator) for name, value in make_batch(policy).items()}
-        columns = {name: value.numpy() for name, value in batch.items()}
-        if images:
-            pixels = (255 * batch["observation.images.front"]).to(torch.uint8)
-            batch["observation.images.front"] = pixels / 255
-            columns["observation.images.front"] = pixels.permute(0, 2, 3, 1).numpy()
-        seen = history.see(columns, range(3))
-        noise = torch.randn(3, HORIZON, 3, generator=generator)
-        own = policy.select_action(batch, noise=noise)
-        if t % STEPS == 0:
-            known = processors.batch(seen, ["go"] * 3)
-            decided = adapter.sample_actions(known, temperature=0, noise=noise)["actions"]
-        torch.testing.assert_close(decided[:, t % STEPS], own, atol=1e-6, rtol=0)

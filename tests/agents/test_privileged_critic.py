@@ -5,8 +5,8 @@ import pytest
 import torch
 from tiny_vlas import STATE, make_batch, make_processors, make_vla
 
-from cronos_lerobot.agents.adapters.privileged import FEATURES, PrivilegedCritic, text_vector
-from cronos_lerobot.agents.adapters.registry import AdapterOptions, make_trainable
+from cronos_lerobot.agents.adapters.privileged import PrivilegedCritic, text_vector
+from cronos_lerobot.agents.adapters.registry import FEATURES, AdapterOptions, make_trainable
 from cronos_lerobot.agents.processing import make_processors as around
 
 SHAPES = {"observation.environment_state": (12,), "observation.state": (STATE,), "action": (3,)}

@@ -81,36 +81,6 @@ def test_likelihoods_do_not_depend_on_the_batch(adapter):
         torch.testing.assert_close(again["log_prob"], log_prob[rows], atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("temperature", [0.0, 1.0])
-def test_noise_at_one_step_is_judged_by_one_look(kind, temperature, tmp_path):
-    adapter = make_trainable(make_vla(kind, tmp_path), AdapterOptions(noise_level=0.8, noise_steps=1))
-    batch, noise = make_batch(), torch.randn(NOISE, generator=generator())
-    with torch.no_grad():
-        sample = adapter.sample_actions(batch, generator=generator(), temperature=temperature, noise=noise)
-        chunk = adapter.policy.predict_action_chunk(dict(batch), noise=noise)[:, :PLAYED]
-    assert torch.equal(sample["actions"], chunk) == (temperature == 0)
-    again = adapter.evaluate_actions(batch, sample["trace"], temperature=temperature)["log_prob"]
-    assert again.shape == (3, 1)
-    torch.testing.assert_close(again, sample["log_prob"], atol=1e-4, rtol=0)
-    if temperature:
-        again.sum().backward()
-        assert any(p.grad is not None and p.grad.any() for p in adapter.policy.parameters())
-
-
-def test_only_what_is_played_is_scored(adapter):
-    batch = make_batch()
-    with torch.no_grad():
-        sample = adapter.sample_actions(batch, generator=generator())
-        trace, log_prob = sample["trace"], sample["log_prob"]
-        other = trace.clone()
-        other[:, -1, PLAYED:] += 1.0
-        other[:, -1, :, DIMS:] += 1.0
-        assert torch.equal(adapter.evaluate_actions(batch, other)["log_prob"], log_prob)
-        other[:, -1, PLAYED - 1, DIMS - 1] += 1.0
-        changed = adapter.evaluate_actions(batch, other)["log_prob"] != log_prob
-    assert changed.tolist() == [[False] * (STEPS - 2) + [True]] * 3
-
-
 def test_gradients_are_finite_differences(adapter):
     batch = make_batch()
     with torch.no_grad():
