@@ -15,7 +15,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import traceback
 import types
 import warnings
 from collections.abc import Mapping, Sequence
@@ -138,7 +137,7 @@ def _run_child(request: dict[str, Any], outputs: Sequence[int]) -> None:
             print(code, file=sys.stderr)
             code = 1
     except BaseException:
-        traceback.print_exc()
+        sys.excepthook(*sys.exc_info())  # ty: ignore[invalid-argument-type]
         code = 1
     sys.stdout.flush()
     sys.stderr.flush()

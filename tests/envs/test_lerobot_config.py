@@ -51,11 +51,9 @@ def test_policy_features_match_what_the_env_observes():
         ("camera_name", "front,sideways"), ("renderer", "ray"), ("advance", "never"), ("max_parallel_tasks", 2),
     ],
 )  # fmt: skip
-def test_config_errors_name_the_field_and_its_value(field, value, caplog):
+def test_config_errors_name_the_field_and_its_value(field, value):
     with pytest.raises(ValueError, match=rf"{field}.*{value}"):
         CronosEnvConfig(**{field: value})
-    # draccus hides the exception's text from command lines, so it is logged as well.
-    assert str(value) in caplog.text
 
 
 # Independent episodes ------------------------------------------------------------------------------------

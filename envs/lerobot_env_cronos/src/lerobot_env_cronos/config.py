@@ -1,9 +1,10 @@
 """`--env.type=cronos` and `cronos_hub`: the LeRobot configurations of the CRONOS scenes."""
 
-import logging
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from types import TracebackType
 from typing import Any, TypeGuard
 
 import gymnasium as gym
@@ -94,8 +95,7 @@ class CronosEnvConfig(EnvConfig):
         try:
             self._build()
         except ValueError as error:
-            # Command lines only say that the config could not be instantiated: draccus drops the reason.
-            logging.getLogger(__name__).error("--env: %s", error)
+            _end_in_one_line(error)
             raise
 
     def _build(self) -> None:
@@ -206,6 +206,19 @@ class CronosHubEnvConfig(CronosEnvConfig, HubEnvConfig):
         self.benchmark = str(folder)
         super()._build()
         check_tag(load_benchmark(self.benchmark, self.scene), name)
+
+
+def _end_in_one_line(reason: ValueError) -> None:
+    """Let a command line that `reason` ends say nothing else: draccus drops it, and LeRobot prints a traceback."""
+    before = sys.excepthook
+
+    def hook(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
+        if error.__cause__ is reason:
+            print(f"error: --env: {reason}", file=sys.stderr)
+        else:
+            before(kind, error, traceback)
+
+    sys.excepthook = hook
 
 
 def is_of_this_package(env: Any) -> TypeGuard[CronosEnvConfig]:
