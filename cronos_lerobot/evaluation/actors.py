@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from copy import copy
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,7 @@ from cronos_lerobot.agents.chunk_player import ObservationHistory, make_player
 from cronos_lerobot.agents.processing import PolicyProcessors, make_processors, observation_columns
 from cronos_lerobot.agents.steering.steered import with_steering
 from cronos_lerobot.agents.weights import train_in_float32
-from cronos_lerobot.evaluation.policy_loading import load_policy
-from cronos_lerobot.evaluation.policy_source import damage_named
-from cronos_lerobot.evaluation.processor_classes import check_processor_classes
+from cronos_lerobot.evaluation.policy_loading import check_processor_classes, damage_named, load_policy
 
 
 class SamplingPolicy(Actor):
@@ -219,7 +218,6 @@ def load_actor(
     """
     renamed = rename_map or {}
     with damage_named(config.pretrained_path):
-        check_processor_classes(str(config.pretrained_path))
         policy: Any = load_policy(config, env, renamed)
         # As it was trained.
         train_in_float32(policy, config.pretrained_path, config.pretrained_revision)
@@ -243,9 +241,5 @@ def _as_it_is(batch: Any) -> Any:
 
 def _autocast(policy: Any, processors: PolicyProcessors) -> Callable[[], AbstractContextManager]:
     """What `lerobot-eval` does for `--policy.use_amp`: makes a context for each inference."""
-
-    def make() -> AbstractContextManager:
-        uses_amp = getattr(getattr(policy, "config", None), "use_amp", False)
-        return torch.autocast(processors.device.type) if uses_amp else nullcontext()
-
-    return make
+    uses_amp = getattr(getattr(policy, "config", None), "use_amp", False)
+    return partial(torch.autocast, processors.device.type) if uses_amp else nullcontext

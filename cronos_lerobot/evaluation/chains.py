@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -53,53 +54,48 @@ class Trajectory:
     """(T + 1,) bool, whether that task has been complete."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class ChainResult:
-    """How a chain ended."""
+    """What has come of a chain so far."""
 
     chain: Chain
-    success: tuple[bool, ...]
+    success: list[bool] = field(default_factory=list)
     """Of each task that was given."""
-    steps: int
+    steps: int = 0
     """Control steps."""
-    found_complete: tuple[int, ...] = ()
+    found_complete: list[int] = field(default_factory=list)
     """Positions of successes whose task was complete when it was given."""
-    never_grasped: tuple[int, ...] = ()
+    never_grasped: list[int] = field(default_factory=list)
     """Positions of other successes without a grasp of the object from the task's start to its success."""
-    starts: tuple[str, ...] = ()
+    starts: list[str] = field(default_factory=list)
     """How each task's bodies lay when it was given, if the runner was asked to look."""
-    trajectory: Trajectory | None = None
-    """If the runner keeps it."""
+    frames: list[tuple[np.ndarray, int, bool]] = field(default_factory=list)
+    """Rows of the trajectory, if the runner keeps it."""
+    elapsed: int = 0
+    """Control steps of the task at hand."""
+    was_found: bool = False
+    """Whether it was complete when it was given."""
+    was_grasped: bool = False
 
     @property
     def length(self) -> int:
         """Tasks completed."""
         return sum(self.success)
 
-
-@dataclass
-class _Run:
-    """A chain that is running, and its past."""
-
-    index: int
-    chain: Chain
-    steps: int = 0
-    elapsed: int = 0
-    success: list[bool] = field(default_factory=list)
-    found_complete: list[int] = field(default_factory=list)
-    never_grasped: list[int] = field(default_factory=list)
-    starts: list[str] = field(default_factory=list)
-    frames: list[tuple[np.ndarray, int, bool]] = field(default_factory=list)
-    was_found: bool = False
-    was_grasped: bool = False
-
     @property
     def task(self) -> Task:
+        """The one at hand."""
         return self.chain.tasks[len(self.success) - 1]
 
     @property
     def is_last(self) -> bool:
+        """Whether no task comes after it."""
         return len(self.success) == len(self.chain.tasks)
+
+    @cached_property
+    def trajectory(self) -> Trajectory | None:
+        """If the runner keeps it."""
+        return Trajectory(*map(np.array, zip(*self.frames, strict=True))) if self.frames else None
 
     def record(self, is_success: bool, is_grasped: bool) -> None:
         """Note a control step."""
@@ -112,18 +108,6 @@ class _Run:
                 self.found_complete.append(len(self.success) - 1)
             elif not self.was_grasped:
                 self.never_grasped.append(len(self.success) - 1)
-
-    def result(self) -> ChainResult:
-        trajectory = Trajectory(*map(np.array, zip(*self.frames, strict=True))) if self.frames else None
-        return ChainResult(
-            self.chain,
-            tuple(self.success),
-            self.steps,
-            tuple(self.found_complete),
-            tuple(self.never_grasped),
-            tuple(self.starts),
-            trajectory,
-        )
 
 
 class ChainRunner:
@@ -151,7 +135,7 @@ class ChainRunner:
         self.env, self.actor, self.rules = env, actor, rules
         self._look, self._keeps_states = look, keeps_states
         self._everyone = np.arange(env.num_envs)
-        self._runs: dict[int, _Run] = {}
+        self._runs: dict[int, ChainResult] = {}
 
     def run(
         self,
@@ -169,8 +153,8 @@ class ChainRunner:
                 configuration, and on nothing else.
             on_end: called with each result as it comes in.
         """
-        waiting, results = deque(enumerate(chains)), {}
-        self._runs = {}
+        results = [ChainResult(chain) for chain in chains]
+        waiting, self._runs = deque(results), {}
         self._instructions = [chains[0].tasks[0].instruction] * self.env.num_envs
         observation = self.env.observe()
         while waiting or self._runs:
@@ -179,12 +163,10 @@ class ChainRunner:
                 _scatter(observation, fresh, self.env.observe(fresh))
             observation, info = self._step(observation)
             for i in self._record(info):
-                run = self._runs.pop(i)
-                results[run.index] = run.result()
-                on_end(results[run.index])
-        return [results[i] for i in range(len(chains))]
+                on_end(self._runs.pop(i))
+        return results
 
-    def _fill(self, waiting: deque[tuple[int, Chain]], split: str, seed: StreamSeed) -> np.ndarray:
+    def _fill(self, waiting: deque[ChainResult], split: str, seed: StreamSeed) -> np.ndarray:
         """Start waiting chains in free streams; returns those (k,).
 
         An actor with one memory for all streams can only clear it for all: its chains start together.
@@ -192,7 +174,7 @@ class ChainRunner:
         free = np.array([i for i in self._everyone if i not in self._runs], dtype=int)[: len(waiting)]
         if not len(free) or not (self.actor.is_per_stream or not self._runs):
             return free[:0]
-        runs = {int(i): _Run(*waiting.popleft()) for i in free}
+        runs = {int(i): waiting.popleft() for i in free}
         self.env.scene_reset(free, np.array([run.chain.configuration for run in runs.values()]), split)
         self._runs |= runs
         self._give_next_task(free)
@@ -231,7 +213,7 @@ class ChainRunner:
         known = getattr(self.env, name, None)
         return known is not None and bool(known[i])
 
-    def _keep_state(self, i: int, run: _Run) -> None:
+    def _keep_state(self, i: int, run: ChainResult) -> None:
         if self._keeps_states:
             qpos = self.env.positions(np.array([i]))[0].astype(np.float32)
             run.frames.append((qpos, len(run.success) - 1, run.success[-1]))

@@ -5,18 +5,15 @@ Its chains, random numbers and actors are those of `cronos-eval`.
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Sequence
 from typing import Any
 
-import torch
-from lerobot.utils.random_utils import get_rng_state, serialize_rng_state, set_rng_state
+from lerobot.utils.random_utils import get_rng_state, set_rng_state
 
 from cronos_lerobot.agents.base import samples
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.evaluation.actors import make_actor
 from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
-from cronos_lerobot.evaluation.results import Episode, describe_episodes, independent_results
+from cronos_lerobot.evaluation.results import describe_episodes, numbers_of
 from cronos_lerobot.evaluation.suites import INDEPENDENT, make_chains, sampling_seed
 from cronos_lerobot.ranks import Ranks
 
@@ -32,7 +29,7 @@ def run_independent(
     seed: int,
     ranks: Ranks | None = None,
     keeps_states: bool = False,
-) -> tuple[list[ChainResult], bool]:
+) -> list[ChainResult]:
     """Run every task of the environment's benchmark with a policy, and leave everything else as it was.
 
     If the policy takes `uniform` (see `TrainablePolicy`), its episodes do not depend on the number of environments
@@ -46,11 +43,11 @@ def run_independent(
         split: `train` or `held_out`.
         temperature: of the sampling, 0 for the likeliest action.
         seed: of the sampling.
-        processes: that share the episodes; all of them call this and get the whole result.
+        ranks: processes that share the episodes; all of them call this and get the whole result.
         keeps_states: return the trajectories, too.
 
     Returns:
-        The episodes, task by task, and whether any randomness was drawn: otherwise all seeds give the same ones.
+        The episodes, task by task.
     """
     ranks = ranks or Ranks()
     chains = make_chains(env.benchmark, INDEPENDENT, split, n_episodes)
@@ -59,24 +56,15 @@ def run_independent(
     try:
         actor = make_actor(policy, processors, temperature)
         actor.seed(ranks.own_seed(seed))
-        seeded = serialize_rng_state()
         own = chains[ranks.rank :: ranks.count]
         runner = ChainRunner(env, actor, keeps_states=keeps_states)
         results = runner.run(own, split, sampling_seed(seed, INDEPENDENT, split)) if own else []
-        drawn = serialize_rng_state()
-        drew = bool(actor.temperature) or any(not torch.equal(drawn[name], seeded[name]) for name in seeded)
     finally:
         if was_training is not None:
             policy.train(was_training)
         set_rng_state(rng_state)
-    gathered = ranks.gather((results, drew))
-    by_chain = {result.chain: result for some, _ in gathered for result in some}
-    return [by_chain[chain] for chain in chains], any(has_drawn for _, has_drawn in gathered)
-
-
-def episode_lists(episodes: Sequence[Episode]) -> list[list[int]]:
-    """Every episode in short, for paired comparisons: [seed, task, configuration, success]."""
-    return [[e["seed"], e["number"], e["configuration"], e["length"]] for e in episodes]
+    by_chain = {result.chain: result for some in ranks.gather(results) for result in some}
+    return [by_chain[chain] for chain in chains]
 
 
 def evaluate_independent(
@@ -84,32 +72,30 @@ def evaluate_independent(
 ) -> dict[str, Any]:
     """The episodes of `run_independent` in numbers.
 
-    A policy that draws nothing, such as ACT, is not repeated: its interval would be too narrow.
-
     Args:
         env: as there, and so are the others.
         policy: as there.
         args: as there.
         seed: of the sampling; each repetition has the next one.
-        repetitions: episodes of each task and configuration.
+        repetitions: episodes of each task and configuration. A policy that does not sample at the temperature,
+            such as ACT, is not repeated: equal episodes would narrow its interval.
         options: as there.
 
     Returns:
         `split`, `temperature` (None for a policy without), `steps` (control steps of all episodes), `episodes`
-        (see `episode_lists`) and `independent_results`.
+        (each in short, for paired comparisons: seed, task, configuration, success) and `independent_results`.
     """
-    episodes = []
-    for s in range(seed, seed + repetitions):
-        results, drew = run_independent(env, policy, *args, seed=s, **options)
-        episodes += describe_episodes(results, s)
-        if not drew and repetitions > 1:
-            logging.warning("--eval.repetitions: the policy draws nothing, so every episode is run once.")
-            break
-    groups = env.benchmark.groups(INDEPENDENT, options["split"])
+    split, temperature = options["split"], options["temperature"] if samples(policy) else None
+    seeds = range(seed, seed + (repetitions if temperature else 1))
+    episodes = [
+        episode
+        for s in seeds
+        for episode in describe_episodes(run_independent(env, policy, *args, seed=s, **options), s)
+    ]
     header = {
-        "split": options["split"],
-        "temperature": options["temperature"] if samples(policy) else None,
+        "split": split,
+        "temperature": temperature,
         "steps": sum(episode["steps"] for episode in episodes),
-        "episodes": episode_lists(episodes),
+        "episodes": [[e[name] for name in ("seed", "number", "configuration", "length")] for e in episodes],
     }
-    return header | independent_results(episodes, [group.tasks[0] for group in groups])
+    return header | numbers_of(INDEPENDENT, episodes, env.benchmark, split)

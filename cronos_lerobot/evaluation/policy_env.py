@@ -54,20 +54,6 @@ def expected_env(policy: PreTrainedConfig, scene: str | None = None) -> CronosEn
     return env
 
 
-def observations_of(features: Features) -> dict[str, Any]:
-    """Fields of `CronosEnvConfig` that show a policy what it takes, its `input_features`."""
-    images = {name: feature for name, feature in features.items() if feature.type is FeatureType.VISUAL}
-    takes_state = OBS_ENV_STATE in features
-    if not images:
-        return {"obs_type": "environment_state_agent_pos"} if takes_state else {}
-    derived: dict[str, Any] = {"obs_type": "pixels_agent_pos", "privileged_state": takes_state}
-    if cameras := [name for name in CAMERAS if f"{OBS_IMAGES}.{name}" in images]:
-        derived["camera_name"] = ",".join(cameras)
-    # LeRobot passes images of another size on without a word.
-    _, height, width = next(iter(images.values())).shape
-    return derived | {"observation_height": height, "observation_width": width}
-
-
 def reads_privileged_state(config: PreTrainedConfig) -> bool:
     """Whether a policy acts on the bodies' poses beside its pictures, which no robot has.
 
@@ -103,51 +89,51 @@ def trained_scene(path: Path | None) -> dict[str, str]:
     Raises:
         ValueError: its config is damaged, or its scene is not registered here.
     """
-    config = _train_config(path)
-    env = config.get("env") or {}
-    scene = env.get("scene")
-    if scene is not None and env.get("type") == "cronos":
-        try:
-            get_scene(scene)
-        except ValueError as error:
-            raise ValueError(f"the policy in {path} was trained in a scene that is not here: {error}") from error
-    if scene is None and (origin := _origin_of_training(config)):
-        scene = origin.scene
-    return {"scene": scene} if scene in SCENES else {}
-
-
-def trained_renderer(path: Path | None) -> dict[str, str]:
-    """The renderer of the pictures that a checkpoint learned from: of its dataset, or of `cronos-train`.
-
-    Empty if it does not say, or if its dataset is not on this machine.
-
-    Raises:
-        ValueError: its config is damaged.
-    """
-    config = _train_config(path)
-    env = config.get("env") or {}
-    renderer = env.get("renderer") if env.get("type", "cronos") == "cronos" else None
-    if origin := _origin_of_training(config):
-        # The environment beside it is that of LeRobot's evaluations alone.
-        renderer = origin.flags.get("env.renderer", renderer)
-    return {"renderer": renderer} if renderer else {}
+    env, origin = _training(path)
+    scene = env.get("scene") or (origin and origin.scene)
+    if not scene:
+        return {}
+    try:
+        return {"scene": get_scene(scene).name}
+    except ValueError as error:
+        raise ValueError(f"the policy in {path} was trained in a scene that is not here: {error}") from error
 
 
 def trained_observations(features: Features, path: Path | None) -> dict[str, Any]:
-    """`observations_of`, and for a policy that takes pictures the renderer of those that it learned from."""
-    observations = observations_of(features)
-    return observations | (trained_renderer(path) if "observation_height" in observations else {})
+    """Fields of `CronosEnvConfig` that show a policy what it takes, as its training or its dataset did.
+
+    Args:
+        features: its `input_features`.
+        path: its checkpoint, which tells the renderer of the pictures that it learned from.
+
+    Raises:
+        ValueError: the checkpoint's config is damaged.
+    """
+    images = {name: feature for name, feature in features.items() if feature.type is FeatureType.VISUAL}
+    takes_state = OBS_ENV_STATE in features
+    if not images:
+        return {"obs_type": "environment_state_agent_pos"} if takes_state else {}
+    derived: dict[str, Any] = {"obs_type": "pixels_agent_pos", "privileged_state": takes_state}
+    if cameras := [name for name in CAMERAS if f"{OBS_IMAGES}.{name}" in images]:
+        derived["camera_name"] = ",".join(cameras)
+    # LeRobot passes images of another size on without a word.
+    _, height, width = next(iter(images.values())).shape
+    env, origin = _training(path)
+    # The environment beside a dataset is that of LeRobot's evaluations alone.
+    renderer = (origin and origin.flags.get("env.renderer")) or env.get("renderer")
+    sizes = {"observation_height": height, "observation_width": width}
+    return derived | sizes | ({"renderer": renderer} if renderer else {})
 
 
-def _train_config(path: Path | None) -> dict[str, Any]:
+def _training(path: Path | None) -> tuple[dict[str, Any], Origin | None]:
+    """The scene's environment that a checkpoint was trained in, and where its dataset comes from."""
     file = Path(path or "") / TRAIN_CONFIG_NAME
-    return json.loads(file.read_text()) if file.is_file() else {}
-
-
-def _origin_of_training(config: Mapping[str, Any]) -> Origin | None:
-    dataset = config.get("dataset") or {}
-    repo_id = dataset.get("repo_id")
-    return _origin_of(repo_id, dataset.get("root"), dataset.get("revision")) if isinstance(repo_id, str) else None
+    config = json.loads(file.read_text()) if file.is_file() else {}
+    env, dataset = config.get("env") or {}, config.get("dataset") or {}
+    origin = None
+    if isinstance(repo_id := dataset.get("repo_id"), str):
+        origin = _origin_of(repo_id, dataset.get("root"), dataset.get("revision"))
+    return env if env.get("type", "cronos") == "cronos" else {}, origin
 
 
 def scene_of_dataset(repo_id: str, root: Path | str | None, revision: str | None = None) -> str | None:
@@ -198,32 +184,37 @@ def check_observations(
     Raises:
         ValueError: it does not; names the flag that would.
     """
-    check_task_observation(policy, env)
+    told = task_observation_of(policy.input_features or {}, env)
+    if told != env.task_observation:
+        raise ValueError(
+            f"the policy takes {OBS_STATE} as with --env.task_observation={told}; the environment has "
+            f"--env.task_observation={env.task_observation}"
+        )
     names = {key: name for key, name in env.features_map.items() if key in env.features}
     given = {(rename_map or {}).get(name, name): env.features[key] for key, name in names.items()}
     for name, taken in ((policy.input_features or {}) | (policy.output_features or {})).items():
         feature = given.get(name)
-        if feature is None and name.startswith(EMPTY_CAMERA):
-            continue
         if feature is None:
-            flags = {OBS_ENV_STATE: "--env.obs_type=environment_state_agent_pos"}
-            flag = flags.get(name, "--env.obs_type=pixels_agent_pos with --env.camera_name=<its cameras>")
+            if name.startswith(EMPTY_CAMERA):
+                continue
+            pixels = "--env.obs_type=pixels_agent_pos with --env.camera_name=<its cameras>"
+            flag = "--env.obs_type=environment_state_agent_pos" if name == OBS_ENV_STATE else pixels
             raise ValueError(
                 f"the policy takes {name}, which the environment does not give: {flag} does, or --rename_map"
             )
-        if taken.type is FeatureType.VISUAL or tuple(taken.shape) == tuple(feature.shape):
-            continue
-        fitting = [f"--env.scene={scene}" for scene in SCENES if _fits(name, taken, scene, env)]
-        why = "in another scene; " + " or ".join(fitting) + " fits" if fitting else "with other options"
-        raise ValueError(
-            f"the policy was made for {name} of {taken.shape[0]} numbers, {env.scene} has {feature.shape[0]}: "
-            f"it was trained {why}"
-        )
+        if taken.type is not FeatureType.VISUAL and tuple(taken.shape) != tuple(feature.shape):
+            raise ValueError(
+                f"the policy was made for {name} of {taken.shape[0]} numbers, {env.scene} has {feature.shape[0]}: "
+                f"it was trained {_where_it_fits(name, taken.shape[0], env)}"
+            )
 
 
-def _fits(name: str, taken: PolicyFeature, scene: str, env: CronosEnvConfig) -> bool:
-    """Whether a vector observation has the size in another scene that a policy takes."""
-    return name != ACTION and (_state_size(name, scene, env, env.task_observation),) == tuple(taken.shape)
+def _where_it_fits(name: str, size: int, env: CronosEnvConfig) -> str:
+    told = env.task_observation
+    fitting = [f"--env.scene={scene}" for scene in SCENES if _size(name, scene, env, told) == size]
+    if name == ACTION or not fitting:
+        return "with other options"
+    return f"in another scene; {' or '.join(fitting)} fits"
 
 
 def task_observation_of(features: Features, env: CronosEnvConfig) -> str:
@@ -233,25 +224,12 @@ def task_observation_of(features: Features, env: CronosEnvConfig) -> str:
     """
     if (state := features.get(OBS_STATE)) is not None:
         for told in (env.task_observation, *TASK_OBSERVATIONS):
-            if (_state_size(OBS_STATE, env.scene, env, told),) == tuple(state.shape):
+            if _size(OBS_STATE, env.scene, env, told) == state.shape[0]:
                 return told
     return env.task_observation
 
 
-def check_task_observation(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
-    """Check that a policy is told its task in the state if it was so in training, and only then.
-
-    Raises:
-        ValueError: it is not so; names the flag.
-    """
-    told = task_observation_of(policy.input_features or {}, env)
-    if told != env.task_observation:
-        raise ValueError(
-            f"the policy takes {OBS_STATE} of {_state_size(OBS_STATE, env.scene, env, told)} numbers, as with "
-            f"--env.task_observation={told}; the environment has --env.task_observation={env.task_observation}"
-        )
-
-
-def _state_size(name: str, scene: str, env: CronosEnvConfig, task_observation: str) -> int:
+def _size(name: str, scene: str, env: CronosEnvConfig, task_observation: str) -> int:
+    """Of a vector in another scene."""
     other = replace(env, scene=scene, benchmark=None, task=None, task_observation=task_observation)
     return next(other.features[key].shape[0] for key, feature in other.features_map.items() if feature == name)

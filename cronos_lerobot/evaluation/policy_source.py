@@ -6,8 +6,8 @@ import hashlib
 import io
 import json
 import sys
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager, redirect_stderr
+from collections.abc import Iterator
+from contextlib import redirect_stderr
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,11 @@ from typing import Any
 import draccus
 from httpx import HTTPError
 from huggingface_hub import HfApi, snapshot_download
-from huggingface_hub.constants import CONFIG_NAME, SAFETENSORS_SINGLE_FILE
+from huggingface_hub.constants import CONFIG_NAME
 from huggingface_hub.errors import HFValidationError
 from huggingface_hub.utils import validate_repo_id
 from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import LAST_CHECKPOINT_LINK
-from safetensors import SafetensorError
 
 FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 """What a policy is loaded from: configs, weights, tokenizers."""
@@ -105,18 +104,7 @@ def pin_policy(name: str, given: str | None) -> tuple[str, str | None]:
         return repository, wanted
 
 
-@contextmanager
-def damage_named(path: Path | str | None) -> Generator[None]:
-    """Around the loading of a policy: a ValueError names the file of it that is damaged."""
-    try:
-        yield
-    except SafetensorError as error:
-        raise ValueError(f"{path}/{SAFETENSORS_SINGLE_FILE} or a processor's file is damaged: {error}") from error
-    except json.JSONDecodeError as error:
-        raise ValueError(f"a configuration of a processor in {path} is damaged: {error}") from error
-
-
-def load_policy_config(path: str, overrides: list[str], revision: str | None = None) -> PreTrainedConfig:
+def load_policy_config(path: str | Path, overrides: list[str], revision: str | None = None) -> PreTrainedConfig:
     """Return the config of the policy that `--policy.path` names.
 
     Args:
@@ -198,13 +186,13 @@ def _files(folder: Path, with_base: bool) -> Iterator[bytes]:
         yield f"{name} {adapters.get(REVISION)}".encode()
 
 
-def find_base(folder: Path) -> tuple[str | None, Path | None]:
+def find_base(folder: Path | str) -> tuple[str | None, Path | None]:
     """The policy that PEFT's adapters in `folder` go onto: as they name it, and its folder if it has one.
 
     The name may be relative to where the training ran, such as outputs/clone. None, None without adapters.
     """
-    name = _adapter_config(folder).get(BASE)
-    return (name, _find_weights(name, folder)) if name else (None, None)
+    name = _adapter_config(Path(folder)).get(BASE)
+    return (name, _find_weights(name, Path(folder))) if name else (None, None)
 
 
 def _find_weights(name: str, folder: Path) -> Path | None:

@@ -24,9 +24,7 @@ VIDEOS = "videos"
 """Folder beside it."""
 FORMAT = 3
 """Version of results.json."""
-MAX_BYTES = 50_000_000
-"""Of a results.json that is read; a full evaluation has 200 kB."""
-REQUIRED = {"policy": str, "policy_fingerprint": str, "scene": str, "benchmark": dict, "episodes": list, "n": int}
+FIELDS = {"policy": str, "policy_fingerprint": str, "scene": str, "benchmark": dict, "episodes": list, "n": int}
 """Fields of every results.json, with their types."""
 
 Episode = Mapping[str, Any]
@@ -68,31 +66,31 @@ def read_evaluation(path: Path) -> list[dict[str, Any]]:
 
 def find_videos(results: Path) -> list[Path]:
     """Return the videos beside a results.json. Paths inside the file are never followed."""
-    return sorted(path for path in (results.parent / VIDEOS).glob("*.mp4") if not path.is_symlink())
+    return videos_below(results.parent, f"{VIDEOS}/*.mp4")
+
+
+def videos_below(folder: Path, pattern: str) -> list[Path]:
+    """The videos of a pattern, without links that lead out of the folder."""
+    home = folder.resolve()
+    return sorted(path for path in folder.glob(pattern) if path.is_file() and path.resolve().is_relative_to(home))
 
 
 def read_results(file: Path) -> dict[str, Any]:
     """Read a results.json, also one of a stranger.
 
     Raises:
-        FileNotFoundError: it is not there.
-        ValueError: it is too large, damaged, something else, or of another version of the environments.
+        OSError: it is not there.
+        ValueError: it is damaged, something else, or of another version of the environments.
     """
-    if not file.is_file():
-        raise FileNotFoundError(f"no {RESULTS} of cronos-eval at {file}")
-    if file.stat().st_size > MAX_BYTES:
-        raise ValueError(f"{file} has more than {MAX_BYTES // 10**6} MB")
     try:
         results = json.loads(file.read_text())
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{file} is damaged: {error}") from error
-    if not isinstance(results, dict) or results.get("suite") not in SUITES or results.get("split") not in SPLITS:
-        raise ValueError(f"{file} is no {RESULTS} of cronos-eval")
-    check_environment_id(results.get("environment"), str(file), "evaluate again with another --output_dir")
-    if results.get("format") != FORMAT:
-        raise ValueError(f"{file} has another format than {FORMAT}: evaluate again with another --output_dir")
-    if wrong := [name for name, kind in REQUIRED.items() if not isinstance(results.get(name), kind)]:
-        raise ValueError(f"{file} is damaged: {', '.join(wrong)}")
+        environment = results["environment"]
+    except (ValueError, RecursionError, TypeError, KeyError) as error:
+        raise ValueError(f"{file} is damaged, or no {RESULTS} of cronos-eval: {error!r}") from error
+    check_environment_id(environment, str(file), "evaluate again with another --output_dir")
+    is_known = (results.get("format"), results.get("suite") in SUITES, results.get("split") in SPLITS)
+    if is_known != (FORMAT, True, True) or not all(isinstance(results.get(k), kind) for k, kind in FIELDS.items()):
+        raise ValueError(f"{file} is damaged, or not of format {FORMAT}: evaluate again with another --output_dir")
     return results
 
 
@@ -108,9 +106,9 @@ def describe_episodes(results: Sequence[ChainResult], seed: int) -> list[dict[st
     for r in results:
         episode: dict[str, Any] = {"number": r.chain.number, "configuration": r.chain.configuration, "seed": seed}
         episode |= {"length": r.length, "steps": r.steps}
-        episode |= {"found_complete": list(r.found_complete), "never_grasped": list(r.never_grasped)}
+        episode |= {"found_complete": r.found_complete, "never_grasped": r.never_grasped}
         if r.starts:
-            episode |= {"success": list(r.success), "starts": list(r.starts)}
+            episode |= {"success": r.success, "starts": r.starts}
         episodes.append(episode)
     return episodes
 

@@ -91,7 +91,7 @@ def open_stream(
         config = CronosEnvConfig(obs_type="environment_state_agent_pos", scene=scene or "")
         env = CronosVectorEnv(1, config.scene, **config.gym_kwargs)
         return env, Spectator(ExpertActor(env), 1, seed)
-    policy = load_policy_config(str(find_policy(policy_path).folder), [f"--device={device}"])
+    policy = load_policy_config(find_policy(policy_path).folder, [f"--device={device}"])
     config = expected_env(policy, scene)
     actor = load_actor(policy, config, getattr(policy, "temperature", SuitesConfig.temperature))
     return CronosVectorEnv(1, config.scene, **config.gym_kwargs), Spectator(actor, 1, seed)

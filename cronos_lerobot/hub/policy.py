@@ -13,11 +13,11 @@ from safetensors import safe_open
 
 from cronos_lerobot.agents.steering.steered import STEERING
 from cronos_lerobot.evaluation.policy_env import trained_scene
+from cronos_lerobot.evaluation.policy_loading import damage_named
 from cronos_lerobot.evaluation.policy_source import (
     ADAPTER_CONFIG,
     BASE,
     REVISION,
-    damage_named,
     files_fingerprint,
     find_base,
 )

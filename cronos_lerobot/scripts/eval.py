@@ -50,7 +50,7 @@ def read_command_line() -> CronosEvalConfig:
     if path := parser.get_path_arg("policy"):
         overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
         source = find_policy(path)
-        config.policy = load_policy_config(str(source.folder), overrides)
+        config.policy = load_policy_config(source.folder, overrides)
         config.policy_name, config.policy_revision = source.name, source.revision
     given = {flag.removeprefix("--").split("=")[0] for flag in parser.get_cli_overrides("env") or []}
     if file := parser.parse_arg("config_path"):

@@ -138,7 +138,7 @@ def _load_policy(folder: Path, env: CronosEnvConfig) -> Actor:
     Raises:
         ValueError: the checkpoint is damaged, or the environment does not show it what it takes.
     """
-    config = load_policy_config(str(folder), ["--device=cpu"])
+    config = load_policy_config(folder, ["--device=cpu"])
     check_observations(config, env)
     return load_actor(config, env, getattr(config, "temperature", SuitesConfig.temperature))
 

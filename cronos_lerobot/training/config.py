@@ -42,7 +42,7 @@ class PeriodicEvaluationConfig:
     n_episodes: int = ranged(NUM_CONFIGURATIONS, minimum=1)
     """Configurations for each task: the first N of the split."""
     repetitions: int = ranged(1, minimum=1)
-    """Episodes of each task and configuration, each with its own random numbers."""
+    """Episodes of each task and configuration, each with its own random numbers, if the policy samples."""
     split: str = ranged("train", choices=("train", "held_out"))
     """Configurations to evaluate on: `train` or `held_out`."""
     temperature: float = ranged(0.6, minimum=0)

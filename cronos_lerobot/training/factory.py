@@ -29,9 +29,8 @@ from cronos_lerobot.evaluation.policy_env import (
     trained_scene,
     warn_of_inputs,
 )
-from cronos_lerobot.evaluation.policy_loading import load_policy
-from cronos_lerobot.evaluation.policy_source import UNDECISIVE, damage_named, load_policy_config
-from cronos_lerobot.evaluation.processor_classes import check_processor_classes
+from cronos_lerobot.evaluation.policy_loading import check_processor_classes, damage_named, load_policy
+from cronos_lerobot.evaluation.policy_source import UNDECISIVE, load_policy_config
 from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.run import Parts
@@ -139,7 +138,8 @@ def _config_to_build(config: CronosTrainConfig) -> PreTrainedConfig:
     assert given is not None
     if config.checkpoint_path is None:
         return deepcopy(given)
-    saved = load_policy_config(str(config.weights_path), [])
+    assert config.weights_path is not None
+    saved = load_policy_config(config.weights_path, [])
     for name in ("device", *UNDECISIVE):
         setattr(saved, name, getattr(given, name))
     return saved

@@ -134,15 +134,7 @@ def test_a_broken_simulation_ends_a_chain_as_a_failure_and_a_stream_not():
     (chain,), _ = run(1, chains=CHAINS[:1], diverge_at={(10, 0)})
     assert (chain.length, chain.steps) == (0, 10)
     (stream,), _ = run(1, chains=CHAINS[:1], diverge_at={(10, 0)}, stops=False)
-    assert (stream.success, stream.steps) == ((False, True, True, True), 320)
-
-
-def test_chains_of_one_task_are_independent_episodes():
-    chains = [Chain(i, (task,), configuration) for i, task in enumerate(TASKS) for configuration in (1, 3)]
-    results, _ = run(3, chains=chains)
-    # SCRIPT goes by task: of configuration 1 the second fails, of 3 the last.
-    assert [r.length for r in results] == [1, 1, 0, 1, 1, 1, 1, 0]
-    assert [r.steps for r in results] == [10, 1, 80, 1, 1, 1, 1, 80]
+    assert (stream.success, stream.steps) == ([False, True, True, True], 320)
 
 
 def test_found_and_ungrasped_successes_and_trajectories():
@@ -166,7 +158,7 @@ def test_found_and_ungrasped_successes_and_trajectories():
             return np.stack([self.position, self.elapsed], axis=1)[ids].astype(float)
 
     (result,) = ChainRunner(Known(1), Idle(), keeps_states=True).run(CHAINS[:1], "train", (0,))
-    assert (result.found_complete, result.never_grasped) == ((1,), (0, 3))
+    assert (result.found_complete, result.never_grasped) == ([1], [0, 3])
     trajectory = result.trajectory
     assert trajectory.qpos.shape == (result.steps + 1, 2)
     # Complete from the step on which it was, until the window is over.

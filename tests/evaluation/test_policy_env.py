@@ -12,7 +12,7 @@ from lerobot_policy_pocketvla import PocketVLAConfig
 from tiny_checkpoints import STATE, TINY_ACT, TOLD, record_one, save_policy, write_train_config
 
 from cronos_lerobot.evaluation.config import CronosEvalConfig
-from cronos_lerobot.evaluation.policy_env import expected_env, reads_privileged_state, trained_renderer
+from cronos_lerobot.evaluation.policy_env import expected_env, reads_privileged_state, trained_observations
 from cronos_lerobot.scripts.eval import read_command_line
 
 FILAMENT = {"renderer": "filament"}
@@ -25,18 +25,24 @@ def config_of(folder):
 
 
 def test_the_renderer_is_the_runs_or_that_of_the_cloned_demonstrations(tmp_path):
+    def renderer(**config):
+        trained = write_train_config(tmp_path, **config)
+        return trained_observations(policy_of().input_features, trained).get("renderer")
+
     # Demonstrations that say that Filament was asked for; without pictures it is not needed here.
-    demos = record_one(tmp_path / "demos", **FILAMENT)
-    dataset = {"repo_id": "me/demos", "root": str(demos)}
-    assert trained_renderer(write_train_config(tmp_path, env={"type": "cronos"} | FILAMENT)) == FILAMENT
-    assert trained_renderer(write_train_config(tmp_path, env=None, dataset=dataset)) == FILAMENT
+    dataset = {"repo_id": "me/demos", "root": str(record_one(tmp_path / "demos", **FILAMENT))}
+    assert renderer(env={"type": "cronos"} | FILAMENT) == "filament"
+    assert renderer(env=None, dataset=dataset) == "filament"
     # What lerobot-train evaluates in is not what it learned from.
-    classic = {"type": "cronos", "renderer": "classic"}
-    assert trained_renderer(write_train_config(tmp_path, env=classic, dataset=dataset)) == FILAMENT
-    elsewhere = dataset | {"root": str(tmp_path)}
-    assert trained_renderer(write_train_config(tmp_path, env=None, dataset=elsewhere)) == {}
-    assert trained_renderer(write_train_config(tmp_path, env={"type": "libero"} | FILAMENT)) == {}
-    assert trained_renderer(tmp_path / "none") == {}
+    assert renderer(env={"type": "cronos", "renderer": "classic"}, dataset=dataset) == "filament"
+    assert renderer(env=None, dataset=dataset | {"root": str(tmp_path)}) is None
+    assert renderer(env={"type": "libero"} | FILAMENT) is None
+
+
+def policy_of(make=ACTConfig, **shown):
+    """A policy of all that is shown."""
+    features = env_to_policy_features(CronosEnvConfig(**shown))
+    return make(device="cpu", input_features={key: f for key, f in features.items() if key != "action"})
 
 
 @pytest.mark.parametrize(
@@ -52,9 +58,7 @@ def test_the_renderer_is_the_runs_or_that_of_the_cloned_demonstrations(tmp_path)
 )
 def test_whether_a_policy_reads_the_poses_beside_pictures(make, shown, reads):
     """LeRobot makes an input of all that a dataset has."""
-    features = env_to_policy_features(CronosEnvConfig(**shown))
-    config = make(device="cpu", input_features={key: f for key, f in features.items() if key != "action"})
-    assert reads_privileged_state(config) is reads
+    assert reads_privileged_state(policy_of(make, **shown)) is reads
 
 
 @pytest.fixture(scope="module")

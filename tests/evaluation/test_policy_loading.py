@@ -82,11 +82,3 @@ def test_the_folder_that_was_trained_on_goes_before_one_of_its_name_here(trained
     caplog.set_level(logging.INFO)
     assert torch.equal(actions(load_policy(config_in(project / RUN), ENV)), expected)
     assert f"go onto the policy in {project / BASE}." in caplog.text
-
-
-def test_one_that_is_nowhere_is_named(trained, tmp_path, monkeypatch):
-    project, _, _ = trained
-    adapters = shutil.copytree(project / RUN, tmp_path / "adapters")
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=rf"the adapters in {adapters} go onto {BASE}, which is no folder.*Hub"):
-        load_policy(config_in(adapters), ENV)

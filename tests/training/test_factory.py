@@ -17,7 +17,7 @@ from tiny_checkpoints import STATE, record_one, save_policy, write_train_config
 
 from cronos_lerobot.agents.imitation.config import DemosConfig, ImitationConfig
 from cronos_lerobot.evaluation.policy_env import check_observations
-from cronos_lerobot.evaluation.processor_classes import check_processor_classes
+from cronos_lerobot.evaluation.policy_loading import check_processor_classes
 from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.factory import check_pictures, make_parts, make_policy_and_processors

@@ -114,7 +114,7 @@ def test_an_evaluation_repeats_with_its_seed(tmp_path):
     paths = []
     for seed in (3, 3, 4):
         torch.rand(1)  # Whatever else was drawn.
-        results, _ = run_independent(env, policy, processors, seed=seed, **options)
+        results = run_independent(env, policy, processors, seed=seed, **options)
         paths.append(np.stack([result.trajectory.qpos for result in results]))
     assert np.array_equal(paths[0], paths[1])
     assert not np.array_equal(paths[0], paths[2])

@@ -67,7 +67,7 @@ def of_cronos_train(ranks, checkpoint, batch_size):
     config = CronosTrainConfig(CronosEnvConfig(**STATE), policy(checkpoint))
     network, *pipelines = make_policy_and_processors(config)
     env = make_eval_env(config, batch_size, ranks.local_count)
-    results, _ = run_independent(
+    results = run_independent(
         env, network, make_processors(network, *pipelines), n_episodes=N_EPISODES, split="held_out",
         temperature=TEMPERATURE, seed=SEED, ranks=ranks, keeps_states=True,
     )  # fmt: skip
