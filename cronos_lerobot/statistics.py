@@ -4,24 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from math import inf, isfinite, nan, sqrt
+from math import inf, nan, sqrt
 
 import numpy as np
 from scipy.stats import t as student_t
-
-__all__ = [
-    "FEWEST_SEEDS",
-    "Gap",
-    "Summary",
-    "cluster_interval",
-    "effective_trials",
-    "interpolate",
-    "performance_gap",
-    "sign_flip_p",
-    "success_at",
-    "summarise",
-    "wilson_interval",
-]
 
 Numbers = Sequence[float] | np.ndarray
 
@@ -111,18 +97,14 @@ class Summary:
     """One number per seed, aggregated."""
 
     mean: float
+    """NaN without seeds, or if the number of one is NaN."""
     std: float | None
     """Sample standard deviation (ddof = 1); None for one seed."""
     ci95: tuple[float, float] | None
     """Student's 95 % interval of the mean; None for fewer than `FEWEST_SEEDS` seeds, or if all are equal."""
-    n: int
-    """Seeds."""
-
-    def __str__(self) -> str:
-        return f"{self.mean:.3f}" if self.std is None else f"{self.mean:.3f} ± {self.std:.3f}"
 
 
-def summarise(values: Numbers, bounds: tuple[float, float] = (-inf, inf)) -> Summary | None:
+def summarise(values: Numbers, bounds: tuple[float, float] = (-inf, inf)) -> Summary:
     """Mean, standard deviation and Student's interval over seeds.
 
     With three to five seeds this interval has the stated coverage, while a bootstrap of three seeds covers .73 and
@@ -131,62 +113,41 @@ def summarise(values: Numbers, bounds: tuple[float, float] = (-inf, inf)) -> Sum
     Args:
         values: one per seed.
         bounds: range of possible values, to which the interval is cut.
-
-    Returns:
-        None if there is no value or one is NaN.
     """
     numbers = np.asarray(values, float)
     n = len(numbers)
     if n == 0 or not np.isfinite(numbers).all():
-        return None
-    mean = float(numbers.mean())
-    if n == 1:
-        return Summary(mean, None, None, 1)
-    std = float(numbers.std(ddof=1))
-    if n < FEWEST_SEEDS or std == 0:
-        return Summary(mean, std, None, n)
+        return Summary(nan, None, None)
+    mean, std = float(numbers.mean()), float(numbers.std(ddof=1)) if n > 1 else None
+    if n < FEWEST_SEEDS or not std:
+        return Summary(mean, std, None)
     low, high = student_t.interval(0.95, n - 1, mean, std / sqrt(n))
-    return Summary(mean, std, (max(float(low), bounds[0]), min(float(high), bounds[1])), n)
+    return Summary(mean, std, (max(float(low), bounds[0]), min(float(high), bounds[1])))
 
 
-@dataclass(frozen=True)
-class Gap:
-    """Area between a learning curve and the optimum."""
+def performance_gap(x: Numbers, y: Numbers, up_to: float | None = None) -> float:
+    """D or C (paper, Equations 3 and 4) over the length of the axis: the mean gap to the optimum, 0 to 1.
 
-    area: float
-    """D if `x` is interaction steps, C if it is interventions; in units of `x`. Smaller is better."""
-    length: float
-    """Of the axis: last `x` minus first."""
-
-    @property
-    def normalised(self) -> float:
-        """Mean gap, 0 to 1: area over length; NaN if the axis has no length."""
-        return self.area / self.length if self.length > 0 else nan
-
-
-def performance_gap(x: Numbers, y: Numbers, up_to: float | None = None) -> Gap:
-    """D or C (paper, Equations 3 and 4) by the trapezoid rule, from the first evaluation on.
-
-    Several evaluations at one `x` are a vertical part of the curve, without area. That happens on the axis of
-    interventions if nothing was reset between two evaluations.
+    By the trapezoid rule, from the first evaluation on. Several evaluations at one `x` are a vertical part of the
+    curve, without area. That happens on the axis of interventions if nothing was reset between two evaluations.
 
     Args:
         x: (points,) interaction steps or interventions at each evaluation, never falling.
         y: (points,) success at each evaluation, 0 to 1.
         up_to: end of the axis; None for the last evaluation. Give runs the same end before you compare their gaps.
-            The gap is NaN if the curve does not reach the end.
+
+    Returns:
+        NaN if the curve does not reach the end, or has no length.
 
     Raises:
         ValueError: the curve has no point, or `x` falls.
     """
-    xs, ys = _curve(x, y)
-    if up_to is not None:
-        end = float(interpolate(xs, ys, [up_to], is_first=True)[0])
-        if not isfinite(end):
-            return Gap(nan, nan)
-        inside = xs < up_to
-        xs, ys = np.append(xs[inside], up_to), np.append(ys[inside], end)
-    return Gap(float(np.trapezoid(OPTIMUM - ys, xs)), float(xs[-1] - xs[0]))
+    xs, ys = np.asarray(x, float), np.asarray(y, float)
+    end = xs[-1] if up_to is None else up_to
+    inside, last = xs < end, interpolate(xs, ys, [end], is_first=True)
+    xs, ys = np.append(xs[inside], end), np.append(ys[inside], last)
+    length = float(end - xs[0])
+    return float(np.trapezoid(OPTIMUM - ys, xs)) / length if length > 0 else nan
 
 
 def success_at(x: Numbers, y: Numbers, at: float) -> float:
@@ -209,17 +170,9 @@ def interpolate(x: Numbers, y: Numbers, at: Numbers, *, is_first: bool = False) 
     Raises:
         ValueError: the curve has no point, or `x` falls.
     """
-    xs, ys = _curve(x, y)
-    places = np.asarray(at, float)
+    xs, ys, places = (np.asarray(numbers, float) for numbers in (x, y, at))
+    if np.any(np.diff(xs) < 0):
+        raise ValueError("x must not fall along a curve")
     if is_first:
         return np.interp(-places, -xs[::-1], ys[::-1], nan, nan)
     return np.interp(places, xs, ys, nan, nan)
-
-
-def _curve(x: Numbers, y: Numbers) -> tuple[np.ndarray, np.ndarray]:
-    xs, ys = np.asarray(x, float), np.asarray(y, float)
-    if len(xs) == 0 or xs.shape != ys.shape:
-        raise ValueError(f"a curve needs as many x as y, at least one, got {xs.shape} and {ys.shape}")
-    if np.any(np.diff(xs) < 0):
-        raise ValueError("x must not fall along a curve")
-    return xs, ys

@@ -16,47 +16,36 @@ from cronos_lerobot.statistics import (
 )
 
 
-def test_gap_is_the_area_above_the_curve():
+def test_gap_is_the_area_above_the_curve_over_its_length():
     # Trapezoids: 10 * (0.8 + 0.6) / 2 + 30 * (0.6 + 0.2) / 2 = 7 + 12.
-    gap = performance_gap([0, 10, 40], [0.2, 0.4, 0.8])
-    assert (gap.area, gap.length) == (pytest.approx(19), 40)
-    assert gap.normalised == pytest.approx(19 / 40)
-
-
-def test_gap_of_the_optimum_and_of_nothing():
-    assert performance_gap([0, 5], [1, 1]).normalised == 0
-    assert performance_gap([0, 5], [0, 0]).normalised == 1
-
-
-def test_gap_begins_at_the_first_evaluation():
-    # Nothing is assumed of what came before it.
-    assert performance_gap([10, 20], [0.5, 0.5]).length == 10
+    assert performance_gap([0, 10, 40], [0.2, 0.4, 0.8]) == pytest.approx(19 / 40)
+    # Nothing is assumed of what came before the first evaluation.
+    assert performance_gap([10, 20], [0.5, 0.5]) == 0.5
+    assert performance_gap([0, 5], [1, 1]) == 0
+    assert performance_gap([0, 5], [0, 0]) == 1
 
 
 def test_several_evaluations_at_one_number_of_interventions():
     # From 0 to 10 the curve goes from the last evaluation at 0 (.4) to the first at 10 (.6), from 10 to 20 from
     # the last at 10 (.8) to .9: 10 * (.6 + .4) / 2 + 10 * (.2 + .1) / 2.
     x, y = [0, 0, 10, 10, 20], [0.2, 0.4, 0.6, 0.8, 0.9]
-    assert performance_gap(x, y).area == pytest.approx(5 + 1.5)
+    assert performance_gap(x, y) == pytest.approx((5 + 1.5) / 20)
     assert interpolate(x, y, [0, 5, 10, 15, 20]).tolist() == pytest.approx([0.4, 0.5, 0.8, 0.85, 0.9])
 
 
 def test_run_that_was_never_reset_has_no_reset_efficiency():
-    gap = performance_gap([0, 0, 0], [0.2, 0.3, 0.4])
-    assert gap.area == 0
-    assert isnan(gap.normalised)
+    assert isnan(performance_gap([0, 0, 0], [0.2, 0.3, 0.4]))
     assert success_at([0, 0, 0], [0.2, 0.3, 0.4], 0) == 0.4
 
 
 def test_gap_up_to_a_shared_end():
     x, y = [0, 10, 20], [0.0, 0.5, 1.0]
     # Up to 15 it ends at .75: 10 * (1 + .5) / 2 + 5 * (.5 + .25) / 2.
-    gap = performance_gap(x, y, up_to=15)
-    assert (gap.area, gap.length) == (pytest.approx(7.5 + 1.875), 15)
+    assert performance_gap(x, y, up_to=15) == pytest.approx((7.5 + 1.875) / 15)
     assert performance_gap(x, y, up_to=20) == performance_gap(x, y)
-    assert isnan(performance_gap(x, y, up_to=21).normalised)
+    assert isnan(performance_gap(x, y, up_to=21))
     # What follows at the end itself is beyond it.
-    assert performance_gap([0, 10, 10, 20], [0.0, 0.5, 0.9, 1.0], up_to=10).area == pytest.approx(7.5)
+    assert performance_gap([0, 10, 10, 20], [0.0, 0.5, 0.9, 1.0], up_to=10) == pytest.approx(0.75)
 
 
 def test_success_is_never_extrapolated():
@@ -68,27 +57,16 @@ def test_success_is_never_extrapolated():
 
 
 def test_curve_must_be_a_curve():
-    with pytest.raises(ValueError, match="must not fall"):
+    with pytest.raises(ValueError, match="fall"):
         performance_gap([10, 0], [0.1, 0.2])
-    with pytest.raises(ValueError, match="at least one"):
+    with pytest.raises(ValueError, match="empty"):
         success_at([], [], 0)
-    with pytest.raises(ValueError, match="as many x as y"):
-        performance_gap([0, 1], [0.1])
-
-
-def test_summary_over_seeds():
-    summary = summarise([0.2, 0.4, 0.9])
-    assert summary is not None
-    assert (summary.mean, summary.n) == (pytest.approx(0.5), 3)
-    # Squares of the deviations: .09 + .01 + .16, over n - 1 = 2.
-    assert summary.std == pytest.approx(sqrt(0.26 / 2))
-    assert str(summary) == "0.500 ± 0.361"
 
 
 def test_interval_of_three_seeds_by_a_table_of_students_t():
-    # t with 2 degrees of freedom is 4.303 at 97.5 %; the standard error is sqrt(.13 / 3).
+    # Squares of the deviations: .09 + .01 + .16, over n - 1 = 2. t with 2 degrees of freedom is 4.303 at 97.5 %.
     summary = summarise([0.2, 0.4, 0.9])
-    assert summary is not None
+    assert (summary.mean, summary.std) == (pytest.approx(0.5), pytest.approx(sqrt(0.26 / 2)))
     half = 4.303 * sqrt(0.13 / 3)
     assert summary.ci95 == (pytest.approx(0.5 - half, abs=1e-4), pytest.approx(0.5 + half, abs=1e-4))
 
@@ -96,18 +74,17 @@ def test_interval_of_three_seeds_by_a_table_of_students_t():
 @pytest.mark.parametrize("num_seeds", [3, 5])
 def test_interval_over_few_seeds_covers_what_it_says(num_seeds):
     runs = np.random.default_rng(0).normal(0.8, 0.05, (2000, num_seeds))
-    intervals = [summary.ci95 for run in runs if (summary := summarise(run)) is not None]
+    intervals = [summarise(run).ci95 for run in runs]
     covered = sum(low <= 0.8 <= high for low, high in intervals)
     # .95 of 2000, within four standard errors of sqrt(2000 * .95 * .05) = 9.7.
     assert abs(covered - 1900) < 40
 
 
-def test_one_seed_has_no_spread_and_a_missing_one_no_summary():
-    summary = summarise([0.5])
-    assert summary is not None
-    assert (summary.mean, summary.std, summary.ci95, str(summary)) == (0.5, None, None, "0.500")
-    assert summarise([]) is None
-    assert summarise([0.5, float("nan")]) is None
+def test_one_seed_has_no_spread_and_a_missing_one_no_mean():
+    one = summarise([0.5])
+    assert (one.mean, one.std, one.ci95) == (0.5, None, None)
+    assert isnan(summarise([]).mean)
+    assert isnan(summarise([0.5, float("nan")]).mean)
 
 
 def test_interval_over_seeds_needs_three_that_differ_and_ends_where_rates_do():

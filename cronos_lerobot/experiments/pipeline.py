@@ -84,7 +84,7 @@ class Runner:
     ) -> None:
         self._threads = threads
         self._show, self._log = show, log
-        self._ranks: set[subprocess.Popen] = set()
+        self._running: set[subprocess.Popen] = set()
         self._stopping = threading.Event()
 
     def run(self, commands: Sequence[Command]) -> None:
@@ -102,10 +102,10 @@ class Runner:
     def stop(self) -> None:
         """Ask running commands to end, and wait until they have saved what they want to keep."""
         self._stopping.set()
-        for process in list(self._ranks):
+        for process in list(self._running):
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGTERM)
-        for process in list(self._ranks):
+        for process in list(self._running):
             # Not `process.wait`: the thread that we may have interrupted is in it, with its lock.
             with suppress(ChildProcessError):
                 os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
@@ -143,9 +143,9 @@ class Runner:
                 )
             finally:
                 signal.pthread_sigmask(signal.SIG_UNBLOCK, {WARNING})
-            self._ranks.add(process)
+            self._running.add(process)
             code = process.wait()
-            self._ranks.discard(process)
+            self._running.discard(process)
             return code
 
 

@@ -8,13 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cronos_lerobot.experiments.definitions import Experiment
-from cronos_lerobot.experiments.tables import curve
-from cronos_lerobot.report.figures import COLORS, INK, SPLIT_LABELS, style_axes
-from cronos_lerobot.statistics import interpolate
+from cronos_lerobot.experiments.tables import curves
+from cronos_lerobot.report.figures import COLORS, INK, SPLIT_LABELS, draw_curve, mean_curve, style_axes
 
 AXES = {"steps": "interaction steps, all streams", "interventions": "interventions, all streams"}
-POINTS = 60
-"""Places at which the curves of several seeds are averaged."""
 
 
 def curves_figure(experiment: Experiment, found: pd.DataFrame) -> Figure:
@@ -51,10 +48,7 @@ def bars_figure(experiment: Experiment, found: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(10, 0.55 * len(experiment.rows) + 1.2), layout="constrained")
     ax = figure.subplots()
     y = np.arange(len(experiment.rows))
-    ends = [
-        [curve(run, "train")["success"].iloc[-1] for _, run in found[found["row"] == row.name].groupby("seed")]
-        for row in experiment.rows
-    ]
+    ends = [[one["success"].iloc[-1] for one in curves(found, row, "train")] for row in experiment.rows]
     ours = [(np.mean(end), np.std(end, ddof=1) if len(end) > 1 else 0) if end else (np.nan, 0) for end in ends]
     for shift, color, label, numbers in (
         (-0.2, COLORS[0], "here", ours),
@@ -74,28 +68,20 @@ def draw_rows(
     ax: Axes, experiment: Experiment, found: pd.DataFrame, split: str, axis: str, task: str | None = None
 ) -> None:
     """Draw the mean of each row's seeds, and their standard deviation as a band; `task` None is all tasks."""
-    for row, color in zip(experiment.rows, COLORS * 2, strict=False):
-        curves = [curve(run, split) for _, run in found[found["row"] == row.name].groupby("seed")]
-        points = [(one[axis].to_numpy(float), _success(one, task)) for one in curves if one[axis].notna().any()]
-        if not points:
-            continue
-        x = np.linspace(max(x[0] for x, _ in points), min(x[-1] for x, _ in points), POINTS)
-        y = np.array([interpolate(*one, x) for one in points])
-        ax.plot(x, y.mean(0), color=color, lw=1.6, label=f"{row.label} ({len(points)} seeds)")
-        if len(points) > 1:
-            ax.fill_between(
-                x, y.mean(0) - y.std(0, ddof=1), y.mean(0) + y.std(0, ddof=1), color=color, alpha=0.15, lw=0
-            )
+    for i, row in enumerate(experiment.rows):
+        known = [one for one in curves(found, row, split) if one[axis].notna().all()]
+        if known:
+            mean = mean_curve([(one[axis], _success(one, task)) for one in known])
+            draw_curve(ax, mean, i, row.label, len(known))
     style_axes(ax, AXES[axis])
     if axis == "interventions":
         ax.set_xscale("symlog", linthresh=100)
 
 
-def _success(one: pd.DataFrame, task: str | None) -> np.ndarray:
+def _success(one: pd.DataFrame, task: str | None) -> list[float]:
     if task is None:
-        return one["success"].to_numpy(float)
-    by_task = [{part["part"]: part["success"] for part in some} for some in one["parts"]]
-    return np.array([found[task] for found in by_task], float)
+        return list(one["success"])
+    return [part["success"] for parts in one["parts"] for part in parts if part["part"] == task]
 
 
 def _legend(figure: Figure, ax: Axes) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cronos_lerobot.experiments.pipeline import CommandFailedError, Pipeline, Runner, await_all
+from cronos_lerobot.experiments.pipeline import CommandFailedError, Pipeline, Runner
 
 JOB_NAME = "cronos"
 
@@ -83,15 +83,3 @@ def submit(
     executor.update_parameters(job_name=name, cpus_per_task=threads, stderr_to_stdout=True, **parameters)
     with executor.batch():
         return [executor.submit(Element(pipeline, threads)) for pipeline in pipelines]
-
-
-def run_on_slurm(
-    pipelines: Sequence[Pipeline],
-    folder: Path,
-    parameters: dict[str, Any],
-    threads: int,
-    requeues: int,
-    progress: Callable[[], None],
-) -> list[str]:
-    """Submit pipelines, follow them to their end; returns why they failed, a line each. See `submit`."""
-    return await_all(pipelines, submit(pipelines, folder, parameters, threads, requeues), progress)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isnan
+from pathlib import Path
 
 import pandas as pd
 
-from cronos_lerobot.experiments.definitions import Experiment
+from cronos_lerobot.experiments.definitions import Experiment, Row
 from cronos_lerobot.experiments.plan import Run
+from cronos_lerobot.report.load import EVALUATIONS, TRAIN, load_evaluations
 from cronos_lerobot.statistics import Summary, performance_gap, success_at, summarise
-
-TRAIN = "cronos-train"
-"""The source of evaluations that a run makes of itself."""
 
 
 def collect(runs: Sequence[Run]) -> pd.DataFrame:
@@ -19,23 +19,28 @@ def collect(runs: Sequence[Run]) -> pd.DataFrame:
 
     One column more: `finished`, whether the run has come to its end.
     """
-    from cronos_lerobot.report.load import load_evaluations
-
     tables = []
     for run in runs:
         if not (run.folder / "train/metrics.jsonl").is_file():
             continue
         found = load_evaluations([run.folder])
+        evaluated = found["source"] != TRAIN
+        # Their folders have the steps; the base policy's own are those of its cloning.
+        found.loc[evaluated, "steps"] = [int(Path(path).parents[1].name) for path in found[evaluated]["path"]]
+        found.loc[found["steps"] == 0, "interventions"] = 0
         own = {"row": run.row.name, "seed": run.seed, "finished": (run.folder / "train/.done").is_file()}
         tables.append(found.assign(**own))
-    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=["row", "seed", "finished"])
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=[*EVALUATIONS, "finished"])
 
 
-def curve(found: pd.DataFrame, split: str) -> pd.DataFrame:
-    """One run's independent evaluations on a split by interaction steps, its own or cronos-eval's."""
-    chosen = found[(found["suite"] == "independent") & (found["split"] == split)]
-    own = chosen[chosen["source"] == TRAIN]
-    return (own if len(own) else chosen).sort_values("steps")
+def curves(found: pd.DataFrame, row: Row, split: str) -> list[pd.DataFrame]:
+    """The independent evaluations of each seed on a split by interaction steps, the run's own or cronos-eval's."""
+    chosen = found[(found["row"] == row.name) & (found["suite"] == "independent") & (found["split"] == split)]
+    several = []
+    for _, one in chosen.groupby("seed"):
+        own = one[one["source"] == TRAIN]
+        several.append((own if len(own) else one).sort_values("steps"))
+    return several
 
 
 def main_table(experiment: Experiment, found: pd.DataFrame) -> pd.DataFrame:
@@ -46,23 +51,23 @@ def main_table(experiment: Experiment, found: pd.DataFrame) -> pd.DataFrame:
     """
     rows = []
     paper = dict(zip([row.name for row in experiment.rows], experiment.paper, strict=False))
+    finished = found[found["finished"].astype(bool)]
     for row in experiment.rows:
-        runs = [run for _, run in found[(found["row"] == row.name) & found["finished"]].groupby("seed")]
-        if not runs:
+        seeds, held_out = curves(finished, row, "train"), curves(finished, row, "held_out")
+        if not seeds:
             continue
-        curves = [curve(run, "train") for run in runs]
-        held_out = [end for run in runs if len(end := curve(run, "held_out"))]
         cells = {
             "row": row.label,
-            "seeds": len(runs),
-            "base": show(summarise([one["success"].iloc[0] for one in curves])),
-            "train": show(summarise([one["success"].iloc[-1] for one in curves], (0, 1))),
+            "seeds": len(seeds),
+            "base": show(summarise([one["success"].iloc[0] for one in seeds])),
+            "train": show(summarise([one["success"].iloc[-1] for one in seeds], (0, 1))),
             "held out": show(summarise([one["success"].iloc[-1] for one in held_out], (0, 1))),
-            "n": int(curves[0]["n"].iloc[-1]),
-            "interventions": round(sum(one["interventions"].iloc[-1] for one in curves) / len(curves)),
-            "D / steps": show(summarise([_gap(one, "steps") for one in curves])),
-            "C / interventions": show(summarise([_gap(one, "interventions") for one in curves])),
+            "n": int(seeds[0]["n"].iloc[-1]),
+            "interventions": round(sum(one["interventions"].iloc[-1] for one in seeds) / len(seeds)),
         }
+        for name, axis in (("D / steps", "steps"), ("C / interventions", "interventions")):
+            gaps = [performance_gap(one[axis], one["success"]) for one in seeds]
+            cells[name] = show(summarise(gaps))
         if row.name in paper:
             cells["paper"] = "{:.3f} ± {:.3f}".format(*paper[row.name])
         rows.append(cells)
@@ -72,24 +77,21 @@ def main_table(experiment: Experiment, found: pd.DataFrame) -> pd.DataFrame:
 def budget_table(experiment: Experiment, found: pd.DataFrame, budgets: Sequence[int]) -> pd.DataFrame:
     """Success after numbers of interventions, interpolated between evaluations; empty where a run spent fewer."""
     rows = []
-    for row in experiment.rows:
-        runs = [run for _, run in found[(found["row"] == row.name) & found["finished"]].groupby("seed")]
-        curves = [curve(run, "train") for run in runs]
+    for row in experiment.rows if budgets else ():
+        seeds = curves(found[found["finished"].astype(bool)], row, "train")
         cells = {"row": row.label}
         for budget in budgets:
-            reached = [one for one in curves if one["interventions"].iloc[-1] >= budget]
-            values = [success_at(one["interventions"], one["success"], budget) for one in reached]
-            cells[f"{budget:,}"] = show(summarise(values)) if len(values) == len(curves) else ""
-        if curves and budgets:
+            is_reached = all(one["interventions"].iloc[-1] >= budget for one in seeds)
+            values = [success_at(one["interventions"], one["success"], budget) for one in seeds]
+            cells[f"{budget:,}"] = show(summarise(values)) if is_reached else ""
+        if seeds:
             rows.append(cells)
     return pd.DataFrame(rows)
 
 
 def sequential_table(experiment: Experiment, found: pd.DataFrame) -> pd.DataFrame:
     """SEQ 0-3 and the chain length of every row and split, over its finished seeds."""
-    if "suite" not in found:
-        return pd.DataFrame()
-    chosen = found[(found["suite"] == "sequential") & found["finished"]]
+    chosen = found[(found["suite"] == "sequential") & found["finished"].astype(bool)]
     rows = []
     for row in experiment.rows:
         for split, runs in chosen[chosen["row"] == row.name].groupby("split", sort=False):
@@ -104,13 +106,9 @@ def sequential_table(experiment: Experiment, found: pd.DataFrame) -> pd.DataFram
     return pd.DataFrame(rows)
 
 
-def show(summary: Summary | None) -> str:
+def show(summary: Summary) -> str:
     """Mean, standard deviation over seeds, and from three seeds on the 95 % interval of the mean."""
-    if summary is None:
+    if isnan(summary.mean):
         return ""
     interval = "" if summary.ci95 is None else " [{:.3f}, {:.3f}]".format(*summary.ci95)
     return f"{summary.mean:.3f}" + ("" if summary.std is None else f" ± {summary.std:.3f}") + interval
-
-
-def _gap(one: pd.DataFrame, axis: str) -> float:
-    return performance_gap(one[axis], one["success"]).normalised

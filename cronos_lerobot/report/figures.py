@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -85,12 +85,10 @@ def evaluation_curve(curves: Sequence[pd.DataFrame], axis: str) -> Curve:
 
 def evaluation_figure(evaluations: pd.DataFrame) -> Figure | None:
     """Success of the periodic evaluations against interaction steps and against interventions."""
-    groups = training_curves(evaluations)
-    figure = Figure(figsize=(10, 3.8), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
+    figure, axes = _subplots(3.8, columns=2, sharey=True)
     for ax, axis in zip(axes, ("steps", "interventions"), strict=True):
-        for i, (label, curves) in enumerate(groups.items()):
-            draw_curve(ax, evaluation_curve(curves, axis), i, _label(label, len(curves)), marker="o")
+        for i, (label, curves) in enumerate(training_curves(evaluations).items()):
+            draw_curve(ax, evaluation_curve(curves, axis), i, label, len(curves), marker="o")
         style_axes(ax, f"{'interaction ' * (axis == 'steps')}{axis}, all streams")
         ax.set_ylim(0, 1.02)
     axes[0].set_ylabel("evaluation success")
@@ -99,8 +97,7 @@ def evaluation_figure(evaluations: pd.DataFrame) -> Figure | None:
 
 def training_figure(updates: pd.DataFrame) -> Figure | None:
     """Success of the streams' segments, by policy update."""
-    figure = Figure(figsize=(10, 3.2), layout="constrained")
-    ax = figure.subplots()
+    figure, (ax,) = _subplots(3.2)
     _draw_updates(ax, updates, "success", 1.6)
     style_axes(ax, "interaction steps, all streams")
     ax.set(ylabel="success of training segments", ylim=(0, 1.02))
@@ -108,21 +105,25 @@ def training_figure(updates: pd.DataFrame) -> Figure | None:
 
 
 def _draw_updates(ax: Axes, updates: pd.DataFrame, name: str, width: float) -> None:
-    for i, (label, some) in enumerate(_by_row(updates)):
+    for i, (label, some) in enumerate(updates.groupby("row", sort=False)):
         runs = [run.dropna(subset=name) for _, run in some.groupby("folder", sort=False)]
         curves = [(run["steps"], run[name]) for run in runs if len(run)]
         if curves:
-            draw_curve(ax, mean_curve(curves), i, _label(label, some["folder"].nunique()), width=width)
+            draw_curve(ax, mean_curve(curves), i, str(label), some["folder"].nunique(), width=width)
 
 
 def segments_figure(segments: pd.DataFrame) -> Figure | None:
     """Training success by segment since the last scene reset, at the end of the runs."""
-    figure = Figure(figsize=(10, 3.2), layout="constrained")
-    ax = figure.subplots()
-    for i, (label, some) in enumerate(_by_row(segments)):
+    figure, (ax,) = _subplots(3.2)
+    for i, (label, some) in enumerate(segments.groupby("row", sort=False)):
         if (curve := segment_curve(some)) is not None:
-            draw_curve(ax, curve, i, _label(label, some["folder"].nunique()), marker="o")
-    style_segment_axis(ax)
+            draw_curve(ax, curve, i, str(label), some["folder"].nunique(), marker="o")
+    style_axes(ax, "segment since the last scene reset (1 is the first after it)")
+    if ax.lines and ax.dataLim.xmax > SINGLE:
+        ax.set_xscale("log", base=2)
+        ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    else:
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set(ylabel="success of training segments", ylim=(0, 1.02))
     return _finished(figure)
 
@@ -140,25 +141,13 @@ def segment_curve(segments: pd.DataFrame) -> Curve | None:
     return Curve(*(column.to_numpy(float) for column in (rates["x"], rates["success"], low, high)))
 
 
-def style_segment_axis(ax: Axes) -> None:
-    """The axis of a `segment_curve`, logarithmic if its spans double."""
-    style_axes(ax, "segment since the last scene reset (1 is the first after it)")
-    if ax.lines and ax.dataLim.xmax > SINGLE:
-        ax.set_xscale("log", base=2)
-        ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-    else:
-        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-
-
 def segment_history_figure(segments: pd.DataFrame) -> Figure | None:
     """Training success by segment since the last scene reset, over the run: a heat map for each row."""
-    groups = [(label, some[some["kind"] == "segment"]) for label, some in _by_row(segments)]
-    groups = [(label, some) for label, some in groups if len(some)]
+    groups = list(segments[segments["kind"] == "segment"].groupby("row", sort=False))
     if not groups:
         return None
     rows = -(-len(groups) // 2)
-    figure = Figure(figsize=(10, 3.2 * rows), layout="constrained")
-    axes = list(figure.subplots(rows, min(2, len(groups)), squeeze=False).flat)
+    figure, axes = _subplots(3.2 * rows, rows, min(2, len(groups)))
     mesh: Any = None
     for ax, (label, some) in zip(axes, groups, strict=False):
         edges, rates = segment_history(some)
@@ -166,7 +155,7 @@ def segment_history_figure(segments: pd.DataFrame) -> Figure | None:
         style_axes(ax, "interaction steps, all streams", grid=False)
         ax.yaxis.set_major_locator(MaxNLocator(integer=True))
         ax.set_ylabel("segment since the reset")
-        ax.set_title(_label(label, some["folder"].nunique()), fontsize=9, color=INK, loc="left")
+        ax.set_title(_label(str(label), some["folder"].nunique()), fontsize=9, color=INK, loc="left")
     figure.colorbar(mesh, ax=axes, label="success", shrink=0.9)
     _remove(axes[len(groups) :])
     return figure
@@ -197,8 +186,7 @@ def agent_figure(updates: pd.DataFrame) -> Figure | None:
     if not panels:
         return None
     rows = -(-len(panels) // 3)
-    figure = Figure(figsize=(10, 2.3 * rows), layout="constrained")
-    axes = list(figure.subplots(rows, 3, squeeze=False).flat)
+    figure, axes = _subplots(2.3 * rows, rows, 3)
     for ax, (name, title) in zip(axes, panels, strict=False):
         _draw_updates(ax, updates, name, 1.2)
         style_axes(ax, "")
@@ -213,8 +201,7 @@ def part_figure(evaluations: pd.DataFrame, suite: str) -> Figure | None:
     if drawn.empty:
         return None
     splits, policies = list(drawn["split"].unique()), list(drawn["policy"].unique())
-    figure = Figure(figsize=(10, 3.8), layout="constrained")
-    axes = figure.subplots(1, len(splits), squeeze=False, sharey=True)[0]
+    figure, axes = _subplots(3.8, columns=len(splits), sharey=True)
     for ax, split in zip(axes, splits, strict=True):
         for _, one in drawn[drawn["split"] == split].iterrows():
             _draw_parts(ax, one["parts"], policies.index(one["policy"]), len(policies), one["policy"])
@@ -233,22 +220,13 @@ def _draw_parts(ax: Axes, parts: Sequence[dict[str, Any]], i: int, number: int, 
     width = 0.8 / number
     x = 1 + np.arange(len(y)) + (i - (number - 1) / 2) * width
     color, _, hatch = style_of(i)
-    errors = np.abs(ends - y[:, None]).T
-    ax.bar(
-        x,
-        y,
-        0.92 * width,
-        yerr=errors,
-        ecolor=INK,
-        color=color,
-        hatch=hatch,
-        edgecolor="white",
-        label=_label(label),
-    )
+    look = {"color": color, "hatch": hatch, "edgecolor": "white", "ecolor": INK}
+    ax.bar(x, y, 0.92 * width, yerr=np.abs(ends - y[:, None]).T, label=_label(label), **look)
 
 
-def _by_row(table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    return iter(table.groupby("row", sort=False)) if len(table) else iter(())
+def _subplots(height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(10, height), layout="constrained")
+    return figure, list(figure.subplots(rows, columns, squeeze=False, **options).flat)
 
 
 def _label(label: str, seeds: int = 1) -> str:
@@ -264,11 +242,12 @@ def style_of(i: int) -> tuple[str, Any, str]:
 
 
 def draw_curve(
-    ax: Axes, curve: Curve, i: int, label: str, *, marker: str = "", width: float = 1.6, marker_size: float = 4
+    ax: Axes, curve: Curve, i: int, label: str, seeds: int, *, marker: str = "", width: float = 1.6
 ) -> None:
-    """Draw a line and its band in the style number `i`."""
+    """Draw the line of some seeds and its band in the style number `i`."""
     color, line, _ = style_of(i)
-    ax.plot(curve.x, curve.y, linestyle=line, color=color, lw=width, marker=marker, ms=marker_size, label=label)
+    text = _label(label, seeds)
+    ax.plot(curve.x, curve.y, linestyle=line, color=color, lw=width, marker=marker, ms=4, label=text)
     ax.fill_between(curve.x, curve.low, curve.high, color=color, alpha=0.18, lw=0)
 
 

@@ -16,15 +16,15 @@ import pandas as pd
 from lerobot_env_cronos.config import DEFAULT_SCENE
 from lerobot_env_cronos.scene.scenes import get_scene
 
-from cronos_lerobot.evaluation.results import find_results, read_results
+from cronos_lerobot.evaluation.eval_info import EVAL_INFO
+from cronos_lerobot.evaluation.results import find_results, find_videos, read_results, videos_below
+from cronos_lerobot.evaluation.suites import SUITES
 from cronos_lerobot.report.runs import TrainingRun, group_runs, read_training_run
 from cronos_lerobot.statistics import cluster_interval
 from cronos_lerobot.training.run_folder import METRICS
 
-EVAL_INFO = "eval_info.json"
 TRAIN, CRONOS_EVAL, LEROBOT_EVAL = "cronos-train", "cronos-eval", "lerobot-eval"
 """Values of the column `source`."""
-SUITES = ("independent", "sequential", "stream")
 SETTING = (
     "scene", "environment", "benchmark", "advance", "end_effector_reset", "temperature", "obs_type", "renderer",
     "versions",
@@ -41,6 +41,7 @@ UPDATES = [
     "diverged",
 ]  # fmt: skip
 SEGMENTS = [*IDENTITY, "steps", "cycle", "is_late", "kind", "part", "successes", "n"]
+TABLES = ("evaluations", "updates", "segments", "interventions")
 APART = ("found_complete", "never_grasped")
 """Of the successes: those of tasks that were complete when they were given, and others without a grasp."""
 LENGTH = 300
@@ -80,33 +81,26 @@ class Loaded:
 
 
 def load_evaluations(folders: Iterable[Path]) -> pd.DataFrame:
-    """Read the evaluations by cronos-train, cronos-eval and lerobot-eval in some folders and below them.
+    """Read the evaluations by cronos-train, cronos-eval and lerobot-eval in folders and below them, see `load`.
 
     Returns:
         One row per evaluation:
         source; experiment (job name of the run); row (what tells it from other runs, or the policy); seed; run and
         folder; steps and interventions of the training; split; suite; n; success, ci95_low and ci95_high;
         found_complete and never_grasped; policy; fingerprint; path; trained_in (folder of the run that made the
-        policy); is_alike (made like the last one of the run); is_budget_spent; parts (cells by task, position or
-        segment); episodes ((n, 4) int: seed, number, configuration, length); setting (see `SETTING`).
-
-    Raises:
-        FileNotFoundError: a folder is missing or holds no run and no evaluation.
-        ValueError: nothing can be read.
+        policy); is_alike (made like the last one of the run) and is_budget_spent, of cronos-train alone; parts
+        (cells by task, position or segment); episodes ((n, 4) int: seed, number, configuration, length); setting
+        (see `SETTING`).
     """
     return load(folders).evaluations
 
 
 def load_metrics(folders: Iterable[Path]) -> pd.DataFrame:
-    """Read the policy updates of cronos-train in some folders and below them.
+    """Read the policy updates of cronos-train in some folders and below them, see `load`.
 
     Returns:
         One row per update: experiment, row, seed, run, folder, steps, interventions, updates, success, segments,
         reward_per_segment, diverged, steps_per_s, `agent/...` and `time/...`.
-
-    Raises:
-        FileNotFoundError: a folder is missing or holds no run and no evaluation.
-        ValueError: nothing can be read.
     """
     return load(folders).updates
 
@@ -126,39 +120,29 @@ def load(folders: Iterable[Path], scene: str | None = None) -> Loaded:
     left_out: list[str] = []
     read = _read_each(metrics, lambda path: tables_of(read_training_run(path.parent)), left_out)
     by_folder = {one.runs[0].folder: one for one in read}
-    groups = group_runs([one.runs[0] for one in read], left_out)
-    trained = [_named(by_folder[run.folder], label) for label, runs in groups.items() for run in runs]
-    runs = [run for one in trained for run in one.runs]
+    loaded = []
+    for label, runs in group_runs([one.runs[0] for one in read], left_out).items():
+        for one in (by_folder[run.folder] for run in runs):
+            for name in TABLES:
+                getattr(one, name)["row"] = label
+            loaded.append(one)
+    runs = [one.runs[0] for one in loaded]
     left_out += [text for run in runs for text in _said_of(run)]
-    tasks = _task_names(scene or _scene_of(runs))
-    evaluated = _read_each(results, _read_results, left_out)
-    evaluated += _read_each(infos, lambda path: _read_eval_info(path, tasks), left_out)
-    if not trained and not evaluated:
+    scenes = {run.config["env"].get("scene") for run in runs} - {None}
+    scene = scene or (str(scenes.pop()) if len(scenes) == 1 else DEFAULT_SCENE)
+    tasks = [task.instruction for task in get_scene(scene).tasks]
+    loaded += _read_each(results, _read_results, left_out)
+    loaded += _read_each(infos, lambda path: _read_eval_info(path, tasks), left_out)
+    if not loaded:
         raise ValueError("; ".join(left_out))
-    whole = join([*trained, *evaluated])
-    whole.left_out = left_out
+    whole = Loaded(runs, videos=[video for one in loaded for video in one.videos], left_out=left_out)
+    for name in TABLES:
+        if tables := [table for one in loaded if len(table := getattr(one, name))]:
+            found = pd.concat(tables, ignore_index=True)
+            columns = dict.fromkeys([*getattr(whole, name), *found])
+            setattr(whole, name, found.reindex(columns=columns))
     _add_runs(whole.evaluations)
     return whole
-
-
-def join(several: Sequence[Loaded]) -> Loaded:
-    """All of them in one."""
-    whole = Loaded()
-    for name in ("evaluations", "updates", "segments", "interventions"):
-        tables = [table for one in several if len(table := getattr(one, name))]
-        if tables:
-            found, first = pd.concat(tables, ignore_index=True), list(getattr(whole, name))
-            setattr(whole, name, found.reindex(columns=dict.fromkeys([*first, *found])))
-    for name in ("runs", "videos", "left_out"):
-        setattr(whole, name, [item for one in several for item in getattr(one, name)])
-    return whole
-
-
-def _named(one: Loaded, label: str) -> Loaded:
-    """The tables of a run with this label in the column `row`."""
-    for table in (one.evaluations, one.updates, one.segments, one.interventions):
-        table["row"] = label
-    return one
 
 
 def _find(folders: Iterable[Path]) -> tuple[list[Path], list[Path], list[Path]]:
@@ -226,32 +210,21 @@ def _check_counters(table: pd.DataFrame) -> None:
             raise ValueError(f"{name} must be numbers that never fall")
 
 
-def _evaluation_cells(run: TrainingRun) -> list[Cells]:
-    start = run.starts[-1]
-    env = run.config["env"]
-    setting = dict.fromkeys(SETTING) | {
-        "scene": env.get("scene"),
-        "environment": start.get("environment"),
-        "benchmark": (start.get("benchmark") or {}).get("fingerprint"),
-        "obs_type": env.get("obs_type"),
-        "renderer": env.get("renderer"),
-        "versions": start.get("versions"),
-    }
+def _evaluation_cells(run: TrainingRun) -> Iterator[Cells]:
+    start, env = run.starts[-1], run.config["env"]
+    setting = dict.fromkeys(SETTING) | {name: env.get(name) for name in ("scene", "obs_type", "renderer")}
+    setting |= {name: start.get(name) for name in ("environment", "versions")}
+    setting["benchmark"] = (start.get("benchmark") or {}).get("fingerprint")
     alike, budget = run.alike, run.config["protocol"].get("reset_budget")
-    rows = []
     for one in run.evaluations:
-        episodes = np.array(one["episodes"], int).reshape(-1, 4)
-        rows.append(
-            {"source": TRAIN, "steps": one["interaction_steps"], "interventions": one["interventions"]}
-            | {"split": str(one["split"]), "suite": "independent"}
-            | _rate(one)
-            | {"policy": run.name, "fingerprint": f"{run.folder} {one['interaction_steps']}"}
-            | {"path": str(run.folder / METRICS), "is_alike": one in alike, "trained_in": str(run.folder)}
-            | {"is_budget_spent": budget is not None and one["interventions"] >= budget}
-            | {"parts": [{"part": str(task)} | _rate(rate) for task, rate in one["per_task"].items()]}
-            | {"episodes": episodes, "setting": setting | {"temperature": one["temperature"]}}
-        )
-    return rows
+        steps, interventions = one["interaction_steps"], one["interventions"]
+        cells = {"source": TRAIN, "steps": steps, "interventions": interventions, "split": str(one["split"])}
+        cells |= {"suite": "independent", "policy": run.name, "fingerprint": f"{run.folder} {steps}"}
+        cells |= {"path": str(run.folder / METRICS), "trained_in": str(run.folder), "is_alike": one in alike}
+        cells |= {"is_budget_spent": budget is not None and interventions >= budget}
+        cells |= {"parts": [{"part": str(task)} | _rate(rate) for task, rate in one["per_task"].items()]}
+        cells |= {"episodes": np.array(one["episodes"], int).reshape(-1, 4)}
+        yield cells | _rate(one) | {"setting": setting | {"temperature": one["temperature"]}}
 
 
 def _update_cells(update: Cells) -> Cells:
@@ -315,30 +288,21 @@ def _said_of(run: TrainingRun) -> Iterator[str]:
 
 def _read_results(path: Path) -> Loaded:
     results = read_results(path)
-    benchmark = results["benchmark"]
     columns = ("seed", "number", "configuration", "length")
     episodes = np.array([[episode[name] for name in columns] for episode in results["episodes"]], int)
-    parts = list(_parts(results))
     overall = results if "success" in results else results["positions"][-1]
-    cells = {"source": CRONOS_EVAL, "split": results["split"], "suite": results["suite"]} | _rate(overall)
-    cells |= {"n": len(episodes), "policy": policy_name(results["policy"])}
-    cells |= {
-        "fingerprint": results["policy_fingerprint"],
-        "path": str(path),
-        "is_alike": True,
-        "is_budget_spent": False,
-    }
-    cells |= {"parts": parts, "episodes": episodes.reshape(-1, 4)}
-    cells["setting"] = {name: results.get(name) for name in SETTING} | {"benchmark": benchmark["fingerprint"]}
-    parent, found, checkpoint = results["policy"].partition("/checkpoints/")
+    folder, found, checkpoint = results["policy"].partition("/checkpoints/")
     step = checkpoint.split("/")[0]
-    cells |= {"trained_in": str(Path(parent).resolve()) if found else ""}
-    cells |= {"steps": int(step) if step.isdigit() else np.nan}
+    cells = _rate(overall) | {name: results[name] for name in ("split", "suite")}
+    cells |= {"source": CRONOS_EVAL, "n": len(episodes), "policy": policy_name(results["policy"])}
+    cells |= {"fingerprint": results["policy_fingerprint"], "path": str(path), "parts": list(_parts(results))}
+    cells |= {"trained_in": str(Path(folder).resolve()) if found else ""}
+    cells |= {"steps": int(step) if step.isdigit() else np.nan, "episodes": episodes.reshape(-1, 4)}
+    fingerprint = results["benchmark"]["fingerprint"]
+    cells["setting"] = {name: results.get(name) for name in SETTING} | {"benchmark": fingerprint}
     title = f"{results['suite']}, {results['split'].replace('_', '-')}"
-    videos = [
-        Video(video, title, f"{cells['policy']}: {video.stem.replace('_', ' ')}")
-        for video in videos_below(path.parent, "videos/*.mp4")
-    ]
+    caption = f"{cells['policy']}: "
+    videos = [Video(video, title, caption + video.stem.replace("_", " ")) for video in find_videos(path)]
     return Loaded(evaluations=pd.DataFrame([cells]), videos=videos)
 
 
@@ -359,31 +323,25 @@ def _parts(results: Cells) -> Iterator[Cells]:
 
 
 def _read_eval_info(path: Path, tasks: Sequence[str]) -> Loaded:
-    suites: dict[str, list[tuple[int, list[bool]]]] = {}
+    groups: dict[str, list[tuple[int, list[bool]]]] = {}
     for entry in json.loads(path.read_text())["per_task"]:
         flags = [bool(flag) for flag in entry["metrics"]["successes"]]
-        suites.setdefault(entry["task_group"], []).append((int(entry["task_id"]), flags))
+        groups.setdefault(entry["task_group"], []).append((int(entry["task_id"]), flags))
     rows, videos = [], []
-    for group, entries in suites.items():
+    for group, entries in groups.items():
         suite, _, split = group.partition("_")
         if suite not in SUITES:
             raise ValueError(f"{path} is of another environment: its task group is {group!r:.50}")
         names = tasks if suite == "independent" else ()
         titles = [names[i] if i < len(names) else f"{suite} {i}" for i, _ in entries]
-        parts = [{"part": title} | _flags_rate(flags) for title, (_, flags) in zip(titles, entries, strict=True)]
         # Episode i of every task has the same seed, which is unknown.
         episodes = [(0, number, i, int(flag)) for number, flags in entries for i, flag in enumerate(flags)]
         table = np.array(episodes, int).reshape(-1, 4)
-        cells = {"source": LEROBOT_EVAL, "split": split, "suite": suite} | _flags_rate(table[:, 3], table[:, 2])
-        cells |= {
-            "policy": path.parent.name,
-            "fingerprint": str(path),
-            "path": str(path),
-            "is_alike": True,
-            "is_budget_spent": False,
-        }
-        cells |= {"parts": parts, "episodes": table, "setting": dict.fromkeys(SETTING)}
-        rows.append(cells | {"trained_in": "", "steps": np.nan})
+        cells = {"source": LEROBOT_EVAL, "split": split, "suite": suite, "policy": path.parent.name}
+        cells |= _flags_rate(table[:, 3], table[:, 2]) | {"fingerprint": str(path), "path": str(path)}
+        cells |= {"episodes": table, "setting": dict.fromkeys(SETTING), "trained_in": "", "steps": np.nan}
+        parts = [{"part": title} | _flags_rate(flags) for title, (_, flags) in zip(titles, entries, strict=True)]
+        rows.append(cells | {"parts": parts})
         for title, (number, flags) in zip(titles, entries, strict=True):
             for i, video in enumerate(videos_below(path.parent, f"videos/{suite}_{split}_{number}/*.mp4")):
                 outcome = f": {'success' if flags[i] else 'failure'}" if i < len(flags) else ""
@@ -397,12 +355,6 @@ def _flags_rate(flags: Sequence[bool] | np.ndarray, clusters: np.ndarray | None 
     return _rate({"n": len(success), "success": success.mean(), "ci95": interval})
 
 
-def videos_below(folder: Path, pattern: str) -> list[Path]:
-    """The videos of a pattern, without links that lead out of the folder."""
-    home = folder.resolve()
-    return sorted(path for path in folder.glob(pattern) if path.is_file() and path.resolve().is_relative_to(home))
-
-
 def policy_name(policy: str) -> str:
     """A policy in short: run and step of a checkpoint, such as `eer 0102400`; a Hub id as it is."""
     parts = Path(policy).parts
@@ -412,15 +364,6 @@ def policy_name(policy: str) -> str:
     run = parts[:place]
     name = "/".join(run[-3:-1]) if run and run[-1] == "train" else "/".join(run[-1:])
     return f"{name} {parts[place + 1]}"
-
-
-def _scene_of(runs: Sequence[TrainingRun]) -> str:
-    scenes = {run.config["env"].get("scene") for run in runs} - {None}
-    return str(scenes.pop()) if len(scenes) == 1 else DEFAULT_SCENE
-
-
-def _task_names(scene: str) -> list[str]:
-    return [task.instruction for task in get_scene(scene).tasks]
 
 
 def _add_runs(evaluations: pd.DataFrame) -> None:

@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -18,7 +19,7 @@ from matplotlib.figure import Figure
 
 from cronos_lerobot.film.png import to_png
 from cronos_lerobot.report import figures, tables
-from cronos_lerobot.report.load import CRONOS_EVAL, EVALUATIONS, LEROBOT_EVAL, TRAIN, Loaded, Video
+from cronos_lerobot.report.load import CRONOS_EVAL, LEROBOT_EVAL, TRAIN, Loaded, Video
 
 PAGE = "index.html"
 DPI = 150
@@ -54,33 +55,40 @@ NAMES = (*SHOWN, "sequential", "evaluations", "updates", "segments")
 """Of the tables: those that the page shows, and all that have a CSV file."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Report:
     """What a report shows."""
 
     loaded: Loaded
-    before: Loaded | None = None
+    before: Loaded = field(default_factory=Loaded)
     """Of the policy that a training began with."""
-    after: Loaded | None = None
+    after: Loaded = field(default_factory=Loaded)
     """Of the policy that came out."""
     videos: Sequence[Path] = ()
     """More to show."""
     title: str = "CRONOS report"
-    left_out: list[str] = field(default_factory=list)
 
     @property
+    def folders(self) -> tuple[Loaded, Loaded, Loaded]:
+        """What was read."""
+        return self.loaded, self.before, self.after
+
+    @property
+    def left_out(self) -> list[str]:
+        """A sentence for each thing that could not be read or is not shown."""
+        return list(dict.fromkeys(text for one in self.folders for text in one.left_out))
+
+    @cached_property
     def gains(self) -> pd.DataFrame:
         """Success before and after, by task."""
-        nothing = pd.DataFrame(columns=EVALUATIONS)
-        before, after = (one.evaluations if one else nothing for one in (self.before, self.after))
-        return tables.gain_table(self.loaded.evaluations, before, after)
+        return tables.gain_table(*(one.evaluations for one in self.folders))
 
 
 def make_tables(report: Report) -> dict[str, pd.DataFrame]:
     """All tables of a report by name, without the empty ones."""
     loaded = report.loaded
     own = loaded.evaluations
-    measured = pd.concat([one.evaluations for one in (loaded, report.before, report.after) if one is not None])
+    measured = pd.concat([one.evaluations for one in report.folders if len(one.evaluations)] or [own])
 
     def of(suite: str, **options: bool) -> pd.DataFrame:
         some = own[(own["source"] == CRONOS_EVAL) & (own["suite"] == suite)]
@@ -173,9 +181,8 @@ def _cell(value: Any) -> str:
 def _embedded(report: Report, output: Path) -> list[dict[str, str | None]]:
     """The videos of a page: as data URLs, or as links if they are too large."""
     named = [Video(path, path.stem.replace("_", " "), "") for path in report.videos]
-    some = [one.videos for one in (report.loaded, report.before, report.after) if one is not None]
     shown, left = [], MAX_TOTAL_BYTES
-    for video in (*named, *(video for videos in some for video in videos)):
+    for video in (*named, *(video for one in report.folders for video in one.videos)):
         size, url = video.path.stat().st_size, None
         if size <= min(MAX_VIDEO_BYTES, left):
             left -= size

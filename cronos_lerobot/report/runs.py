@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -96,10 +96,8 @@ def read_training_run(folder: Path) -> TrainingRun:
     for line in (folder / METRICS).read_text().splitlines():
         with suppress(json.JSONDecodeError):
             records.append(json.loads(line))
-    if wrong := [line for line in records if not isinstance(line, dict) or "kind" not in line]:
-        raise ValueError(f"{folder / METRICS} is not of cronos-train: it has the record {str(wrong[0])[:80]}")
-    if not records:
-        raise ValueError(f"{folder / METRICS} has no record yet")
+    if not records or not all(isinstance(record, dict) and "kind" in record for record in records):
+        raise ValueError(f"{folder / METRICS} has no record yet, or it is not of cronos-train")
     manifest = folder / MANIFEST
     try:
         starts = _that_remain(json.loads(manifest.read_text())["starts"])
@@ -126,29 +124,34 @@ def config_of(starts: list[Record]) -> dict[str, Any]:
     return config | {name: dict(config.get(name) or {}) for name in ("env", "policy", "protocol", "algorithm")}
 
 
-def group_runs(runs: Iterable[TrainingRun], notes: list[str] | None = None) -> dict[str, list[TrainingRun]]:
+def group_runs(runs: Sequence[TrainingRun], notes: list[str]) -> dict[str, list[TrainingRun]]:
     """Group runs whose settings differ only in seed and length, by a label that says how the groups differ.
 
-    Of several runs of one seed and base policy, a group has the longest.
+    Of several runs of one seed and base policy, which share their beginning, a group has the longest.
 
     Args:
         runs: of any experiments.
         notes: takes a sentence for each run that is in no group.
     """
-    runs = list(runs)
     if not runs:
         return {}
     settings = _settings([_experiment_of(run) for run in runs])
     varying = settings.loc[:, settings.nunique(dropna=False) > 1]
-    groups: dict[tuple[str, ...], list[TrainingRun]] = {}
+    groups: dict[tuple[str, ...], dict[Any, TrainingRun]] = {}
     for key, run in zip(map(tuple, varying.to_numpy()), runs, strict=True):
-        _add_run(groups.setdefault(key, []), run, [] if notes is None else notes)
+        group, which = groups.setdefault(key, {}), (run.seed, run.base) if run.seed is not None else run.folder
+        if (other := group.setdefault(which, run)) is not run:
+            dropped, kept = sorted((run, other), key=lambda one: one.last["interaction_steps"])
+            group[which] = kept
+            notes.append(
+                f"the run {dropped.folder}: {kept.folder} has the same settings and seed, and is as long or longer"
+            )
     others = [name for name in varying if name.removeprefix("protocol.") not in DESCRIBED]
     labels: dict[str, list[TrainingRun]] = {}
-    for key, members in groups.items():
-        values = dict(zip(varying.columns, key, strict=True))
-        label = _label(members, {name: values[name] for name in others}, len(others) < len(varying.columns))
-        labels[_unique(label, members, labels)] = members
+    for key, group in groups.items():
+        values, members = dict(zip(varying, key, strict=True)), list(group.values())
+        label = _label(members, {name: values[name] for name in others}, len(others) < len(values))
+        labels[f"{label} ({members[0].folder})" if label in labels else label] = members
     return labels
 
 
@@ -161,25 +164,6 @@ def _label(members: list[TrainingRun], others: dict[str, str], is_protocol_told:
     told = [f"{name.rpartition('.')[2]}={value}" for name, value in others.items() if value != "nan"]
     protocol = [describe_protocol(run.config["protocol"])] if is_protocol_told or not told else []
     return ", ".join(protocol + told)
-
-
-def _unique(label: str, members: list[TrainingRun], taken: dict[str, Any]) -> str:
-    return f"{label} ({members[0].folder})" if label in taken else label
-
-
-def _add_run(group: list[TrainingRun], run: TrainingRun, notes: list[str]) -> None:
-    """Add a run to its group, or keep the longer of it and one of the same seed: they share their beginning."""
-    same = next(
-        (one for one in group if one.seed is not None and (one.seed, one.base) == (run.seed, run.base)), None
-    )
-    if same is None:
-        group.append(run)
-        return
-    dropped, kept = sorted((run, same), key=lambda one: one.last["interaction_steps"])
-    group[group.index(same)] = kept
-    notes.append(
-        f"the run {dropped.folder}: {kept.folder} has the same settings and seed, and is as long or longer"
-    )
 
 
 def _experiment_of(run: TrainingRun) -> dict[str, Any]:

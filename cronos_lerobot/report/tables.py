@@ -70,15 +70,14 @@ def _gaps(curve: pd.DataFrame, end: float, spent: float) -> tuple[float, float]:
     if curve["steps"].iloc[0]:
         return np.nan, np.nan
     axes = ((curve["steps"], end), (curve["interventions"], spent))
-    by_steps, by_resets = (performance_gap(x, curve["success"], up_to).normalised for x, up_to in axes)
+    by_steps, by_resets = (performance_gap(x, curve["success"], up_to) for x, up_to in axes)
     return by_steps, by_resets
 
 
-def cells_of(name: str, summary: Summary | None) -> Cells:
+def cells_of(name: str, summary: Summary) -> Cells:
     """The cells of a summary: mean, standard deviation and ends of the interval."""
-    low, high = (summary.ci95 if summary else None) or (None, None)
-    mean, std = (summary.mean, summary.std) if summary else (None, None)
-    return {name: mean, f"{name} std": std, f"{name} ci95_low": low, f"{name} ci95_high": high}
+    low, high = summary.ci95 or (None, None)
+    return {name: summary.mean, f"{name} std": summary.std, f"{name} ci95_low": low, f"{name} ci95_high": high}
 
 
 def gain_table(evaluations: pd.DataFrame, before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
@@ -135,8 +134,7 @@ def _interval(lengths: np.ndarray, pairs: Pairs) -> tuple[float | None, float | 
     """Of one policy by configuration, of several over the trainings."""
     if len(lengths) == 1 and not pairs.are_chains:
         return cluster_interval(lengths[0] > 0, pairs.clusters)
-    summary = summarise(lengths.mean(axis=1))
-    return (summary.ci95 if summary else None) or (None, None)
+    return summarise(lengths.mean(axis=1)).ci95 or (None, None)
 
 
 def part_table(evaluations: pd.DataFrame, columns: Sequence[str], *, with_all: bool = True) -> pd.DataFrame:
@@ -191,14 +189,10 @@ def rates_by_part(segments: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
         if len(counts) == 1:
             ends = wilson_interval(successes, n)
         else:
-            summary = summarise(counts["successes"] / counts["n"], (0, 1))
-            ends = (summary.ci95 if summary else None) or (np.nan, np.nan)
-        rows.append(dict(zip(by, key, strict=True)) | _counts(successes, n, ends))
+            ends = summarise(counts["successes"] / counts["n"], (0, 1)).ci95 or (np.nan, np.nan)
+        rate = {"successes": successes, "n": n, "success": successes / n, "ci95_low": ends[0]}
+        rows.append(dict(zip(by, key, strict=True)) | rate | {"ci95_high": ends[1]})
     return pd.DataFrame(rows)
-
-
-def _counts(successes: int, n: int, ends: tuple[float, float]) -> Cells:
-    return {"successes": successes, "n": n, "success": successes / n, "ci95_low": ends[0], "ci95_high": ends[1]}
 
 
 def merged(table: pd.DataFrame) -> pd.DataFrame:

@@ -19,83 +19,53 @@ ENV = ("--env.type=cronos", "--env.obs_type=environment_state_agent_pos")
 DATASET = "local/cronos_demos"
 SCALES = {
     "full": {
-        "record": ("--dataset.num_episodes=1200",),
-        "clone": ("--batch_size=256", "--steps=640", "--save_freq=640"),
-        "train": (
-            "--num_envs=64",
-            "--steps=204800",
-            "--eval_freq=102400",
-            "--eval.n_episodes=32",
-            "--save_freq=102400",
-        ),
-        "evaluate": (),
-        "film": ("--segments=16",),
+        "record": "--dataset.num_episodes=1200",
+        "clone": "--batch_size=256 --steps=640 --save_freq=640",
+        "train": "--num_envs=64 --steps=204800 --eval_freq=102400 --eval.n_episodes=32 --save_freq=102400",
+        "evaluate": "",
+        "film": "--segments=16",
     },
     "smoke": {
-        "record": ("--dataset.num_episodes=8",),
-        "clone": ("--batch_size=32", "--steps=5", "--save_freq=5"),
-        "train": ("--num_envs=4", "--steps=640", "--protocol.update_interval=80", "--eval.n_episodes=1"),
-        "evaluate": ("--eval.n_episodes=1",),
-        "film": ("--segments=1",),
+        "record": "--dataset.num_episodes=8",
+        "clone": "--batch_size=32 --steps=5 --save_freq=5",
+        "train": "--num_envs=4 --steps=640 --protocol.update_interval=80 --eval.n_episodes=1",
+        "evaluate": "--eval.n_episodes=1",
+        "film": "--segments=1",
     },
 }
 """Flags that depend on the scale."""
+CLONE = "--policy.type=pocketvla --policy.device=cpu --policy.push_to_hub=false"
+CLONE_RUN = "--log_freq=40 --num_workers=0 --wandb.enable=false --seed=1"
+RESETS = "--protocol.scene_reset_interval=320 --protocol.reset_phase=staggered"
+RESETS += " --protocol.end_effector_reset=true"
+RECORD = "--record.repo_id=local/cronos_demo_streams --record.streams=1"
 
 
 def make_commands(scale: str, folder: Path) -> list[Command]:
     """The commands of the demo; their outputs lie in `folder`."""
-    more, policy = SCALES[scale], Path("checkpoints/last/pretrained_model")
-    dataset = (f"--dataset.repo_id={DATASET}", f"--dataset.root={folder / 'demos'}")
-    base, tuned = folder / "base", folder / "finetune"
+    more = {name: flags.split() for name, flags in SCALES[scale].items()}
+    policy = Path("checkpoints/last/pretrained_model")
+    demos, base, tuned = folder / "demos", folder / "base", folder / "finetune"
+    before, after, video = folder / "eval_before", folder / "eval_after", folder / "film" / "stream.mp4"
+    dataset = (f"--dataset.repo_id={DATASET}", f"--dataset.root={demos}")
     record = ("cronos-record-demos", *ENV, *dataset, *more["record"], "--seed=1", *WIDE_FLAGS, *DIVERSE_FLAGS)
-    clone = (
-        *(
-            "lerobot-train",
-            "--policy.type=pocketvla",
-            "--policy.device=cpu",
-            "--policy.push_to_hub=false",
-            *dataset,
-        ),
-        *(*more["clone"], "--log_freq=40", "--num_workers=0", "--wandb.enable=false", "--seed=1"),
-        f"--output_dir={base}",
-    )
-    train = (
-        *("cronos-train", f"--policy.path={base / policy}", *ENV, "--seed=1"),
-        *("--protocol.scene_reset_interval=320", "--protocol.reset_phase=staggered"),
-        *(
-            "--protocol.end_effector_reset=true",
-            "--record.repo_id=local/cronos_demo_streams",
-            "--record.streams=1",
-        ),
-        *(*more["train"], "--resume=auto", f"--output_dir={tuned}"),
-    )
-    film = (
-        *("python", "-m", "cronos_lerobot.film.stream_video", f"--policy.path={tuned / policy}"),
-        *(*more["film"], f"--output={folder / 'film' / 'stream.mp4'}"),
-    )
-    report = (
-        *(
-            "cronos-report",
-            str(tuned),
-            "--before",
-            str(folder / "eval_before"),
-            "--after",
-            str(folder / "eval_after"),
-        ),
-        *("--videos", str(folder / "film" / "stream.mp4"), f"--output={folder / 'report'}", "--title=CRONOS demo"),
-    )
+    clone = ("lerobot-train", *CLONE.split(), *dataset, *more["clone"], *CLONE_RUN.split())
+    train = ("cronos-train", f"--policy.path={base / policy}", *ENV, "--seed=1", *RESETS.split())
+    train += (*RECORD.split(), *more["train"], "--resume=auto")
+    film = ("python", "-m", "cronos_lerobot.film.stream_video", f"--policy.path={tuned / policy}", *more["film"])
+    report = ("cronos-report", str(tuned), "--before", str(before), "--after", str(after), "--videos", str(video))
     return [
-        Command(record, folder / "demos"),
-        Command(clone, base),
-        _evaluation(base / policy, folder / "eval_before", more["evaluate"]),
-        Command(train, tuned, resumes=True),
-        _evaluation(tuned / policy, folder / "eval_after", more["evaluate"]),
-        Command(film, folder / "film"),
-        Command(report, folder / "report"),
+        Command(record, demos),
+        Command((*clone, f"--output_dir={base}"), base),
+        _evaluation(base / policy, before, more["evaluate"]),
+        Command((*train, f"--output_dir={tuned}"), tuned, resumes=True),
+        _evaluation(tuned / policy, after, more["evaluate"]),
+        Command((*film, f"--output={video}"), video.parent),
+        Command((*report, f"--output={folder / 'report'}", "--title=CRONOS demo"), folder / "report"),
     ]
 
 
-def _evaluation(policy: Path, output: Path, more: tuple[str, ...]) -> Command:
+def _evaluation(policy: Path, output: Path, more: list[str]) -> Command:
     words = ("cronos-eval", f"--policy.path={policy}", "--eval.suites=[independent]", "--eval.videos=0", *more)
     return Command((*words, f"--output_dir={output}"), output, resumes=True)
 

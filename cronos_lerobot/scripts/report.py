@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-from cronos_lerobot.scripts import compare
 
 # Import late: --help and a wrong flag answer at once.
 if TYPE_CHECKING:
@@ -29,16 +29,29 @@ examples:
 
 OUTPUT/index.html is self-contained. Figures (PNG) and tables (CSV) lie beside it.
 """
+COMPARE_EPILOG = """\
+A and B are output folders of cronos-eval or run folders of cronos-train. A folder above several of them stands for
+the seeds of one training. Episodes are paired by suite, split, task or ordering, configuration and sampling seed.
+With fewer than three seeds on a side, the interval is that of these very policies.
+
+examples:
+  two policies
+      cronos-report compare outputs/eval/base outputs/eval/eer
+  two rows of a table, all seeds of each
+      cronos-report compare outputs/reproduce/table1/t80 outputs/reproduce/table1/t1280_eer
+
+docs/evaluation.md says how the intervals and p-values are computed.
+"""
+
+
+def _parser(name: str, description: str, epilog: str) -> argparse.ArgumentParser:
+    kind = argparse.RawDescriptionHelpFormatter
+    return argparse.ArgumentParser(name, description=description, epilog=epilog, formatter_class=kind)
 
 
 def make_parser() -> argparse.ArgumentParser:
     """The flags of `cronos-report`."""
-    parser = argparse.ArgumentParser(
-        "cronos-report",
-        description=(__doc__ or "").split("`: ")[1].capitalize(),
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = _parser("cronos-report", "Curves, tables and videos of runs, as one HTML page.", EPILOG)
 
     def add_folders(flag: str, text: str) -> None:
         parser.add_argument(flag, nargs="+", type=Path, metavar="DIR", default=[], help=text)
@@ -56,24 +69,26 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def make_compare_parser() -> argparse.ArgumentParser:
+    """The flags of `cronos-report compare`."""
+    text = "Two policies, or two ways to train, compared on the same episodes."
+    parser = _parser("cronos-report compare", text, COMPARE_EPILOG)
+    parser.add_argument("a", type=Path, metavar="A", help="folder of one side")
+    parser.add_argument("b", type=Path, metavar="B", help="folder of the other side")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    return parser
+
+
 def make_report(
-    runs: list[Path],
+    runs: Sequence[Path],
     *,
-    before: list[Path] | None = None,
-    after: list[Path] | None = None,
-    videos: list[Path] | None = None,
+    before: Sequence[Path] = (),
+    after: Sequence[Path] = (),
+    videos: Sequence[Path] = (),
     title: str = "CRONOS report",
     scene: str | None = None,
 ) -> Report:
-    """Read the folders of a report.
-
-    Args:
-        runs: folders of runs and evaluations, or above them.
-        before: evaluations of the policy that a training began with.
-        after: evaluations of the policy that came out.
-        videos: more to show.
-        title: of the page.
-        scene: names the tasks of lerobot-eval's folders.
+    """Read the folders of a report: the flags of `cronos-report`.
 
     Raises:
         FileNotFoundError: a folder holds no run and no evaluation, or a video is missing.
@@ -82,18 +97,33 @@ def make_report(
     from cronos_lerobot.report.load import Loaded, load
     from cronos_lerobot.report.page import Report
 
-    if missing := [video for video in videos or [] if not video.is_file()]:
+    if missing := [video for video in videos if not video.is_file()]:
         raise FileNotFoundError(f"no video {missing[0]}")
-    loaded = load(runs, scene) if runs else Loaded()
-    old, new = (load(folders, scene) if folders else None for folders in (before, after))
-    left_out = [text for one in (loaded, old, new) if one for text in one.left_out]
-    return Report(loaded, old, new, videos or [], title, list(dict.fromkeys(left_out)))
+    loaded = [load(folders, scene) if folders else Loaded() for folders in (runs, before, after)]
+    return Report(*loaded, videos, title)
+
+
+def compare(arguments: Sequence[str]) -> None:
+    """Print the comparison that the arguments of `cronos-report compare` name."""
+    args = make_compare_parser().parse_args(arguments)
+    from cronos_lerobot.report.compare import compare_sides, read_side, to_json, to_text
+    from cronos_lerobot.scripts.closed_pipe import ends_with_its_reader
+    from cronos_lerobot.scripts.errors import error_line
+
+    with error_line():
+        (a, notes_a), (b, notes_b) = read_side(args.a), read_side(args.b)
+        comparisons = compare_sides(a, b)
+    notes = list(dict.fromkeys(notes_a + notes_b))
+    for note in notes:
+        print(f"left out: {note}", file=sys.stderr)
+    with ends_with_its_reader():
+        print(json.dumps(to_json(comparisons, notes), indent=2) if args.json else to_text(comparisons))
 
 
 def main() -> None:
     """Entry point of `cronos-report`."""
     if sys.argv[1:2] == ["compare"]:
-        compare.main(sys.argv[2:])
+        compare(sys.argv[2:])
         return
     parser = make_parser()
     args = parser.parse_args()
@@ -110,14 +140,7 @@ def main() -> None:
     from cronos_lerobot.scripts.errors import error_line
 
     with error_line():
-        report = make_report(
-            args.runs,
-            before=args.before,
-            after=args.after,
-            videos=args.videos,
-            title=args.title,
-            scene=args.scene,
-        )
+        report = make_report(**{name: value for name, value in vars(args).items() if name != "output"})
         page = write_report(report, args.output)
     for text in report.left_out:
         print(f"left out: {text}", file=sys.stderr)

@@ -17,7 +17,7 @@ from importlib import import_module
 from pathlib import Path
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Experiment, find_rows
-from cronos_lerobot.experiments.pipeline import Command, Pipeline, interrupt_on_signals, run_here
+from cronos_lerobot.experiments.pipeline import Command, Pipeline, await_all, interrupt_on_signals, run_here
 from cronos_lerobot.experiments.plan import Options, Run, make_pipelines, make_runs
 from cronos_lerobot.experiments.scales import OBS_TYPES, SCALES
 
@@ -148,11 +148,12 @@ def run_all(runs: Sequence[Run], args: argparse.Namespace, slurm: dict[str, str 
         if args.launcher == "local":
             parallel = args.jobs or max(1, len(os.sched_getaffinity(0)) // args.threads)
             return run_here(pipelines, parallel, args.threads, progress, show)
-        from cronos_lerobot.experiments.slurm import run_on_slurm
+        from cronos_lerobot.experiments.slurm import submit
 
         if args.jobs:
             slurm["array_parallelism"] = args.jobs
-        return run_on_slurm(pipelines, args.root / "slurm", slurm, args.threads, args.requeues, progress)
+        jobs = submit(pipelines, args.root / "slurm", slurm, args.threads, args.requeues)
+        return await_all(pipelines, jobs, progress)
 
 
 def choose(args: argparse.Namespace, extra: Sequence[str]) -> dict[Experiment, list[Run]]:

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from slurm_cluster import SlurmCluster, missing
 
-from cronos_lerobot.experiments.pipeline import Command, Pipeline
-from cronos_lerobot.experiments.slurm import run_on_slurm, submit
+from cronos_lerobot.experiments.pipeline import Command, Pipeline, await_all
+from cronos_lerobot.experiments.slurm import submit
 
 pytestmark = pytest.mark.skipif(bool(missing()), reason=f"Slurm is not installed: {', '.join(missing())}")
 
@@ -54,7 +54,7 @@ def test_a_run_that_its_time_limit_stops_continues_and_ends_as_an_unbroken_one(c
         assert time.monotonic() < deadline, cluster.logs()
 
     with cluster.sparing_the_wait():
-        failed = run_on_slurm(pipelines, tmp_path / "slurm", parameters, 1, 5, progress)
+        failed = await_all(pipelines, submit(pipelines, tmp_path / "slurm", parameters, 1, 5), progress)
     assert [line.split(":")[0] for line in failed] == ["wrong"], cluster.logs()
     assert command.is_done
     assert len(list(command.output.glob("start*"))) >= 2

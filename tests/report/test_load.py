@@ -43,8 +43,10 @@ def test_one_row_per_evaluation(tmp_path):
     assert table["episodes"].iloc[0].shape == (32, 4)
 
 
-def test_one_row_per_update(tmp_path):
-    write_training_run(tmp_path / "a", agent="imitation")
+def test_one_row_per_update_without_an_unfinished_last_line(tmp_path):
+    run = write_training_run(tmp_path / "a", agent="imitation")
+    with (run / "metrics.jsonl").open("a") as file:
+        file.write('{"kind": "upd')
     table = load_metrics([tmp_path])
     assert table["steps"].tolist() == [1280 * i for i in range(1, 9)]
     assert table["agent/loss"].iloc[1:].tolist() == [1 / i for i in range(2, 9)]
@@ -64,14 +66,6 @@ def test_two_evaluations_of_one_policy_are_told_apart_by_their_folders(tmp_path)
     assert sorted(load_evaluations([tmp_path])["policy"]) == ["me/a", "me/a (cold)", "me/a (hot)"]
 
 
-def test_unfinished_last_line_is_skipped(tmp_path):
-    run = write_training_run(tmp_path / "a")
-    with (run / "metrics.jsonl").open("a") as file:
-        file.write('{"kind": "upd')
-    (read,) = load([run]).runs
-    assert (len(read.updates), len(read.evaluations)) == (8, 3)
-
-
 def change(name, value):
     """An edit of the third line, an update, or of the last, an evaluation; `name` is a path of keys."""
 
@@ -85,21 +79,11 @@ def change(name, value):
     return lambda run: edit_lines(run, edit)
 
 
-def config_is(value):
-    return lambda run: edit_starts(run, lambda starts: starts[0].update(config=value))
-
-
 DAMAGES = {
-    "no record": lambda run: (run / "metrics.jsonl").write_text(""),
     "bytes": lambda run: (run / "metrics.jsonl").write_bytes(b"\xff\xfe\x00"),
     "of another tool": lambda run: (run / "metrics.jsonl").write_text('{"step": 1, "loss": 0.3}\n'),
-    "a list": lambda run: (run / "metrics.jsonl").write_text("[1]\n"),
-    "deep": lambda run: (run / "metrics.jsonl").write_text("[" * 100_000),
     "manifest cut": lambda run: (run / "manifest.json").write_text('{"starts": ['),
-    "no manifest": lambda run: (run / "manifest.json").unlink(),
-    "no start": lambda run: (run / "manifest.json").write_text('{"starts": []}'),
-    "config is a list": config_is([1]),
-    "protocol is a number": config_is({"protocol": 3}),
+    "config is a list": lambda run: edit_starts(run, lambda starts: starts[0].update(config=[1])),
     "another version": lambda run: edit_starts(run, lambda starts: starts[0].update(environment="x-v0")),
     "no rollout": change("update/rollout", None),
     "text for a number": change("update/rollout/success", "high"),
@@ -110,7 +94,6 @@ DAMAGES = {
     "no episodes": change("evaluation/n", 0),
     "steps fall": change("evaluation/interaction_steps", -1),
     "steps without end": change("evaluation/interaction_steps", float("inf")),
-    "task is a list": change("evaluation/per_task", [1]),
 }
 
 
@@ -128,9 +111,7 @@ def test_a_damaged_run_is_left_out_and_said(tmp_path, damage):
 
 
 @pytest.mark.parametrize(
-    "content",
-    ["{", "[]", "{}", '{"suite": "independent"}', {"success": "x"}, {"episodes": [1]}, {"n": None}, {"format": 1}],
-    ids=str,
+    "content", ["{", '{"suite": "independent"}', {"success": "x"}, {"episodes": [1]}], ids=str
 )
 def test_damaged_results_are_left_out_and_said(tmp_path, content):
     write_training_run(tmp_path / "whole")
@@ -143,7 +124,7 @@ def test_damaged_results_are_left_out_and_said(tmp_path, content):
     assert set(loaded.evaluations["source"]) == {"cronos-train"}
 
 
-@pytest.mark.parametrize("group", ["pusht", "libero_spatial", 3])
+@pytest.mark.parametrize("group", ["libero_spatial", 3])
 def test_evaluations_of_another_environment_are_left_out_and_said(tmp_path, group):
     write_training_run(tmp_path / "whole")
     other = write_lerobot_eval(tmp_path / "other", "pusht") / "eval_info.json"

@@ -41,7 +41,7 @@ def test_areas_need_a_first_evaluation_at_step_0(tmp_path):
     edit_lines(run, lambda lines: lines.pop(0))
     (row,) = seed_table(load_evaluations([run])).to_dict("records")
     assert row["success"] == 0.75
-    assert row["D / steps"] is None
+    assert np.isnan(row["D / steps"])
     assert len(gain_table(load_evaluations([run]), NOTHING, NOTHING)) == 0
 
 
