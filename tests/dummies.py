@@ -63,7 +63,7 @@ class DummyEnv:
         self.calls.append("step")
         reward, diverged = self.step_streams(actions, np.arange(self.num_envs))
         never = np.zeros(self.num_envs, bool)
-        info = {"is_success": self.is_success, "is_grasped": never, "diverged": diverged}
+        info = {"is_success": self.is_success, "diverged": diverged}
         return self._observation(), reward, never, never, info
 
     def step_streams(self, actions, ids):
@@ -77,10 +77,6 @@ class DummyEnv:
     @property
     def is_success(self):
         return np.abs(self.x - [task.goal for task in self.tasks]) < 0.3
-
-    @property
-    def is_grasped(self):
-        return np.zeros(self.num_envs, bool)
 
     def observe(self, ids=None):
         self.calls.append("observe")

@@ -44,7 +44,7 @@ FLOORS = {
         "film", "report", "experiments", "hub", "scripts", "__init__",
     ),
     "lerobot_env_cronos": (
-        "lerobot_log", "scene", "benchmark", "simulation", "vector_env", "episodic", "autoreset",
+        "scene", "benchmark", "simulation", "vector_env", "episodic", "autoreset",
         "sequential", "config", "plugin", "expert", "__init__",
     ),
 }  # fmt: skip

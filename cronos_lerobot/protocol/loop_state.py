@@ -151,12 +151,13 @@ class LoopState:
         """Count one control step of every stream.
 
         Args:
-            info: the environment's `is_success`, `is_grasped` and `diverged` after the step, (N,) bool each.
+            info: the environment's `is_success` and `diverged` after the step, (N,) bool each. Where `is_grasped`
+                is missing, nothing is said to be never grasped.
             cut: (N,) bool, where the stream's piece ends here.
         """
         self.t += 1
         self.succeeded |= info["is_success"]
-        self.grasped |= info["is_grasped"]
+        self.grasped |= info.get("is_grasped", True)
         self.diverged = info["diverged"].copy()
         if self.begins_segment:
             # No task can be done in one step.

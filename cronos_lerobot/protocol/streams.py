@@ -37,8 +37,8 @@ class Streams(Protocol):
         """Apply actions (N, A) in physical units for one control step.
 
         Returns:
-            Observation, reward (N,), two arrays (N,) of False, and info: `is_success`, `is_grasped` and
-            `diverged`, (N,) bool. If known, also `executed_action` (N, A) float32, and `intervened` (N,) bool: a
+            Observation, reward (N,), two arrays (N,) of False, and info: `is_success` and `diverged`, (N,) bool.
+            If known, also `is_grasped` (N,) bool, `executed_action` (N, A) float32, and `intervened` (N,) bool: a
             person or a script acted.
         """
         ...

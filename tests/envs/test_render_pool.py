@@ -1,16 +1,13 @@
 """Drawing in processes of their own: the same frames, and nothing left behind."""
 
 import contextlib
-import errno
 import os
 import signal
-import tempfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 from lerobot_env_cronos import CronosVectorEnv
-from lerobot_env_cronos.simulation import render_pool
 from lerobot_env_cronos.simulation.render_pool import MIN_FRAMES, RenderPool
 from lerobot_env_cronos.simulation.rendering import ClassicRenderer
 
@@ -27,7 +24,7 @@ def simulation():
 @pytest.fixture
 def pool(simulation):
     model = simulation.render_model
-    pool = RenderPool(model, *SIZE, model.camera("front").id, processes=2, capacity=2 * MIN_FRAMES)
+    pool = RenderPool(model, *SIZE, model.camera("front").id, processes=2)
     yield pool
     pool.close()
 
@@ -76,38 +73,13 @@ def test_what_is_broken_off_is_not_taken_for_what_comes_next(simulation, monkeyp
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(RenderPool, "_wait", interrupted)
+        patched.setattr(RenderPool, "_read", interrupted)
         with pytest.raises(KeyboardInterrupt):
             renderer.render(states[0])
     for _ in range(2):
         for qpos, frames in zip(states, expected, strict=True):
             assert np.array_equal(renderer.render(qpos), frames)
     renderer.close()
-
-
-def test_frames_that_find_no_room_in_memory_lie_on_disk(simulation, pool, monkeypatch, tmp_path):
-    """A file with holes would kill who draws into it, without a word."""
-    full, disk = tmp_path / "full", tmp_path / "disk"
-    full.mkdir()
-    disk.mkdir()
-    allocate = os.posix_fallocate
-
-    def no_room_in_memory(descriptor, *where):
-        if str(full) in os.readlink(f"/proc/self/fd/{descriptor}"):
-            raise OSError(errno.ENOSPC, "No space left on device")
-        allocate(descriptor, *where)
-
-    monkeypatch.setattr(render_pool, "_memory_folder", lambda: full)
-    monkeypatch.setattr(tempfile, "tempdir", str(disk))
-    monkeypatch.setattr(os, "posix_fallocate", no_room_in_memory)
-    model = simulation.render_model
-    other = RenderPool(model, *SIZE, model.camera("front").id, processes=2, capacity=2 * MIN_FRAMES)
-    assert np.array_equal(other.render(simulation.qpos), pool.render(simulation.qpos))
-    other.close()
-    monkeypatch.setattr(tempfile, "tempdir", str(full))
-    with pytest.raises(OSError, match=r"no room for \d+ MB of frames in .*full"):
-        RenderPool(model, *SIZE, model.camera("front").id, processes=1, capacity=4000)
-    assert not list(full.iterdir())
 
 
 def test_a_picture_larger_than_the_models_buffer_is_whole(simulation):
@@ -130,4 +102,4 @@ def test_a_process_that_cannot_draw_says_why(simulation, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "no such platform")
     model = simulation.render_model
     with pytest.raises(RuntimeError, match="no such platform"):
-        RenderPool(model, *SIZE, model.camera("front").id, processes=1, capacity=5)
+        RenderPool(model, *SIZE, model.camera("front").id, processes=1)

@@ -250,7 +250,7 @@ def test_a_refused_token(hub, commands):
 def test_missing_repositories_and_revisions(hub, bench, evaluation, commands):
     results = ("cronos-publish", "results", f"--results={evaluation}", "--repo_id=me/policy")
     for command, said in (
-        ((*results, "--benchmark=me/bench@v9"), "benchmark me/bench has no revision 'v9'"),
+        ((*results, "--benchmark=me/bench@v9"), "no benchmark 'me/bench@v9'"),
         (("cronos-publish", *BENCHMARK, "--pictures=false", "--branch=x", "--revision=v9"), "no revision 'v9'"),
         (("cronos-eval", "--expert=true", "--env.benchmark=me/nobody"), "no benchmark 'me/nobody'"),
     ):

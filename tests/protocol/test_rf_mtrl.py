@@ -43,7 +43,7 @@ class FastEnv(DummyEnv):
             never.astype(np.float32),
             never,
             never,
-            {"is_success": never, "is_grasped": never, "diverged": never},
+            {"is_success": never, "diverged": never},
         )
 
     def observe(self):

@@ -9,17 +9,16 @@ from typing import TYPE_CHECKING
 from lerobot_env_cronos.simulation import gl as gl  # isort: skip  # chooses OpenGL's platform before mujoco
 
 from lerobot_env_cronos.benchmark.version import register_gymnasium
-from lerobot_env_cronos.lerobot_log import shorten_video_backend_warning
-from lerobot_env_cronos.plugin import register_with_lerobot
+from lerobot_env_cronos.plugin import register_with_lerobot, shorten_video_backend_warning
 from lerobot_env_cronos.scene.scenes import SCENES as SCENES
 
 if TYPE_CHECKING:
     from lerobot_env_cronos.autoreset import CronosGymVectorEnv as CronosGymVectorEnv
     from lerobot_env_cronos.benchmark.benchmark import Benchmark as Benchmark
     from lerobot_env_cronos.benchmark.benchmark import EpisodeGroup as EpisodeGroup
+    from lerobot_env_cronos.benchmark.benchmark import load_benchmark as load_benchmark
     from lerobot_env_cronos.benchmark.benchmark import packaged_benchmark as packaged_benchmark
     from lerobot_env_cronos.benchmark.files import write_benchmark as write_benchmark
-    from lerobot_env_cronos.benchmark.load import load_benchmark as load_benchmark
     from lerobot_env_cronos.benchmark.orderings import load_orderings as load_orderings
     from lerobot_env_cronos.benchmark.registry import register_scene as register_scene
     from lerobot_env_cronos.benchmark.version import check_environment_id as check_environment_id
@@ -41,9 +40,8 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "autoreset": "CronosGymVectorEnv",
-    "benchmark.benchmark": "Benchmark EpisodeGroup packaged_benchmark",
+    "benchmark.benchmark": "Benchmark EpisodeGroup load_benchmark packaged_benchmark",
     "benchmark.files": "write_benchmark",
-    "benchmark.load": "load_benchmark",
     "benchmark.orderings": "load_orderings",
     "benchmark.registry": "register_scene",
     "benchmark.version": "check_environment_id gymnasium_id",

@@ -5,7 +5,6 @@ window of 80 control steps. The first task that is not complete in its window fa
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -18,29 +17,8 @@ from lerobot_env_cronos.vector_env import LEROBOT_OPTIONS, as_one_seed, check_op
 ADVANCES = ("window", "on_success")
 
 
-@dataclass(frozen=True)
-class ChainStep:
-    """What one control step did to the chains, arrays (n,) bool but for `position`."""
-
-    running: np.ndarray
-    """Which chains were running before the step."""
-    position: np.ndarray
-    """Number (n,) in the ordering of the task that was acted on, from 0."""
-    task_success: np.ndarray
-    """The task was completed by this step; True once for each task."""
-    success: np.ndarray
-    """The last task was completed: the whole chain. It is over."""
-    failure: np.ndarray
-    """A task failed, or the simulation diverged. The chain is over."""
-    switched: np.ndarray
-    """The next task begins with the next step."""
-    diverged: np.ndarray
-    is_grasped: np.ndarray
-    """The object of the task that was acted on is grasped after the step."""
-
-
 class SequentialVectorEnv(EpisodicVectorEnv):
-    """`num_envs` chains, each of one ordering of tasks from one configuration (paper, Section 4).
+    """`num_envs` chains of one ordering of tasks, each from one configuration (paper, Section 4).
 
     A task is complete if its success test holds after any step of its window. The reward is 1 for each completed
     task, so an episode's return is its chain length, and the mean return CALVIN's average chain length. A chain is
@@ -48,7 +26,7 @@ class SequentialVectorEnv(EpisodicVectorEnv):
     nothing and reports no success until the next start.
 
     Args:
-        ordering: the tasks of the chains that `reset` starts.
+        ordering: the tasks of every chain.
         advance: `window` starts the next task when the 80 steps are over; `on_success` (CALVIN's) as soon as the
             task is complete.
         end_effector_reset: send the arm home, gripper open, between tasks.
@@ -57,7 +35,7 @@ class SequentialVectorEnv(EpisodicVectorEnv):
 
     Attributes:
         chain_length: (n,) int, tasks completed so far. As a failure ends the chain, it says which ones.
-        position: (n,) int, number of the current task in its ordering.
+        position: (n,) int, number of the current task in the ordering.
     """
 
     def __init__(
@@ -79,7 +57,6 @@ class SequentialVectorEnv(EpisodicVectorEnv):
         self.ordering = tuple(ordering)
         self.advance, self.window, self._sends_arm_home = advance, window, end_effector_reset
         self._max_episode_steps = window * len(self.ordering)
-        self._orderings = [self.ordering] * num_envs
         self.chain_length, self.position = np.zeros(num_envs, dtype=int), np.zeros(num_envs, dtype=int)
         self._elapsed = np.zeros(num_envs, dtype=int)
         self._is_complete = np.zeros(num_envs, dtype=bool)
@@ -94,46 +71,16 @@ class SequentialVectorEnv(EpisodicVectorEnv):
             "is_complete": self._is_complete,
         }
 
-    def get_state(self) -> dict[str, np.ndarray]:
-        """See `CronosVectorEnv.get_state`; with the orderings (n, longest), padded with -1."""
-        valid, longest = self.scene.tasks + self.scene.reset_tasks, max(map(len, self._orderings))
-        numbers = [[valid.index(task) for task in ordering] for ordering in self._orderings]
-        orderings = np.array([row + [-1] * (longest - len(row)) for row in numbers])
-        return super().get_state() | {"orderings": orderings}
-
-    def set_state(self, state: dict[str, np.ndarray]) -> None:
-        """See `CronosVectorEnv.set_state`."""
-        super().set_state(state)
-        valid = self.scene.tasks + self.scene.reset_tasks
-        self._orderings = [tuple(valid[i] for i in row if i >= 0) for row in state["orderings"]]
-
     def reset(self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None):
         """Start `ordering` everywhere, at starts number `seed + i` or `seeds[i]`, modulo their count."""
         check_options(options, LEROBOT_OPTIONS)
         gym.vector.VectorEnv.reset(self, seed=as_one_seed(seed))
-        self.start(self._all, [self.ordering] * self.num_envs, self._choose_starts(seed, self.starts))
+        self.scene_reset(self._all, self._choose_starts(seed, self.starts), self.split)
+        self.set_task(self._all, [self.ordering[0]] * self.num_envs)
+        self.done[:] = self._is_complete[:] = False
+        self.chain_length[:] = self.position[:] = self._elapsed[:] = 0
         nothing = np.zeros(self.num_envs, dtype=bool)
-        return self.observe_running(self._all), self._chain_info(nothing, nothing, self.position)
-
-    def start(self, ids: np.ndarray, orderings: Sequence[Sequence[Task]], configurations: np.ndarray) -> None:
-        """Start a chain in each of the environments `ids`; the others go on, or stay frozen.
-
-        Args:
-            ids: (k,) environments.
-            orderings: the k chains' tasks, of any length above 0.
-            configurations: (k,) indices into the split.
-
-        Raises:
-            ValueError: there is no such environment or configuration, or `ids` do not rise.
-        """
-        ids = np.asarray(ids)
-        # First of all, because it refuses what are no environments.
-        self.scene_reset(ids, configurations, self.split)
-        for i, ordering in zip(ids, orderings, strict=True):
-            self._orderings[i] = tuple(ordering)
-        self.set_task(ids, [ordering[0] for ordering in orderings])
-        self.done[ids] = self._is_complete[ids] = False
-        self.chain_length[ids] = self.position[ids] = self._elapsed[ids] = 0
+        return self.observe_running(self._all), self._chain_info(nothing, nothing)
 
     def step(self, actions: np.ndarray):
         """Step the running chains; the observation is under the task that comes next.
@@ -142,16 +89,7 @@ class SequentialVectorEnv(EpisodicVectorEnv):
         arrays: `task_success` (the current task was completed by this step), `position` (of the task that was
         acted on) and `chain_length`.
         """
-        what = self.apply(actions)
-        observation = self.observe_running(self._all[what.running])
-        info = self._chain_info(what.success, what.task_success, what.position) | {"diverged": what.diverged}
-        # Of the task that was acted on, not of the one that comes next.
-        info["is_grasped"] = what.is_grasped
-        return observation, what.task_success.astype(np.float32), what.success.copy(), what.failure, info
-
-    def apply(self, actions: np.ndarray) -> ChainStep:
-        """`step` without an observation: apply actions (n, 7) to the running chains and do the bookkeeping."""
-        running, position = ~self.done, self.position.copy()
+        running = ~self.done
         ids = self._all[running]
         _, diverged = self.step_streams(actions, ids)
         self._elapsed[ids] += 1
@@ -160,15 +98,16 @@ class SequentialVectorEnv(EpisodicVectorEnv):
         self._is_complete |= task_success
         self.chain_length += task_success
         window_over = self._elapsed >= self.window
-        is_last = self.position + 1 >= [len(ordering) for ordering in self._orderings]
+        is_last = self.position + 1 >= len(self.ordering)
         success = task_success & is_last
         failure = running & (diverged | (window_over & ~self._is_complete))
         may_switch = window_over if self.advance == "window" else self._is_complete
         switched = running & self._is_complete & may_switch & ~is_last & ~failure
         self.done |= success | failure
-        is_grasped = self.is_grasped.copy()
+        # Of the task that was acted on, not of the one that comes next.
+        info = self._chain_info(success, task_success) | {"diverged": diverged}
         self._begin_next_task(self._all[switched])
-        return ChainStep(running, position, task_success, success, failure, switched, diverged, is_grasped)
+        return self.observe_running(ids), task_success.astype(np.float32), success.copy(), failure, info
 
     def _begin_next_task(self, ids: np.ndarray) -> None:
         if not len(ids):
@@ -177,13 +116,13 @@ class SequentialVectorEnv(EpisodicVectorEnv):
         self._elapsed[ids], self._is_complete[ids] = 0, False
         if self._sends_arm_home:
             self.end_effector_reset(ids)
-        self.set_task(ids, [self._orderings[i][self.position[i]] for i in ids])
+        self.set_task(ids, [self.ordering[k] for k in self.position[ids]])
 
-    def _chain_info(self, success: np.ndarray, task_success: np.ndarray, position: np.ndarray) -> dict[str, Any]:
+    def _chain_info(self, success: np.ndarray, task_success: np.ndarray) -> dict[str, Any]:
         return {
             "is_success": success.copy(),
             "is_grasped": self.is_grasped.copy(),
             "task_success": task_success.copy(),
-            "position": position.copy(),
+            "position": self.position.copy(),
             "chain_length": self.chain_length.copy(),
         }

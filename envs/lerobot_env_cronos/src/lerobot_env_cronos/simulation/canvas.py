@@ -1,6 +1,6 @@
 """An OpenGL context that draws a model, and the process that has one of its own.
 
-    python canvas.py MODEL.mjb SHARED_FILE HEIGHT WIDTH CAMERA CAPACITY
+    python canvas.py MODEL.mjb HEIGHT WIDTH CAMERA
 
 It imports nothing but numpy and mujoco, so that such a process starts in a moment; see `render_pool`.
 """
@@ -12,8 +12,8 @@ import sys
 import mujoco
 import numpy as np
 
-REQUEST, ANSWER = struct.Struct("<ii"), b"d"
-"""First row and number of rows to draw; done."""
+READY, COUNT = b"r", struct.Struct("<i")
+"""What a process says when it can draw; how many states, float64 (nq,), a request consists of."""
 
 
 class Canvas:
@@ -69,30 +69,25 @@ class Canvas:
         self._context.free()
 
 
-def shared_arrays(path: str, capacity: int, nq: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """States (capacity, nq) float64 and frames (capacity, height, width, 3) uint8 in a file that two map."""
-    offset = capacity * nq * 8
-    memory = np.memmap(path, np.uint8, "r+", shape=(offset + capacity * height * width * 3,))
-    return memory[:offset].view(np.float64).reshape(capacity, nq), memory[offset:].reshape(-1, height, width, 3)
-
-
-def serve(model_path: str, shared_path: str, *numbers: str) -> None:
-    """Draw what is asked for on standard input, until it ends."""
-    height, width, camera, capacity = map(int, numbers)
+def serve(model_path: str, *numbers: str) -> None:
+    """Answer each request on standard input with its frames (n, height, width, 3) uint8, until it ends."""
+    height, width, camera = map(int, numbers)
     # Ctrl-C goes to all processes of a terminal, SIGTERM to all of a cluster's job; the one that asked decides,
     # and this one ends with its standard input.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     model = mujoco.MjModel.from_binary_path(model_path)
-    states, frames = shared_arrays(shared_path, capacity, model.nq, height, width)
     canvas = Canvas(model, height, width, camera)
-    sys.stdout.buffer.write(ANSWER)
-    sys.stdout.buffer.flush()
-    while len(request := sys.stdin.buffer.read(REQUEST.size)) == REQUEST.size:
-        first, count = REQUEST.unpack(request)
-        canvas.draw(states[first : first + count], frames[first : first + count])
-        sys.stdout.buffer.write(ANSWER)
-        sys.stdout.buffer.flush()
+    requests, answers = sys.stdin.buffer, sys.stdout.buffer
+    answers.write(READY)
+    answers.flush()
+    while len(head := requests.read(COUNT.size)) == COUNT.size:
+        (count,) = COUNT.unpack(head)
+        states = np.frombuffer(requests.read(count * model.nq * 8)).reshape(count, model.nq)
+        frames = np.empty((count, height, width, 3), np.uint8)
+        canvas.draw(states, frames)
+        answers.write(frames.data)
+        answers.flush()
 
 
 if __name__ == "__main__":

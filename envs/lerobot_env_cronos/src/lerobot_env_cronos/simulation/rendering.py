@@ -20,7 +20,7 @@ import numpy as np
 from lerobot_env_cronos.simulation import gl
 from lerobot_env_cronos.simulation.canvas import Canvas
 from lerobot_env_cronos.simulation.filament import FilamentRenderer
-from lerobot_env_cronos.simulation.render_pool import MIN_FRAMES, RenderPool
+from lerobot_env_cronos.simulation.render_pool import MIN_FRAMES, RenderPool, num_processes
 
 RENDERERS = ("classic", "filament")
 SOFTWARE = "llvmpipe"
@@ -96,7 +96,7 @@ class ClassicRenderer:
         """Render states `qpos` (n, nq) to uint8 frames (n, height, width, 3)."""
         gl.claim_process()
         if self._processes > 1 and len(qpos) >= 2 * MIN_FRAMES:
-            # The processes draw into one shared memory: one batch at a time.
+            # One batch at a time.
             with self._pool_lock:
                 return self._pool_for(len(qpos)).render(qpos)
         frames = np.empty((len(qpos), self.height, self.width, 3), np.uint8)
@@ -104,10 +104,11 @@ class ClassicRenderer:
         return frames
 
     def _pool_for(self, count: int) -> RenderPool:
-        if self._pool is None or self._pool.is_closed or count > self._pool.capacity:
+        needed = num_processes(count, self._processes)
+        if self._pool is None or self._pool.size < needed:
             if self._pool is not None:
                 self._pool.close()
-            self._pool = RenderPool(self.model, self.height, self.width, self.camera, self._processes, count)
+            self._pool = RenderPool(self.model, self.height, self.width, self.camera, needed)
         return self._pool
 
     def close(self) -> None:
