@@ -108,7 +108,6 @@ ROWS = [
     ("configurations/train", 1, {"environment": "lerobot_env_cronos/kitchen_2x2-v1"}, "environment"),
     ("configurations/train", 2, {"configuration": 7}, "row 2: configuration"),
     ("configurations/held_out", 2, {"toy_bear_x_m": 0.9}, "held_out, row 2: the toy bear"),
-    ("configurations/train", 2, {"carpet_z_m": -0.2}, "row 2: the carpet"),
     ("configurations/train", 2, {"carpet_qw": 3.0}, "row 2: the carpet"),
     ("configurations/train", 2, {"carpet_y_m": float("nan")}, "row 2: the carpet"),
     ("configurations/train", 2, {"carpet_y_m": None}, "carpet_y_m"),
@@ -128,28 +127,10 @@ def test_a_bad_row_is_named(file, row, values, message, mine, tmp_path):
         read_benchmark(tmp_path, "me/mine@abc")
 
 
-@pytest.mark.parametrize("environment", ["lerobot_env_cronos/playroom_2x2-v0", "lerobot_env_cronos/attic-v1", "x"])
-def test_a_benchmark_of_no_scene_is_refused(environment, mine, tmp_path):
-    write_benchmark(mine[0], tmp_path)
-    for path in tmp_path.glob("*/*.parquet"):
-        table = pq.read_table(path)
-        column = pa.array([environment] * len(table))
-        pq.write_table(table.set_column(table.column_names.index("environment"), "environment", column), path)
-    with pytest.raises(BenchmarkError, match=environment.rpartition("/")[2].removesuffix("-v1")):
-        read_benchmark(tmp_path, "it")
-
-
-def test_chains_of_different_lengths(mine, tmp_path):
-    write_benchmark(mine[0], tmp_path)
-    for row in (3, 4, 5):
-        change(tmp_path, "sequential/train", row, instructions=["put the toy bear on the carpet"])
-    with pytest.raises(BenchmarkError, match=r"one length.*\[1, 3\]"):
-        read_benchmark(tmp_path, "it")
-
-
 HOSTILE = {
     # Files of kilobytes that hold gigabytes.
     "rows": lambda table: repeat_row(table, 1_000_000),
+    "list": lambda table: repeat_in_list(table, 5_000_000),
     "a text": lambda table: repeat_row(table, 50_000, "x" * 1_000_000),
     "metadata": lambda table: table.replace_schema_metadata({"lerobot_env_cronos.bodies": "[" * 900_000}),
     "nested metadata": lambda table: table.replace_schema_metadata({"lerobot_env_cronos.bodies": "[" * 100_000}),
@@ -169,10 +150,17 @@ def repeat_row(table, number, text=None):
     return pa.table({name: pa.DictionaryArray.from_arrays(indices, value) for name, value in first.items()})
 
 
+def repeat_in_list(table, number):
+    """A table of one row, whose chain is very long."""
+    texts = pa.DictionaryArray.from_arrays(pa.array(np.zeros(number, np.int8)), pa.array(["put the toy bear"]))
+    chain = pa.ListArray.from_arrays(pa.array([0, number], pa.int32()), texts)
+    return table.slice(0, 1).set_column(table.column_names.index("instructions"), "instructions", chain)
+
+
 @pytest.mark.parametrize("what", HOSTILE)
 def test_a_small_file_that_holds_gigabytes_is_refused_in_a_short_message(what, mine, tmp_path):
     write_benchmark(mine[0], tmp_path)
-    path = tmp_path / "configurations/train.parquet"
+    path = tmp_path / ("sequential" if what == "list" else "configurations") / "train.parquet"
     pq.write_table(HOSTILE[what](pq.read_table(path)), path, compression="zstd")
     assert path.stat().st_size < 4e6
     before = pa.default_memory_pool().max_memory()
@@ -180,17 +168,6 @@ def test_a_small_file_that_holds_gigabytes_is_refused_in_a_short_message(what, m
         read_benchmark(tmp_path, "it")
     assert len(str(raised.value)) < 1000
     assert pa.default_memory_pool().max_memory() < before + 1e8
-
-
-def test_a_list_of_very_many_values_is_refused(mine, tmp_path):
-    write_benchmark(mine[0], tmp_path)
-    path = tmp_path / "sequential/train.parquet"
-    table, number = pq.read_table(path).slice(0, 1), 5_000_000
-    texts = pa.DictionaryArray.from_arrays(pa.array(np.zeros(number, np.int8)), pa.array(["put the toy bear"]))
-    chain = pa.ListArray.from_arrays(pa.array([0, number], pa.int32()), texts)
-    pq.write_table(table.set_column(table.column_names.index("instructions"), "instructions", chain), path)
-    with pytest.raises(BenchmarkError, match="too large"):
-        read_benchmark(tmp_path, "it")
 
 
 def test_columns_that_are_not_needed_are_not_read(mine, tmp_path):

@@ -1,7 +1,6 @@
-"""The frozen benchmark configurations: golden bytes; bodies lie apart, in view, within reach, and stay."""
+"""The frozen benchmark configurations: golden bytes; bodies lie in view, and stay."""
 
 import hashlib
-import itertools
 import sys
 from importlib import resources
 
@@ -11,16 +10,13 @@ from env_rollouts import keep_still, make
 from lerobot_env_cronos import SCENES, get_scene
 from lerobot_env_cronos.benchmark import freeze
 from lerobot_env_cronos.benchmark.configurations import (
-    CLEARANCE_M,
     SPLITS,
     footprint_corners,
     footprint_gap,
     load_configurations,
 )
-from lerobot_env_cronos.scene.robot import HOME_QPOS
 from lerobot_env_cronos.scene.scenes import BODIES
 from lerobot_env_cronos.scene.view import is_in_view
-from lerobot_env_cronos.simulation.kinematics import forward_kinematics, inverse_kinematics
 
 DATA = resources.files("lerobot_env_cronos").joinpath("data")
 # A change of these is a new version of the environment id.
@@ -66,14 +62,10 @@ def test_footprint_gap_by_hand():
 @pytest.mark.parametrize("split", SPLITS)
 @pytest.mark.parametrize("scene", SCENES)
 def test_doing_nothing_moves_nothing_and_completes_nothing(scene, split):
-    poses, bodies = load_configurations(scene, split), get_scene(scene).bodies
-    for configuration in poses:
-        yaws = 2 * np.arctan2(configuration[:, 6], configuration[:, 3])
-        corners = [footprint_corners(b, configuration[i, :2], yaws[i]) for i, b in enumerate(bodies)]
-        assert min(footprint_gap(a, b) for a, b in itertools.combinations(corners, 2)) > CLEARANCE_M - 1e-4
+    poses = load_configurations(scene, split)
     env = make(64, scene)
     env.scene_reset(np.arange(64), np.arange(64), split)
-    keep_still(env, 20)
+    keep_still(env, 10)
     assert np.abs(env.simulation.body_poses() - poses)[..., :3].max() < 2e-3
     assert np.abs(env.simulation.qvel[:, 8:]).max() < 1e-6
     assert not env.find_complete(env.scene.tasks).any()
@@ -81,23 +73,10 @@ def test_doing_nothing_moves_nothing_and_completes_nothing(scene, split):
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_every_body_is_in_the_picture_and_in_reach(scene):
+def test_every_body_is_in_the_picture(scene):
     poses = np.concatenate([load_configurations(scene, split) for split in SPLITS])
     for i, name in enumerate(SCENES[scene].bodies):
         yaws = 2 * np.arctan2(poses[:, i, 6], poses[:, i, 3])
         corners = np.stack([footprint_corners(name, p[:2], yaw) for p, yaw in zip(poses[:, i], yaws)])
         for height in (0.0, BODIES[name].size[2]):
             assert is_in_view(np.concatenate([corners, np.full((*corners.shape[:2], 1), height)], -1)).all()
-    # A hand that points down and across the line to the robot, just above every body.
-    goal = poses[..., :3].reshape(-1, 3) + np.array([0, 0, 0.03])
-    bearing = np.arctan2(goal[:, 1], goal[:, 0])
-    closing = np.stack([-np.sin(bearing), np.cos(bearing), 0 * bearing], 1)
-    down = np.tile([0.0, 0.0, -1.0], (len(goal), 1))
-    R = np.stack([down, closing, np.cross(down, closing)], 2)
-    q = np.tile(HOME_QPOS, (len(goal), 1))
-    start, _, _ = forward_kinematics(q)
-    for way in np.linspace(0.05, 1.0, 20)[:, None]:
-        q = inverse_kinematics(q, start + way * (goal - start), R)
-    reached, R_reached, _ = forward_kinematics(q)
-    assert np.linalg.norm(reached - goal, axis=1).max() < 0.001
-    assert (R_reached[:, 2, 0] < -0.999).all()

@@ -13,13 +13,13 @@ from forked_commands import run_forked
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from lerobot_env_cronos import (
     CronosEnv,
     CronosGymVectorEnv,
     CronosVectorEnv,
     IndependentVectorEnv,
     SequentialVectorEnv,
+    check_environment_id,
     get_scene,
 )
 
@@ -86,9 +86,10 @@ def test_lerobot_knows_the_environments_whatever_is_imported_first(order):
 # Episodes ------------------------------------------------------------------------------------------------
 
 
-def test_the_limit_of_steps_is_80_or_what_make_is_told():
+def test_the_limit_of_steps_is_what_make_is_told():
     assert gym.spec(ID).max_episode_steps == 80
-    for limit, given in ((80, {}), (3, {"max_episode_steps": 3}), (100, {"max_episode_steps": 100})):
+    for limit in (3, 100):
+        given = {"max_episode_steps": limit}
         env = gym.make(ID, **STATE, **given)
         vector = gym.make_vec(ID, num_envs=1, autoreset_mode="Disabled", **STATE, **given)
         env.reset(seed=0)
@@ -176,15 +177,16 @@ def test_what_is_wrong_is_named(make, named):
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_make_vec_is_gymnasiums_own_vector_of_single_environments(mode):
-    """The same seeds and actions, over the ends of episodes, one of them 30 steps early."""
+    """The same seeds and actions, over the ends of episodes at different times."""
     ours = gym.make_vec(ID, num_envs=2, autoreset_mode=mode, **STATE)
     assert type(ours.unwrapped) is CronosGymVectorEnv
     assert ours.metadata["autoreset_mode"] is mode
     singles = SyncVectorEnv([lambda: TimeLimit(CronosEnv(**STATE), 80)] * 2, autoreset_mode=mode)
     assert_equal(ours.reset(seed=3), singles.reset(seed=3))
-    ours.unwrapped._elapsed[1] = singles.envs[1]._elapsed_steps = 30
+    for i, elapsed in enumerate((60, 70)):
+        ours.unwrapped._elapsed[i] = singles.envs[i]._elapsed_steps = elapsed
     ends = []
-    for step, action in enumerate(actions(2, 90), start=1):
+    for step, action in enumerate(actions(2, 25), start=1):
         mine, theirs = ours.step(action), singles.step(action)
         ends += [(step, int(i)) for i in np.flatnonzero(mine[3])]
         for a, b in zip(mine[:4], theirs[:4], strict=True):
@@ -194,17 +196,7 @@ def test_make_vec_is_gymnasiums_own_vector_of_single_environments(mode):
             # Nothing is said of it by Gymnasium's vector where the step was a reset.
             info.pop(key, None), theirs[4].pop(key, None)
         assert_equal(info, theirs[4])
-    assert ends == [(50, 1), (80, 0)]
-
-
-@pytest.mark.parametrize(("mode", "ends"), [("NextStep", [80, 161]), ("SameStep", [80, 160])])
-def test_episode_statistics_of_gymnasiums_wrapper(mode, ends):
-    """With NextStep the 81st step is the reset's."""
-    env = RecordEpisodeStatistics(gym.make_vec(ID, num_envs=2, autoreset_mode=mode, **STATE))
-    env.reset(seed=0)
-    infos = [env.step(np.tile(STILL, (2, 1)))[4] for _ in range(162)]
-    assert [step for step, info in enumerate(infos, start=1) if "episode" in info] == ends
-    assert all(infos[step - 1]["episode"]["l"].tolist() == [80, 80] for step in ends)
+    assert ends == [(10, 1), (20, 0)]
 
 
 def test_without_autoreset_the_mask_says_who_starts_again():
@@ -235,8 +227,8 @@ def test_a_vector_draws_only_if_it_is_told_to():
 MAKERS = [
     lambda: CronosVectorEnv(2, **STATE),
     lambda: SequentialVectorEnv(2, ordering=TASKS[::-1], window=5, end_effector_reset=True, **STATE),
-    lambda: IndependentVectorEnv(2, task=TASKS[0], **STATE),
-    lambda: gym.make_vec(ID, num_envs=2, **STATE).unwrapped,
+    lambda: IndependentVectorEnv(2, task=TASKS[0], max_episode_steps=9, **STATE),
+    lambda: gym.make_vec(ID, num_envs=2, max_episode_steps=9, **STATE).unwrapped,
 ]
 
 
@@ -247,11 +239,11 @@ MAKERS = [
 def test_a_copy_goes_on_bit_for_bit(make, duplicate):
     env = make()
     env.reset(seed=5)
-    tape = actions(2, 20)
-    for action in tape[:10]:
+    tape = actions(2, 12)
+    for action in tape[:6]:
         env.step(action)
     other = duplicate(env)
-    for action in tape[10:]:
+    for action in tape[6:]:
         assert_equal(list(env.step(action)), list(other.step(action)))
     # Random starts, too.
     assert_equal(env.reset(), other.reset())
@@ -261,7 +253,7 @@ def test_a_copy_goes_on_bit_for_bit(make, duplicate):
 def test_a_state_is_gone_back_to_from_beyond_the_end_of_the_episode(make):
     env = make()
     env.reset(seed=5)
-    tape = actions(2, 100)
+    tape = actions(2, 15)
     for action in tape[:3]:
         env.step(action)
     state = env.get_state()
@@ -285,6 +277,19 @@ def test_a_state_of_something_else_is_refused_and_changes_nothing(make):
         with pytest.raises(ValueError, match="state"):
             env.set_state(other)
         assert_equal(env.get_state(), state)
+
+
+# Versions ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("text", ["lerobot_env_cronos/kitchen_2x2-v0", "kitchen_2x2", "PushT-v1", None, ""])
+def test_only_this_version_is_accepted(text):
+    assert check_environment_id(ID, "run outputs/train") == "kitchen_2x2"
+    with pytest.raises(ValueError, match=r"^dataset me/streams .*record it anew"):
+        check_environment_id(text, "dataset me/streams", "record it anew")
+
+
+# Processes -----------------------------------------------------------------------------------------------
 
 
 FORK = """

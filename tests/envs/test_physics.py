@@ -13,7 +13,7 @@ FLAT = get_scene(SCENE).receptacles
 
 
 def flat_body_on_the_table(body: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    model = build_model(get_scene(SCENE))
+    model = build_model(get_scene(SCENE), looks=False)
     model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     data = mujoco.MjData(model)
@@ -63,7 +63,7 @@ def test_tasks_sizes_and_masses_are_the_papers():
     ]
     masses = {}
     for scene in SCENES:
-        model = build_model(get_scene(scene))
+        model = build_model(get_scene(scene), looks=False)
         masses |= {body: model.body(body).mass[0] for body in get_scene(scene).bodies}
     # Volumes by hand, times the published densities.
     assert masses["yellow plate"] == pytest.approx(np.pi * 0.055**2 * 0.006 * 1003)

@@ -4,6 +4,7 @@ import copy
 
 import numpy as np
 import pytest
+from env_rollouts import STILL, keep_still, make
 from lerobot_env_cronos import CronosVectorEnv, Task, get_scene
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.scene.model import TABLE, hand_sensor, support_sensor
@@ -11,17 +12,11 @@ from lerobot_env_cronos.scene.robot import FINGERTIP_REACH, HOME_QPOS
 from lerobot_env_cronos.scene.scenes import BODIES, SCENES
 from lerobot_env_cronos.simulation.kinematics import forward_kinematics, inverse_kinematics
 
-STATE = "environment_state_agent_pos"
 CENTRE = np.array([0.30, 0.0])
-STILL = np.array([0, 0, 0, 0, 0, 0, 1.0])
 BOTTLE, SHOVEL, PLATE = "ketchup bottle", "kitchen shovel", "yellow plate"
 PLATE_TOP = 0.006
 WEIGHT = {BOTTLE: 0.1388, SHOVEL: 0.3246}
 """Volume of the boxes that they consist of, times density and 9.81 m/s^2 [N]."""
-
-
-def make(n: int, scene: str = "kitchen_2x2") -> CronosVectorEnv:
-    return CronosVectorEnv(n, scene, obs_type=STATE)
 
 
 def put(env: CronosVectorEnv, tasks: list[Task], offsets: np.ndarray, centres: np.ndarray | None = None) -> None:
@@ -59,10 +54,6 @@ def drive(env: CronosVectorEnv, motion: np.ndarray, gripper: np.ndarray, steps: 
     actions = np.zeros((env.num_envs, 7))
     actions[:, :3], actions[:, 6] = motion, gripper
     return np.array([env.step(actions)[4]["is_success"] for _ in range(steps)])
-
-
-def wait(env: CronosVectorEnv, steps: int) -> np.ndarray:
-    return drive(env, np.zeros((1, 3)), np.ones(env.num_envs), steps)
 
 
 def lies_on(env: CronosVectorEnv, task: Task) -> np.ndarray:
@@ -114,7 +105,7 @@ def test_an_overhang_counts_and_a_lean_does_not():
     env = make(5)
     offsets = np.array([[0, y, PLATE_TOP] for y in (0.0, 0.045, -0.045, 0.075, -0.075)])
     put(env, [task] * 5, offsets)
-    success = wait(env, 10)
+    success = keep_still(env, 10)
     np.testing.assert_array_equal(success[-1], [True, True, True, False, False])
     assert not success[:, 3:].any()
     table = env.simulation.force(support_sensor(SHOVEL, TABLE))[:, 2]
@@ -152,7 +143,7 @@ def test_what_was_placed_is_so_until_it_leaves_the_receptacle():
     task = Task(BOTTLE, PLATE)
     env = make(3)
     put(env, [task] * 3, np.array([[0, 0, PLATE_TOP]] * 3))
-    assert wait(env, 3)[-1].all()
+    assert keep_still(env, 3)[-1].all()
     width = BODIES[BOTTLE].size[1]
     tips = np.tile([*CENTRE, PLATE_TOP + 0.004], (3, 1))
     tips[:2, 1] += width / 2 + 0.05
@@ -173,7 +164,7 @@ def test_what_was_placed_is_so_until_it_leaves_the_receptacle():
     np.testing.assert_array_equal(lifted[-1], [True, False, False])
     assert env.simulation.body_pose(BOTTLE)[2, 2] > 0.05
     drive(env, np.array([[0, 0, -0.03]]), np.array([0, 0, 0]), 3)
-    np.testing.assert_array_equal(wait(env, 6)[-1], [True, False, True])
+    np.testing.assert_array_equal(keep_still(env, 6)[-1], [True, False, True])
 
 
 def test_what_is_dropped_counts_when_it_lies_still():
@@ -214,24 +205,24 @@ def test_pushed_off_and_on_again_does_not_count():
     task = Task(BOTTLE, "cloth")
     env = make(1)
     put(env, [task], np.array([[0, 0, 0.0094]]))
-    assert wait(env, 3)[-1, 0]
+    assert keep_still(env, 3)[-1, 0]
     # An intervention that moves the cloth away drops the bottle on the table, another slides the cloth under it.
     cloth = env.simulation.body_pose("cloth").copy()
     env.simulation.move_body(np.array([0]), "cloth", cloth + np.array([0.2, 0, 0, 0, 0, 0, 0]))
-    assert not wait(env, 5).any()
+    assert not keep_still(env, 5).any()
     assert env.simulation.is_on_table(BOTTLE)[0]
     lifted = env.simulation.body_pose(BOTTLE) + np.array([0, 0, 0.0094, 0, 0, 0, 0])
     env.simulation.qpos[:, 8:15] = lifted
     env.simulation.move_body(np.array([0]), "cloth", cloth)
-    assert not wait(env, 5).any()
+    assert not keep_still(env, 5).any()
     assert lies_on(env, task)[0]
     # Put there by an intervention of its own it counts as carried.
     env.simulation.move_body(np.array([0]), BOTTLE, env.simulation.body_pose(BOTTLE).copy())
-    assert wait(env, 3)[-1, 0]
+    assert keep_still(env, 3)[-1, 0]
 
 
 def test_a_reset_task_is_complete_from_the_start_when_bodies_were_put_on_the_table():
-    env = CronosVectorEnv(2, "playroom_2x2", obs_type=STATE, reward="difference")
+    env = make(2, "playroom_2x2")
     env.set_task([0, 1], [Task("toy bear", None), Task("plastic bottle", None)])
     assert env.is_success.all()
     _, reward, *_ = env.step(np.tile(STILL, (2, 1)))

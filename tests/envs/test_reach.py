@@ -14,7 +14,7 @@ from lerobot_env_cronos.benchmark.configurations import (
 )
 from lerobot_env_cronos.expert.reach import find_reach, sample_reach_configuration
 
-N = 32
+N = 16
 
 
 def draw(scene: str, seed: int = 0, n: int = N) -> np.ndarray:
@@ -61,9 +61,9 @@ def test_a_taller_object_is_carried_less_far():
 
 
 def test_same_seed_same_layouts_and_none_of_the_held_out_ones():
-    poses = draw("kitchen_2x2", n=200)
-    np.testing.assert_array_equal(poses, draw("kitchen_2x2", n=200))
-    assert not np.array_equal(poses, draw("kitchen_2x2", seed=1, n=200))
+    poses = draw("kitchen_2x2", n=40)
+    np.testing.assert_array_equal(poses[:10], draw("kitchen_2x2", n=10))
+    assert not np.array_equal(poses[:1], draw("kitchen_2x2", seed=1, n=1))
     held_out = load_configurations("kitchen_2x2", "held_out")
     # Furthest of the bodies from where a held-out configuration has it: never all four near.
     distance = np.linalg.norm(poses[:, None, :, :2] - held_out[None, ..., :2], axis=-1).max(-1)

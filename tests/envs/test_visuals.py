@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 from lerobot_env_cronos.scene import model as model_module
-from lerobot_env_cronos.scene.model import CAMERAS, build_model
-from lerobot_env_cronos.scene.robot import HOME_QPOS, PAD_HALF_SIZE, PAD_POS
+from lerobot_env_cronos.scene.model import build_model
+from lerobot_env_cronos.scene.robot import PAD_HALF_SIZE, PAD_POS
 from lerobot_env_cronos.scene.scenes import BODIES, SCENES
 from lerobot_env_cronos.scene.visuals.meshes import VISUAL_GROUP, loft, prism, rectangle
 
@@ -73,29 +73,6 @@ def test_fingers_end_where_the_pads_end(dressed, side, sign):
     assert vertices[:, 0].max() == pytest.approx(PAD_POS[0] + PAD_HALF_SIZE[0], abs=1e-4)
     # No part reaches beyond the gripping surface towards the other finger.
     assert (sign * vertices[:, 1]).min() == pytest.approx(PAD_POS[1] - PAD_HALF_SIZE[1], abs=1e-4)
-
-
-def project(model: mujoco.MjModel, camera: str, points: np.ndarray) -> np.ndarray:
-    """Image coordinates (n, 2) of world points, +-1 at the edges of a square picture."""
-    data = mujoco.MjData(model)
-    data.qpos[:6] = HOME_QPOS
-    mujoco.mj_forward(model, data)
-    local = (points - data.camera(camera).xpos) @ data.camera(camera).xmat.reshape(3, 3)
-    return local[:, :2] / -local[:, 2:] / np.tan(np.deg2rad(CAMERAS[camera]["fovy"]) / 2)
-
-
-def test_front_camera_sees_every_body_at_the_edge_of_the_spawn_area(dressed):
-    (x0, y0), (x1, y1) = SCENE.spawn_low, SCENE.spawn_high
-    # Any yaw: the largest footprint is a circle around the corner of the square.
-    reach = max(np.hypot(*BODIES[n].size[:2]) if BODIES[n].shape == "cloth" else max(BODIES[n].size)
-                for n in SCENE.bodies) / 2  # fmt: skip
-    angles = np.linspace(0, 2 * np.pi, 36)
-    ring = reach * np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1)
-    points = np.concatenate([ring + np.array([x, y, z]) for x in (x0, x1) for y in (y0, y1) for z in (0.0, 0.02)])
-    image = project(dressed, "front", points)
-    assert np.abs(image).max() < 0.95
-    # Tight framing: the bodies use at least nine tenths of the picture's width.
-    assert np.abs(image[:, 0]).max() > 0.9
 
 
 def test_loft_faces_outwards_and_names_wrong_caps():
