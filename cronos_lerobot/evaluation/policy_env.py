@@ -23,7 +23,7 @@ from lerobot.utils.constants import (
     OBS_STATE,
 )
 from lerobot_env_cronos import CronosEnvConfig
-from lerobot_env_cronos.scene.model import CAMERAS
+from lerobot_env_cronos.scene.cameras import CAMERAS
 from lerobot_env_cronos.scene.scenes import SCENES, get_scene
 from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS
 

@@ -15,8 +15,8 @@ from lerobot_env_cronos.benchmark.configurations import (
     footprint_gap,
     load_configurations,
 )
+from lerobot_env_cronos.scene.cameras import is_in_view
 from lerobot_env_cronos.scene.scenes import BODIES
-from lerobot_env_cronos.scene.view import is_in_view
 
 DATA = resources.files("lerobot_env_cronos").joinpath("data")
 # A change of these is a new version of the environment id.

@@ -255,13 +255,3 @@ def test_the_fingerprint_sees_what_your_own_shape_collides_with(monkeypatch):
         monkeypatch.setitem(SHAPES, "peg", other)
         fingerprints.add(benchmark.fingerprint)
     assert len(fingerprints) == 4
-
-
-def test_bodies_have_numbers_of_python():
-    """As JSON writes them, which tells 600 from 600.0."""
-    given = Body("e", [np.float32(0.5), 1, np.float64(0.125)], np.int64(600), "box", np.float32([0.5, 0, 1]))
-    plain = Body("e", (0.5, 1, 0.125), 600, "box", (0.5, 0.0, 1.0))
-    assert given == plain
-    assert json.dumps([given.size, given.density, given.colour]) == json.dumps(
-        [plain.size, plain.density, plain.colour]
-    )

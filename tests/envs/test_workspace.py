@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.benchmark import configurations
+from lerobot_env_cronos.scene.cameras import is_in_view
 from lerobot_env_cronos.scene.scenes import BODIES
-from lerobot_env_cronos.scene.view import is_in_view
 from lerobot_env_cronos.simulation.workspace import Unsuitable, find_free_pose, find_unsuitable
 
 UPRIGHT = [1.0, 0.0, 0.0, 0.0]

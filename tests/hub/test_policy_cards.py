@@ -8,7 +8,7 @@ import pytest
 import yaml
 from flags import parse_flags
 from lerobot_env_cronos.config import CronosEnvConfig
-from lerobot_env_cronos.scene.model import CAMERAS
+from lerobot_env_cronos.scene.cameras import CAMERAS
 from synthetic_evaluations import write_evaluation
 from synthetic_runs import edit_lines, edit_starts
 

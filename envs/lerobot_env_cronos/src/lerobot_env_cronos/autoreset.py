@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode
 
-from lerobot_env_cronos.episodic import IndependentVectorEnv, draw_start, find_task
+from lerobot_env_cronos.episodic import IndependentVectorEnv, draw_start, find_task, take_row
 from lerobot_env_cronos.scene.scenes import get_scene
 from lerobot_env_cronos.simulation.simulation import check_state
 from lerobot_env_cronos.vector_env import LEROBOT_OPTIONS, as_one_seed, check_options
@@ -99,12 +99,10 @@ class CronosGymVectorEnv(IndependentVectorEnv):
         info = self._mark(info, np.ones(self.num_envs, dtype=bool))
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
             starting = terminated | truncated
+            names = ("is_success", "is_grasped", "diverged", "task")
             for i in self._all[starting]:
-                final: dict[str, Any] = {
-                    name: bool(info[name][i]) for name in ("is_success", "is_grasped", "diverged")
-                }
-                final["task"] = info["task"][i]
-                info = self._add_info(info, {"final_obs": _row(observation, i), "final_info": final}, i)
+                last = {name: info[name][i].item() for name in names}
+                info = self._add_info(info, {"final_obs": take_row(observation, i), "final_info": last}, i)
         if self.autoreset_mode is not AutoresetMode.DISABLED and starting.any():
             ids = self._all[starting]
             self._begin(ids)
@@ -135,7 +133,3 @@ class CronosGymVectorEnv(IndependentVectorEnv):
 
     def _task_numbers(self) -> np.ndarray:
         return np.array([self.scene.tasks.index(task) for task in self.tasks])
-
-
-def _row(batch: dict[str, Any], i: int) -> dict[str, Any]:
-    return {key: _row(value, i) if isinstance(value, dict) else value[i].copy() for key, value in batch.items()}

@@ -15,7 +15,6 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from lerobot_env_cronos.benchmark.benchmark import SUITES, EpisodeGroup, benchmark_scene, load_benchmark
 from lerobot_env_cronos.benchmark.configurations import SPLITS
 from lerobot_env_cronos.benchmark.files import check_tag, fetch_benchmark
-from lerobot_env_cronos.benchmark.version import gymnasium_id
 from lerobot_env_cronos.episodic import EpisodicVectorEnv, IndependentVectorEnv, LazyVectorEnv
 from lerobot_env_cronos.scene.scenes import CONTROL_HZ, get_scene
 from lerobot_env_cronos.sequential import ADVANCES, SequentialVectorEnv
@@ -128,16 +127,6 @@ class CronosEnvConfig(EnvConfig):
             shape = (self.observation_height, self.observation_width, 3)
             self.features[key] = PolicyFeature(FeatureType.VISUAL, shape)
             self.features_map[key] = key
-
-    @property
-    def package_name(self) -> str:
-        """The module that registers the Gymnasium ids."""
-        return "lerobot_env_cronos"
-
-    @property
-    def gym_id(self) -> str:
-        """Gymnasium id of the single-environment form."""
-        return gymnasium_id(self.scene)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

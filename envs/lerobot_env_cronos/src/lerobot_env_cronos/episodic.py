@@ -219,7 +219,7 @@ class CronosEnv(gym.Env):
         start, self._env.task = draw_start(self.np_random, len(self._env.starts), self._tasks, chosen)
         observation, info = self._env.reset(seed=[start])
         self._over = (False, False)
-        return _first(observation), self._describe(info)
+        return take_row(observation, 0), self._describe(info)
 
     def step(self, action: np.ndarray):
         """Apply an action (7,) in physical units."""
@@ -228,10 +228,12 @@ class CronosEnv(gym.Env):
         observation, reward, terminated, truncated, info = self._env.step(np.asarray(action)[None])
         if not any(self._over):
             self._over = (bool(terminated[0]), bool(truncated[0]))
-        return _first(observation), float(reward[0]), *self._over, self._describe(info)
+        return take_row(observation, 0), float(reward[0]), *self._over, self._describe(info)
 
     def _describe(self, info: dict[str, Any]) -> dict[str, Any]:
-        return _first(info) | {"task": self._env.scene.tasks.index(self._env.task)}
+        return {name: values[0].item() for name, values in info.items()} | {
+            "task": self._env.scene.tasks.index(self._env.task)
+        }
 
     def render(self) -> np.ndarray | None:
         """Frame (height, width, 3) uint8 at `render_size`, or None without a render mode."""
@@ -289,7 +291,8 @@ def _copy(batch: dict[str, Any]) -> dict[str, Any]:
     return {key: _copy(value) if isinstance(value, dict) else value.copy() for key, value in batch.items()}
 
 
-def _first(batch: dict[str, Any]) -> dict[str, Any]:
-    """The only row of a batch; numbers are Python's."""
-    first = {k: _first(v) if isinstance(v, dict) else v[0] for k, v in batch.items()}
-    return {k: v.item() if isinstance(v, np.generic) else v for k, v in first.items()}
+def take_row(batch: dict[str, Any], i: int) -> dict[str, Any]:
+    """A copy of row `i` of a batch."""
+    return {
+        key: take_row(value, i) if isinstance(value, dict) else value[i].copy() for key, value in batch.items()
+    }

@@ -58,14 +58,10 @@ def set_configurations_file(scene: Scene, path: Path) -> None:
         ValueError: the scene has other configurations already; the file is of other bodies, a split has not 64
             configurations, or one of these cannot be used.
     """
-    splits = _load_splits(scene, path)
-    is_known = scene.name in SCENES or _packaged_file(scene).is_file()
-    if is_known and any((splits[split] != load_configurations(scene.name, split)).any() for split in SPLITS):
-        raise ValueError(
-            f"{scene.name} has other configurations than {path}: write a benchmark for --env.benchmark"
-        )
-    if not is_known:
-        _files[scene.name] = path
+    if scene.name in SCENES and _files.get(scene.name) != path:
+        raise ValueError(f"{scene.name} has its configurations, not those of {path}: --env.benchmark takes others")
+    _load_splits(scene, path)
+    _files[scene.name] = path
 
 
 def _packaged_file(scene: Scene) -> Traversable:

@@ -11,10 +11,10 @@ import numpy as np
 from lerobot_env_cronos.benchmark.configurations import set_configurations_file
 from lerobot_env_cronos.benchmark.version import register_gymnasium
 from lerobot_env_cronos.scene.bodies import SHAPES, narrowest_width
+from lerobot_env_cronos.scene.cameras import is_spawn_area_in_view
 from lerobot_env_cronos.scene.model import TABLE
 from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, add_robot
 from lerobot_env_cronos.scene.scenes import BODIES, SCENES, Body, Scene
-from lerobot_env_cronos.scene.view import is_spawn_area_in_view
 from lerobot_env_cronos.scene.visuals.objects import LOOKS
 
 # Part of Gymnasium's environment ids and of file names.

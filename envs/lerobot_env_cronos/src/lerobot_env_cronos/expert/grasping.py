@@ -80,8 +80,6 @@ class Grasps:
     """(n, 3) closing axis in the object's frame."""
     floor: np.ndarray
     """(n,) height that the fingertips stay above [m]."""
-    cost: np.ndarray
-    """(n,) its score, 0 the best."""
     blocker: np.ndarray
     """(n,) index of the object that is in the way of the hand, -1 for none."""
 
@@ -178,7 +176,7 @@ def choose_grasps(
     cost += 8.0 * np.linalg.norm((point - com[:, None])[..., :2], axis=-1)
     best, n = cost.argmin(1), np.arange(len(p))
     blocker = find_blocker(world, centre[n, best], closing[n, best], obj, is_support)
-    return Grasps(candidates.point[best], candidates.axis[best], floor[n, best], cost[n, best], blocker)
+    return Grasps(candidates.point[best], candidates.axis[best], floor[n, best], blocker)
 
 
 def _width(world: WorldBoxes, candidates: GraspCandidates, R: np.ndarray, closing: np.ndarray) -> np.ndarray:

@@ -13,9 +13,9 @@ import numpy as np
 from lerobot_env_cronos.benchmark.configurations import Place, sample_configuration
 from lerobot_env_cronos.expert.expert import HOVER_HEIGHT
 from lerobot_env_cronos.expert.grasping import TIP_CLEARANCE
+from lerobot_env_cronos.scene.cameras import is_in_view
 from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, FINGERTIP_REACH, HOME_QPOS
 from lerobot_env_cronos.scene.scenes import BODIES, Scene
-from lerobot_env_cronos.scene.view import is_in_view
 from lerobot_env_cronos.simulation.kinematics import forward_kinematics, inverse_kinematics
 
 SPACING_M = 0.02

@@ -1,33 +1,37 @@
 """The MuJoCo model of a scene, built with MjSpec."""
 
-from typing import Any
-
 import mujoco
-import numpy as np
 
 from lerobot_env_cronos.scene import visuals
 from lerobot_env_cronos.scene.bodies import add_body
-from lerobot_env_cronos.scene.physics import INTEGRATOR, SOLREF, TIMESTEP_S
+from lerobot_env_cronos.scene.cameras import CAMERAS, camera_quaternion
 from lerobot_env_cronos.scene.robot import CONTACT_SOLIMP, add_robot
-from lerobot_env_cronos.scene.scenes import BODIES, Scene
+from lerobot_env_cronos.scene.scenes import BODIES, CONTROL_HZ, Scene
+
+# The numbers that trade speed against honest physics.
+TIMESTEP_S = 0.008
+# With the implicit integrators what a hand holds slips up to three times as far at long time steps: they damp the
+# arm after the contacts were solved.
+INTEGRATOR = mujoco.mjtIntegrator.mjINT_EULER
+SUBSTEPS = round(1 / (CONTROL_HZ * TIMESTEP_S))
+"""Physics steps of a control step."""
+
+RAMP_CHUNKS, RAMP_SHARE = 8, 0.9
+"""The joint targets move linearly in 8 chunks over most of a control step. Without that, what is held slips."""
+CHUNK_SUBSTEPS = round(RAMP_SHARE * SUBSTEPS / RAMP_CHUNKS)
+"""Physics steps of one chunk of the ramp."""
+
+SETTLE_CHUNK_S = 0.1
+"""How often bodies that settle are looked at [s]."""
+SETTLE_SUBSTEPS = round(SETTLE_CHUNK_S / TIMESTEP_S)
+
+SOLREF = (2 * TIMESTEP_S, 1.0)
+"""Time constant [s] and damping ratio of contacts: as stiff as the time step allows, 2 dt."""
 
 TABLE_LOW, TABLE_HIGH, TABLE_THICKNESS = (-0.20, -0.45), (0.70, 0.45), 0.30
 """Table top in the base frame, surface at z = 0 [m]. A body pushed over its edge falls to the floor. Contacts push
 out along the shortest way: a hand that leans on a body would press it through the thin board that is drawn."""
 FLOOR_Z = -0.75
-
-CAMERAS: dict[str, dict[str, Any]] = {
-    # A front view, 45 degrees down through a long lens: bodies at the edges of the widened spawn area just fit
-    # the width of a square picture, and little is lost behind the arm.
-    "front": {"pos": [1.03, 0, 0.82], "xyaxes": [0, 1, 0, -1, 0, 1], "fovy": 27.0},
-    # The Bridge set-up's third-person Logitech C920, as identified by SimplerEnv.
-    "bridge": {
-        "pos": [0.0, -0.16, 0.36],
-        "xyaxes": [0.483933, -0.875105, 0.0, 0.602558, 0.333214, 0.725184],
-        "fovy": 42.1004,
-    },
-}
-"""Fixed cameras by name: position [m], image x and y axes, vertical field of view [deg]."""
 
 
 def grasp_sensor(side: str, obj: str) -> str:
@@ -62,7 +66,7 @@ def build_spec(scene: Scene, looks: bool = True) -> mujoco.MjSpec:
     _add_contact_sensors(spec, scene)
     for name, camera in CAMERAS.items():
         spec.worldbody.add_camera(
-            name=name, pos=camera["pos"], fovy=camera["fovy"], quat=_camera_quat(camera["xyaxes"])
+            name=name, pos=camera["pos"], fovy=camera["fovy"], quat=camera_quaternion(camera["xyaxes"])
         )
     if looks:
         visuals.dress(spec, bodies)
@@ -72,29 +76,6 @@ def build_spec(scene: Scene, looks: bool = True) -> mujoco.MjSpec:
 def build_model(scene: Scene, looks: bool = True) -> mujoco.MjModel:
     """Compile the scene's model; what it looks like has no mass, touches nothing, and costs physics time."""
     return build_spec(scene, looks).compile()
-
-
-def camera_axes(name: str) -> tuple[np.ndarray, np.ndarray, float]:
-    """Position (3,) [m], rotation (3, 3) with the image's x, y and the backward axis as columns, and half the
-    vertical field of view [rad] of a camera in the base frame."""
-    camera = CAMERAS[name]
-    return np.array(camera["pos"]), _camera_rotation(camera["xyaxes"]), np.deg2rad(camera["fovy"]) / 2
-
-
-def _camera_rotation(xyaxes: list[float]) -> np.ndarray:
-    """Rotation matrix of a camera from its image x and y axes, made orthonormal."""
-    x, y = np.array(xyaxes[:3]), np.array(xyaxes[3:])
-    x = x / np.linalg.norm(x)
-    y = y - x * (x @ y)
-    y = y / np.linalg.norm(y)
-    return np.stack([x, y, np.cross(x, y)], axis=1)
-
-
-def _camera_quat(xyaxes: list[float]) -> np.ndarray:
-    """Orientation (w, x, y, z) of a camera from its image x and y axes."""
-    quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, _camera_rotation(xyaxes).ravel())
-    return quat
 
 
 def _set_options(spec: mujoco.MjSpec) -> None:

@@ -32,7 +32,7 @@ ARM_FORCE_LIMIT = (200.0, 200.0, 100.0, 100.0, 100.0, 100.0)
 """Torque limits of SimplerEnv's system identification [N m]."""
 
 CONTACT_SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
-"""Impedance of contacts; their time constant is the model's default (`physics.SOLREF`)."""
+"""Impedance of contacts; their time constant is the model's default (`model.SOLREF`)."""
 PALM_SOLREF = (0.02, 1.0)
 
 

@@ -8,8 +8,6 @@ package are added by `lerobot_env_cronos.benchmark.registry.register_scene`.
 
 from dataclasses import dataclass
 
-import numpy as np
-
 CONTROL_HZ = 5
 """Control frequency of the environment, of `render_fps` and of every dataset [Hz]."""
 
@@ -23,8 +21,7 @@ class Body:
 
     `size` is the full extent of its bounding box in its resting pose, z up [m]; `density` is that of the
     collision geometry [kg/m^3]; `shape` names a builder of `lerobot_env_cronos.scene.bodies` and a look of
-    `lerobot_env_cronos.scene.visuals`; `colour` is the RGB (0 to 1) of the plain shapes `box` and `disc`. Numbers
-    of NumPy become Python's.
+    `lerobot_env_cronos.scene.visuals`; `colour` is the RGB (0 to 1) of the plain shapes `box` and `disc`.
     """
 
     name: str
@@ -32,18 +29,6 @@ class Body:
     density: float
     shape: str
     colour: tuple[float, float, float] | None = None
-
-    def __post_init__(self) -> None:
-        # A fingerprint hashes them as JSON, which knows no number of NumPy's; Python's stay as they are.
-        for name in ("size", "density", "colour"):
-            object.__setattr__(self, name, _plain(getattr(self, name)))
-
-
-def _plain(value: object) -> object:
-    """A number, or a tuple of numbers, without NumPy's types."""
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    return tuple(map(_plain, value)) if isinstance(value, tuple | list) else value
 
 
 @dataclass(frozen=True)
@@ -133,13 +118,8 @@ SCENES: dict[str, Scene] = {
 def get_scene(name: str) -> Scene:
     """Look a scene up by name; a ValueError names the valid ones."""
     if name not in SCENES:
-        raise ValueError(describe_unknown_scene(name, "--env.discover_packages_path"))
+        raise ValueError(
+            f"unknown scene {name!r}; valid scenes: {sorted(SCENES)}. One of your own is registered by its "
+            "package: install it as lerobot_env_<name>, or give --env.discover_packages_path=<package>"
+        )
     return SCENES[name]
-
-
-def describe_unknown_scene(name: str, flag: str | None) -> str:
-    """That there is no scene `name`, and how to have one; `flag` imports a package, where a command has such."""
-    return (
-        f"unknown scene {name!r}; valid scenes: {sorted(SCENES)}. One of your own is registered by its package: "
-        f"install it as lerobot_env_<name>{f', or give {flag}=<package>' if flag else ''}"
-    )

@@ -23,14 +23,15 @@ class Canvas:
     time of a small one.
     """
 
-    def __init__(self, model: mujoco.MjModel, height: int, width: int, camera: int, shadows: bool = False):
+    def __init__(self, model: mujoco.MjModel, height: int, width: int, camera: int):
         self._model, self._data = model, mujoco.MjData(model)
         self._rect = mujoco.MjrRect(0, 0, width, height)
         self._scene, self._options = mujoco.MjvScene(model, maxgeom=500), mujoco.MjvOption()
         self._camera = mujoco.MjvCamera()
         self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = shadows
+        # In software they cost five times the rest of the frame.
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         # The buffer is as large as the model says, and a picture beyond it is black there.
         screen = model.vis.global_
         screen.offwidth, screen.offheight = max(screen.offwidth, width), max(screen.offheight, height)

@@ -6,9 +6,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from lerobot_env_cronos.scene.model import CAMERAS
+from lerobot_env_cronos.scene.cameras import CAMERAS
 from lerobot_env_cronos.scene.scenes import Scene, Task
-from lerobot_env_cronos.simulation.rendering import RENDERERS, BatchRenderer, make_renderer
+from lerobot_env_cronos.simulation.rendering import RENDERERS, ClassicRenderer, FilamentRenderer, make_renderer
 from lerobot_env_cronos.simulation.simulation import Simulation
 
 OBS_TYPES = ("pixels_agent_pos", "environment_state_agent_pos")
@@ -96,7 +96,7 @@ class ObservationBuilder:
         self.pixels = obs_type == "pixels_agent_pos"
         self.privileged = privileged_state or not self.pixels
         self.size, self.render_size = (height, width), tuple(render_size)
-        self._renderers: dict[tuple, BatchRenderer] = {}
+        self._renderers: dict[tuple, ClassicRenderer | FilamentRenderer] = {}
         self.space = self._space()
 
     def _space(self) -> gym.spaces.Dict:
@@ -165,7 +165,7 @@ class ObservationBuilder:
         flat = np.concatenate(parts, axis=2, dtype=np.float32).reshape(len(p), -1)
         return flat.clip(-STATE_LIMIT, STATE_LIMIT)
 
-    def _renderer(self, size: tuple[int, int], camera: str) -> BatchRenderer:
+    def _renderer(self, size: tuple[int, int], camera: str) -> ClassicRenderer | FilamentRenderer:
         key = (size, camera)
         if key not in self._renderers:
             model, processes = self.simulation.render_model, self.simulation.num_threads

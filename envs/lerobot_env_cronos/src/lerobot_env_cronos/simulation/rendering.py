@@ -12,7 +12,6 @@ import os
 import threading
 import weakref
 from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -29,20 +28,9 @@ SOFTWARE = "llvmpipe"
 _GL_THREAD = ThreadPoolExecutor(1, thread_name_prefix="opengl")
 
 
-class BatchRenderer(Protocol):
-    """Draws simulation states; any thread may ask for frames."""
-
-    def render(self, qpos: np.ndarray) -> np.ndarray:
-        """Frames (n, height, width, 3) uint8 of states `qpos` (n, nq)."""
-        ...
-
-    def close(self) -> None:
-        """Free what it draws with."""
-
-
 def make_renderer(
     name: str, model: mujoco.MjModel, height: int, width: int, camera: str, processes: int = 1
-) -> BatchRenderer:
+) -> ClassicRenderer | FilamentRenderer:
     """Return the renderer `name` of `RENDERERS` for one camera and size.
 
     Args:
@@ -58,37 +46,25 @@ def make_renderer(
     """
     gl.claim_process()
     if name == "classic":
-        return ClassicRenderer(model, height, width, camera, processes=processes)
+        return ClassicRenderer(model, height, width, camera, processes)
     return FilamentRenderer(model, height, width, camera)
 
 
 class ClassicRenderer:
-    """Renders `camera` of simulation states at `height` x `width`.
-
-    Shadows and reflections are off unless asked for: in software rendering they cost five times the rest of the
-    frame.
+    """Renders `camera` of simulation states at `height` x `width`, without shadows.
 
     Raises:
         KeyError: the model has no such camera.
         RenderingError: no OpenGL context can be opened.
     """
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        height: int,
-        width: int,
-        camera: str,
-        *,
-        shadows: bool = False,
-        processes: int = 1,
-    ):
+    def __init__(self, model: mujoco.MjModel, height: int, width: int, camera: str, processes: int = 1):
         self.model, self.height, self.width = model, height, width
         self.camera = model.camera(camera).id
-        self._canvas = _GL_THREAD.submit(_open, model, height, width, self.camera, shadows).result()
+        self._canvas = _GL_THREAD.submit(_open, model, height, width, self.camera).result()
         self._finalizer = weakref.finalize(self, _close, self._canvas, os.getpid())
         in_software = processes > 1 and SOFTWARE in _GL_THREAD.submit(self._canvas.driver).result()
-        self._processes = processes if in_software and not shadows else 1
+        self._processes = processes if in_software else 1
         self._pool: RenderPool | None = None
         self._pool_lock = threading.Lock()
 
@@ -118,9 +94,9 @@ class ClassicRenderer:
         self._finalizer()
 
 
-def _open(model: mujoco.MjModel, height: int, width: int, camera: int, shadows: bool) -> Canvas:
+def _open(model: mujoco.MjModel, height: int, width: int, camera: int) -> Canvas:
     try:
-        return Canvas(model, height, width, camera, shadows)
+        return Canvas(model, height, width, camera)
     except Exception as error:  # The platforms raise whatever their bindings do.
         cause = f"{type(error).__name__}: {error}"
         raise gl.RenderingError(gl.NO_CONTEXT.format(platform=os.environ.get("MUJOCO_GL"), cause=cause)) from error

@@ -14,8 +14,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from lerobot_env_cronos.benchmark.version import VERSION
-from lerobot_env_cronos.scene.model import build_model
-from lerobot_env_cronos.scene.physics import CHUNK_SUBSTEPS, RAMP_CHUNKS, SETTLE_SUBSTEPS, SUBSTEPS
+from lerobot_env_cronos.scene.model import CHUNK_SUBSTEPS, RAMP_CHUNKS, SETTLE_SUBSTEPS, SUBSTEPS, build_model
 from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, FINGER_CLOSED, FINGER_OPEN, FINGERTIP_REACH, HOME_QPOS
 from lerobot_env_cronos.scene.scenes import BODIES, Scene
 from lerobot_env_cronos.simulation.judging import Judge

@@ -10,9 +10,9 @@ from functools import partial
 import numpy as np
 
 from lerobot_env_cronos.benchmark.configurations import Place, draw_spawn_place, footprint_corners, sample_place
+from lerobot_env_cronos.scene.cameras import is_in_view, is_spawn_area_in_view
 from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW
 from lerobot_env_cronos.scene.scenes import BODIES, Scene
-from lerobot_env_cronos.scene.view import is_in_view, is_spawn_area_in_view
 from lerobot_env_cronos.simulation.simulation import Simulation
 
 MAX_RECEPTACLE_TILT_RAD = np.deg2rad(60)
