@@ -7,7 +7,6 @@ from functools import partial
 from types import TracebackType
 from typing import Any, TypeGuard
 
-import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig, HubEnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
@@ -142,11 +141,10 @@ class CronosEnvConfig(EnvConfig):
         """Streams to train on, which never reset themselves; `options` are those of `CronosVectorEnv`."""
         return CronosVectorEnv(num_envs, self.scene, **(self.gym_kwargs | options))
 
-    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
         """One native vector env per task or ordering, built lazily; `use_async_envs` is not needed and ignored."""
         makers = {i: self._maker(n_envs, chosen) for i, chosen in self._chosen().items()}
-        envs: dict[int, gym.vector.VectorEnv] = {i: LazyVectorEnv(make, n_envs) for i, make in makers.items()}
-        return {f"{self.suite}_{self.split}": envs}
+        return {f"{self.suite}_{self.split}": {i: LazyVectorEnv(make, n_envs) for i, make in makers.items()}}
 
     def _chosen(self) -> dict[int, EpisodeGroup]:
         """The tasks or orderings of the suite that `task` chooses, by their number."""

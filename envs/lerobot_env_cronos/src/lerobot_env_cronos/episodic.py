@@ -118,44 +118,23 @@ class IndependentVectorEnv(EpisodicVectorEnv):
         return self.observe_running(running), reward, success.copy(), truncated, info
 
 
-class LazyVectorEnv(gym.vector.VectorEnv):
-    """Builds its environment at the first use and frees it on `close`.
+class LazyVectorEnv:
+    """Builds its environment at the first use and frees it on `close`, as LeRobot's own lazy vector does.
 
     `lerobot-eval` creates the environments of all tasks up front and evaluates them one after the other; built
     lazily, only one of them occupies memory and an OpenGL context at a time.
     """
 
-    metadata = CronosVectorEnv.metadata
-    render_mode = "rgb_array"
-
     def __init__(self, make: Callable[[], CronosVectorEnv], num_envs: int):
-        self._make = make
+        self._make, self.num_envs = make, num_envs
         self._env: CronosVectorEnv | None = None
-        self.num_envs = num_envs
-
-    @property
-    def env(self) -> CronosVectorEnv:
-        """The environment, built if need be."""
-        if self._env is None:
-            self._env = self._make()
-        return self._env
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or name == "_env":
+        if name.startswith("_"):
             raise AttributeError(name)
-        return getattr(self.env, name)
-
-    def reset(self, *, seed=None, options=None):
-        """See `IndependentVectorEnv.reset`."""
-        return self.env.reset(seed=seed, options=options)
-
-    def step(self, actions):
-        """See `IndependentVectorEnv.step`."""
-        return self.env.step(actions)
-
-    def render(self):
-        """See `CronosVectorEnv.render`."""
-        return self.env.render()
+        if self._env is None:
+            self._env = self._make()
+        return getattr(self._env, name)
 
     def close(self, **kwargs) -> None:
         """Free the environment; the next use builds it again."""
