@@ -232,17 +232,16 @@ MAKERS = [
 ]
 
 
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 @pytest.mark.parametrize(
     "make", [*MAKERS, lambda: CronosVectorEnv(2, observation_height=32, observation_width=32)]
 )
-def test_a_copy_goes_on_bit_for_bit(make, duplicate):
+def test_a_copy_goes_on_bit_for_bit(make):
     env = make()
     env.reset(seed=5)
     tape = actions(2, 12)
     for action in tape[:6]:
         env.step(action)
-    other = duplicate(env)
+    other = copy.deepcopy(pickle.loads(pickle.dumps(env)))
     for action in tape[6:]:
         assert_equal(list(env.step(action)), list(other.step(action)))
     # Random starts, too.

@@ -1,20 +1,24 @@
 """LeRobot's plugin interface: configs, features, environments by suite and split."""
 
+import importlib
+import logging
+
 import numpy as np
 import pytest
 from env_rollouts import STATE
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.factory import make_env, make_env_config
 from lerobot.envs.utils import env_to_policy_features
-from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils import import_utils
 from lerobot_env_cronos import CronosEnvConfig, IndependentVectorEnv, get_scene
 from lerobot_env_cronos.benchmark.configurations import load_configurations
+from lerobot_env_cronos.plugin import shorten_video_backend_warning
 
 TASK = get_scene("kitchen_2x2").tasks[0]
 
 
 def test_lerobot_finds_the_plugin_and_builds_every_task():
-    register_third_party_plugins()
+    import_utils.register_third_party_plugins()
     assert "cronos" in EnvConfig.get_known_choices()
     cfg = make_env_config("cronos", split="held_out", observation_height=64, observation_width=64)
     envs = make_env(cfg, n_envs=2)["independent_held_out"]
@@ -54,6 +58,26 @@ def test_policy_features_match_what_the_env_observes():
 def test_config_errors_name_the_field_and_its_value(field, value):
     with pytest.raises(ValueError, match=rf"{field}.*{value}"):
         CronosEnvConfig(**{field: value})
+
+
+def test_without_ffmpeg_the_decoder_is_named_in_one_sentence_and_once(caplog, monkeypatch):
+    logger = logging.getLogger("lerobot.utils.import_utils")
+
+    def fail(name):
+        raise RuntimeError("Could not load libtorchcodec. Traceback (most recent call last): ...")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(logger, "filters", [])
+        shorten_video_backend_warning()
+        patched.setattr(importlib.util, "find_spec", lambda name: name)
+        patched.setattr(importlib, "import_module", fail)
+        backends = [import_utils.get_safe_default_video_backend() for _ in range(3)]
+        logger.warning("something else")
+    assert backends == ["pyav"] * 3
+    ours, other = [record.getMessage() for record in caplog.records]
+    assert "PyAV" in ours
+    assert "Traceback" not in ours
+    assert other == "something else"
 
 
 # Independent episodes ------------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from lerobot_env_cronos.scene import model as model_module
 from lerobot_env_cronos.scene.model import build_model
-from lerobot_env_cronos.scene.robot import PAD_HALF_SIZE, PAD_POS
 from lerobot_env_cronos.scene.scenes import BODIES, SCENES
 from lerobot_env_cronos.scene.visuals.meshes import VISUAL_GROUP, loft, prism, rectangle
 
@@ -65,14 +64,6 @@ def test_body_fills_its_bounding_box_and_stays_inside(models, scene, name):
     assert (np.abs(vertices) <= half + 1e-4).all()
     # At least 90 % of the published extent is visible in every direction.
     assert (np.ptp(vertices, axis=0) >= 0.9 * 2 * half).all()
-
-
-@pytest.mark.parametrize(("side", "sign"), [("left", 1.0), ("right", -1.0)])
-def test_fingers_end_where_the_pads_end(dressed, side, sign):
-    vertices = visual_vertices(dressed, f"{side}_finger_link")
-    assert vertices[:, 0].max() == pytest.approx(PAD_POS[0] + PAD_HALF_SIZE[0], abs=1e-4)
-    # No part reaches beyond the gripping surface towards the other finger.
-    assert (sign * vertices[:, 1]).min() == pytest.approx(PAD_POS[1] - PAD_HALF_SIZE[1], abs=1e-4)
 
 
 def test_loft_faces_outwards_and_names_wrong_caps():
