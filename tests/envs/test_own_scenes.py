@@ -94,8 +94,6 @@ def test_plain_bodies_have_mass_and_colour_and_can_be_placed():
             [BLOCK, COASTER, replace(BLOCK, name="red_block")],
             "red_block",
         ),
-        (SCENE, [replace(BLOCK, colour=(255, 0, 0)), COASTER], "colour"),
-        (SCENE, [replace(BLOCK, size=(0.03, np.nan, 0.03)), COASTER], "size"),
         (SCENE, [replace(BLOCK, name="red/block"), COASTER], "red/block"),
     ],
 )

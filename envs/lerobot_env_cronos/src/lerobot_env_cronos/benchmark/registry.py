@@ -87,16 +87,8 @@ def _check_body(body: Body) -> None:
         raise ValueError(f"a body needs a name without a slash that is not in use, got {name!r}; in use: {taken}")
     if body.shape not in valid_shapes:
         raise ValueError(f"unknown shape {body.shape!r} of the {name}; valid shapes: {valid_shapes}")
-    numbers = np.array([*body.size, body.density], dtype=float)
-    if len(body.size) != 3 or not (np.isfinite(numbers) & (numbers > 0)).all():
-        raise ValueError(
-            f"size of the {name} must be three positive lengths [m], density positive [kg/m^3], got {body.size}, "
-            f"{body.density}"
-        )
     if body.shape in ROUND_SHAPES and body.size[0] != body.size[1]:
         raise ValueError(f"a {body.shape} is round: the {name} needs two equal sides, got {body.size[:2]}")
-    if body.colour is not None and (len(body.colour) != 3 or not all(0 <= c <= 1 for c in body.colour)):
-        raise ValueError(f"colour of the {name} must be (R, G, B) in 0 to 1, got {body.colour}")
 
 
 def _check_spawn_area(scene: Scene, bodies: dict[str, Body]) -> None:

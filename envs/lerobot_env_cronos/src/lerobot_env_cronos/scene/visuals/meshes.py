@@ -24,8 +24,6 @@ def loft(rings: np.ndarray, caps: str = "both") -> Surface:
 
     Ends that nobody sees are left open: a frame's cost grows with the triangles.
     """
-    if caps not in ("both", "first", "last", "none"):
-        raise ValueError(f"unknown caps {caps!r}; valid: both, first, last, none")
     rings = np.asarray(rings, dtype=float)
     r, k, _ = rings.shape
     vertices = rings.reshape(-1, 3)
