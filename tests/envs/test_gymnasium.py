@@ -75,14 +75,6 @@ def test_gymnasium_needs_neither_lerobot_nor_torch():
     subprocess.run([sys.executable, "-c", IMPORTS], check=True)
 
 
-@pytest.mark.parametrize("order", [("lerobot_env_cronos", "lerobot.envs"), ("lerobot.envs", "lerobot_env_cronos")])
-def test_lerobot_knows_the_environments_whatever_is_imported_first(order):
-    code = f"import {order[0]}, {order[1]}\nfrom lerobot.envs.configs import EnvConfig\n"
-    code += "print({'cronos', 'cronos_hub'} <= EnvConfig.get_known_choices().keys())"
-    done = run_forked([sys.executable, "-c", code])
-    assert done.stdout == "True\n", done.stderr
-
-
 # Episodes ------------------------------------------------------------------------------------------------
 
 
