@@ -5,15 +5,12 @@ from __future__ import annotations
 import importlib
 import io
 import sys
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr, suppress
-from dataclasses import fields, is_dataclass
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stderr, suppress
 from pathlib import Path
-from types import NoneType
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import draccus
-from draccus.utils import ParsingError
 from lerobot.configs import parser
 
 
@@ -33,7 +30,7 @@ def parse_command_line(
         types: default types of choice fields, by name.
 
     Raises:
-        ValueError: a flag does not exist, or its value is null where it cannot be.
+        ValueError: a flag does not exist.
         FileNotFoundError: there is no file `--config_path`.
         ParsingError: a value does not fit its flag; `scripts.errors.reason` finds why.
         PluginLoadError: a module cannot be imported.
@@ -50,11 +47,15 @@ def parse_command_line(
     if file is not None:
         file = parser.extract_path_fields_from_config(file, paths)
     kind = "json" if file is not None and file.endswith(".json") else "yaml"
-    with _one_reason(given), draccus.config_type(kind):
-        config = draccus.parse(config_class, file, flags)
-    for flag in _null_flags(given):
-        if not _takes_null(config, flag):
-            raise ValueError(f"null is no value of --{flag}")
+    said = io.StringIO()
+    try:
+        with draccus.config_type(kind), redirect_stderr(said):
+            config = draccus.parse(config_class, file, flags)
+    except SystemExit as exit_:
+        # argparse prints all flags, and then the reason.
+        wrong = said.getvalue().rpartition(": error: ")[2].strip()
+        raise ValueError(f"{wrong}; --help lists the flags") from exit_
+    sys.stderr.write(said.getvalue())
     return config
 
 
@@ -78,45 +79,6 @@ def allow_single_file(name: str) -> None:
     with suppress(ImportError):
         module = importlib.import_module(name)
         module.__path__ = getattr(module, "__path__", [])
-
-
-@contextmanager
-def _one_reason(arguments: Sequence[str]) -> Generator[None]:
-    """Turn what argparse prints, all flags and then the reason, into a ValueError with the reason."""
-    said = io.StringIO()
-    try:
-        with redirect_stderr(said):
-            yield
-    except SystemExit as exit_:
-        wrong = said.getvalue().rpartition(": error: ")[2].strip()
-        raise ValueError(f"{wrong}; --help lists the flags") from exit_
-    except ParsingError as error:
-        # Logged by configs, because draccus hides the reason: `reason` finds it again.
-        if isinstance(error.__cause__, TypeError) and (flags := _null_flags(arguments)):
-            raise ValueError(f"null is no value of {' or '.join(f'--{flag}' for flag in flags)}") from error
-        raise
-    sys.stderr.write(said.getvalue())
-
-
-def _null_flags(arguments: Sequence[str]) -> list[str]:
-    """The flags that are given as null, without their dashes."""
-    found = []
-    for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
-        name, equals, value = argument.partition("=")
-        if name.startswith("--") and (value if equals else following) in ("null", "~"):
-            found.append(name.removeprefix("--"))
-    return found
-
-
-def _takes_null(config: Any, flag: str) -> bool:
-    """Whether a field of a config may be None; draccus gives None to numbers and booleans, too."""
-    *groups, name = flag.split(".")
-    for group in groups:
-        config = getattr(config, group, None)
-    field = next((f for f in fields(config) if f.name == name), None) if is_dataclass(config) else None
-    if field is None or field.default is None or getattr(config, name) is not None:
-        return True
-    return NoneType in get_args(get_type_hints(type(config))[name])
 
 
 def _missing_types(arguments: Sequence[str], types: Mapping[str, str]) -> list[str]:

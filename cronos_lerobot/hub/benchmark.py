@@ -18,7 +18,7 @@ from lerobot_env_cronos.scene.scenes import BODIES, STEPS_PER_TASK
 from lerobot_env_cronos.simulation.gl import RenderingError
 
 from cronos_lerobot.hub import env_file
-from cronos_lerobot.hub.cards import code, describe_source, is_packaged, render_card
+from cronos_lerobot.hub.cards import describe_source, is_packaged, render_card
 from cronos_lerobot.hub.config import BenchmarkConfig
 from cronos_lerobot.hub.pictures import configuration_pictures, configuration_sheet, task_sheet
 from cronos_lerobot.hub.push import PublishError
@@ -35,11 +35,7 @@ REPLACES = [f"{config}/*" for config in CONFIGS] + ["pictures/*"]
 
 
 def choose_benchmark(config: BenchmarkConfig) -> Benchmark:
-    """The benchmark that the flags name.
-
-    Raises:
-        ValueError: it cannot be loaded or drawn.
-    """
+    """The benchmark that the flags name."""
     sizes = {name: getattr(config, name) for name in ("num_configurations", "num_orderings", "chain_length")}
     given = {name: value for name, value in sizes.items() if value is not None}
     if config.seed is None and given:
@@ -53,11 +49,7 @@ def choose_benchmark(config: BenchmarkConfig) -> Benchmark:
 
 
 def write_benchmark_repository(config: BenchmarkConfig, folder: Path, benchmark: Benchmark) -> str:
-    """Write the tree of the repository of a benchmark into `folder`; returns what it is, in words.
-
-    Raises:
-        PublishError: pictures cannot be drawn.
-    """
+    """Write the tree of the repository of a benchmark into `folder`; returns what it is, in words."""
     try:
         pictures = configuration_pictures(benchmark) if config.pictures else None
     except RenderingError as error:
@@ -118,25 +110,16 @@ def task_id(suite: str, split: str) -> str:
 def _card(benchmark: Benchmark, config: BenchmarkConfig, title: str) -> str:
     scene = benchmark.scene
     rows = sum(benchmark.size(suite, split) for suite in SUITES for split in SPLITS)
-    sizes = [
-        (code(body.name), ", ".join(f"{round(1000 * float(side), 1)}" for side in body.size), body.density)
-        for body in map(BODIES.__getitem__, scene.bodies)
-    ]
     return render_card(
         "benchmark",
         title=title,
-        repo_id=config.repo_id,
+        config=config,
         benchmark=benchmark,
-        source=code(describe_source(benchmark.source)),
-        scene=scene,
+        source=describe_source(benchmark.source),
         environment=gymnasium_id(scene.name),
-        bodies=sizes,
+        bodies=[BODIES[name] for name in scene.bodies],
         window_steps=STEPS_PER_TASK,
-        has_pictures=config.pictures,
-        has_env_hub=config.env_hub,
         is_own_scene=not is_packaged(scene.name),
         is_packaged=benchmark.fingerprint == load_benchmark(None, scene.name).fingerprint,
-        column_prefix=scene.bodies[0].replace(" ", "_"),
-        chain_length=len(benchmark.groups("sequential", "train")[0].tasks),
         size_category="n<1K" if rows < 1000 else "1K<n<10K" if rows < 10_000 else "10K<n<100K",
     )

@@ -2,31 +2,35 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import draccus
 import jinja2
-from huggingface_hub import constants
+from lerobot.rl.algorithms.configs import RLAlgorithmConfig
+from lerobot_env_cronos import CronosEnvConfig
 from markupsafe import Markup
 
 from cronos_lerobot.hub.stage import clean
 from cronos_lerobot.provenance import package_versions
+from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.resume import flatten
 
 PACKAGED = Path(__file__).parent / "cards"
 CHECKOUT = Path(__file__).parents[2] / "datasets_cards"
+SHOWN = ("env.", "protocol.", "algorithm.", "num_envs", "steps", "seed")
+"""Flags that a card shows, by their beginning."""
 
 
 def render_card(kind: str, **values: Any) -> str:
     """The card `kind`.md with `values`.
 
     Values may come from files of other people. Each stays in its line and cannot end the code that it stands in.
-
-    Raises:
-        jinja2.UndefinedError: a value is missing.
     """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(PACKAGED if PACKAGED.is_dir() else CHECKOUT),
@@ -38,9 +42,8 @@ def render_card(kind: str, **values: Any) -> str:
         autoescape=False,
     )
     environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}
-    environment.filters |= {"table": table, "command": command}
-    common = {"hub": constants.ENDPOINT, "versions": package_versions()}
-    return environment.get_template(f"{kind}.md").render(common | values)
+    environment.filters |= {"code": code, "cell": cell, "command": command, "interval": interval}
+    return environment.get_template(f"{kind}.md").render({"versions": package_versions()} | values)
 
 
 def one_line(value: Any) -> str:
@@ -53,11 +56,9 @@ def code(value: Any) -> Markup:
     return Markup(f"`{clean(one_line(value))[:300] or ' '}`")
 
 
-def table(rows: Iterable[Iterable[Any]], *header: str) -> Markup:
-    """A Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    cells = ([one_line(cell).replace("|", "\\|") for cell in line] for line in lines)
-    return Markup("\n".join(f"| {' | '.join(line)} |" for line in cells))
+def cell(value: Any) -> Markup:
+    """Inline code in a table."""
+    return Markup(str(code(value)).replace("|", "\\|"))
 
 
 def command(words: Iterable[str]) -> Markup:
@@ -80,3 +81,20 @@ def is_packaged(scene: str) -> bool:
 def describe_source(source: str) -> str:
     """Where a benchmark is from, without the folders of the person who used it."""
     return "a local folder" if Path(source.partition("@")[0]).exists() else clean(source)
+
+
+def changed_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
+    """The flags of `cronos-train` among `SHOWN` that differ from their defaults.
+
+    Args:
+        flags: by name, such as `protocol.scene_reset_interval`.
+    """
+    algorithm, known = flags.get("algorithm.type"), RLAlgorithmConfig.get_known_choices()
+    choice = {"algorithm": known[algorithm]()} if isinstance(algorithm, str) and algorithm in known else {}
+    config = draccus.encode(CronosTrainConfig(env=CronosEnvConfig(), **choice))
+    defaults = flatten(json.loads(json.dumps(config)))
+    return {
+        name: value if isinstance(value, str) else json.dumps(value)
+        for name, value in flags.items()
+        if name.startswith(SHOWN) and not name.startswith("env.features") and value != defaults.get(name)
+    }

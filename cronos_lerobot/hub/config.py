@@ -3,20 +3,12 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
-from importlib import import_module
+from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
-
-from cronos_lerobot.hub.push import Target
 
 
 def check_name(flag: str, name: str) -> None:
-    """Check that a flag names a repository.
-
-    Raises:
-        ValueError: it does not.
-    """
+    """Check that a flag names a repository."""
     if not re.fullmatch(r"[\w.-]+/[\w.-]+", name):
         raise ValueError(f"--{flag}={name}: give a repository, <owner>/<name>")
 
@@ -40,33 +32,13 @@ class PublishConfig:
     discover_packages_path: str | None = None
     """Module to import first, one that registers your scene."""
 
-    repo_type: ClassVar[str] = "dataset"
-
     def validate(self) -> None:
-        """Check the flags and import the module that they name.
-
-        Raises:
-            ValueError: a flag is missing or wrong.
-            FileExistsError: the dry run's folder is in use.
-            ImportError: the module cannot be imported.
-        """
+        """Check the flags."""
         check_name("repo_id", self.repo_id)
         if self.dry_run != (self.output_dir is not None):
             raise ValueError("give --dry_run=true and --output_dir=<folder> together")
         if self.output_dir is not None and self.output_dir.exists() and any(self.output_dir.iterdir()):
             raise FileExistsError(f"{self.output_dir} is not empty: choose another --output_dir")
-        if self.discover_packages_path:
-            import_module(self.discover_packages_path)
-
-    @property
-    def target(self) -> Target:
-        """The place on the Hub."""
-        return Target(self.repo_id, self.repo_type, self.branch, self.revision, self.private)
-
-    @property
-    def targets(self) -> list[Target]:
-        """All places that are to hold the same files."""
-        return [self.target]
 
 
 @dataclass
@@ -91,11 +63,6 @@ class BenchmarkConfig(PublishConfig):
     """Push the same files to the model repository of this name: LeRobot's make_env looks for env.py there."""
     pictures: bool = True
     """Add pictures of the tasks and of every configuration; needs OpenGL."""
-
-    @property
-    def targets(self) -> list[Target]:
-        """The dataset, and the model repository of LeRobot's EnvHub."""
-        return [self.target, *([replace(self.target, repo_type="model")] if self.env_hub else [])]
 
 
 @dataclass
@@ -125,14 +92,6 @@ class PolicyConfig(PublishConfig):
     """License, as the Hub calls it; by default --policy.license of the training, or apache-2.0 for a policy that
     began from scratch."""
 
-    repo_type: ClassVar[str] = "model"
-
-    def validate(self) -> None:
-        """Check the base's name as well."""
-        super().validate()
-        if self.base_policy is not None:
-            check_name("base_policy", self.base_policy)
-
 
 @dataclass
 class ResultsConfig(PublishConfig):
@@ -148,5 +107,3 @@ class ResultsConfig(PublishConfig):
     """Publish also what is not the benchmark's own evaluation, such as fewer episodes; the entry says so."""
     source_url: str | None = None
     """Page with the details of the evaluation, such as its log."""
-
-    repo_type: ClassVar[str] = "model"

@@ -24,11 +24,7 @@ def render_poses(
 ) -> list[list[np.ndarray]]:
     """Frames (height, width, 3) uint8 of poses (n, bodies, 7) with the arm at home, one for each camera.
 
-    Args:
-        benchmark: whose scene it is.
-        poses: of its bodies.
-        size: (width, height) [px].
-        cameras: names.
+    `size` is (width, height) [px].
     """
     width, height = size
     env = CronosVectorEnv(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from glob import escape
 from json import JSONDecodeError
 from pathlib import Path
+from typing import Any
 
 import httpx
 from huggingface_hub import HfApi, constants, get_session, set_client_factory
@@ -22,36 +22,25 @@ from huggingface_hub.errors import (
 )
 from huggingface_hub.utils import disable_progress_bars
 
+from cronos_lerobot.hub.config import PublishConfig
+
 TIMEOUT_S = 60.0
 """Seconds that the Hub may take to answer, or to take the next bytes of an upload."""
 AGAIN = "run the same command again, it resumes with what is missing"
+LOG_IN = "set HF_TOKEN, or run `hf auth login`"
+ADVICE = {
+    401: LOG_IN,
+    403: "the token may not write there",
+    412: "it was changed meanwhile and nothing was pushed: run the same command again",
+    429: f"it asks for fewer requests: wait some minutes, then {AGAIN}",
+}
+"""What helps, by the status of the Hub's answer."""
 UNREADABLE = (JSONDecodeError, KeyError, TypeError, AttributeError, httpx.DecodingError)
 """What huggingface_hub raises at an answer that no Hub gives, such as a proxy's login page."""
 
 
 class PublishError(Exception):
     """Publishing failed; the message says why and what helps."""
-
-
-@dataclass(frozen=True)
-class Target:
-    """A place on the Hub."""
-
-    repo_id: str
-    repo_type: str
-    """`dataset` or `model`."""
-    branch: str | None = None
-    """Where to push, `main` by default; made if it is not there."""
-    revision: str | None = None
-    """What a new branch starts from, `main` by default."""
-    private: bool | None = None
-
-    @property
-    def url(self) -> str:
-        """Its page."""
-        prefix = "datasets/" if self.repo_type == "dataset" else ""
-        branch = f"/tree/{self.branch}" if self.branch else ""
-        return f"{constants.ENDPOINT}/{prefix}{self.repo_id}{branch}"
 
 
 def limit_waiting() -> None:
@@ -71,59 +60,52 @@ def _limit(request: httpx.Request) -> None:
 
 def push_folder(
     folder: Path,
-    target: Target,
+    config: PublishConfig,
+    repo_type: str,
     message: str,
     *,
     replaces: Sequence[str] = (),
     tag: str | None = None,
-    creates: bool = True,
     parent_commit: str | None = None,
 ) -> str:
-    """Make the repository what `folder` is; files that are there already are not sent again.
+    """Make the repository what `folder` is; files that are there already are not sent again. Returns its URL.
 
     Args:
         folder: the tree to push.
-        target: where to.
+        config: where to.
+        repo_type: `dataset` or `model`.
         message: of the commit.
-        replaces: patterns of files that are removed if the folder does not have them. One without a slash is of
-            files at the root alone.
+        replaces: patterns (see `matching`) of files that are removed if the folder does not have them.
         tag: to put onto the result, moved if it is there.
-        creates: make the repository if it is not there.
-        parent_commit: that the branch must still be at, because the tree was made from it.
-
-    Returns:
-        The URL of the repository.
+        parent_commit: that the branch must still be at. None makes a repository that is not there.
 
     Raises:
-        PublishError: the Hub refused, the branch is at another commit than `parent_commit`, or the connection was
-            lost; pushing again resumes with what is missing.
+        PublishError: the Hub refused, or the connection was lost; pushing again resumes with what is missing.
     """
     if not sys.stderr.isatty():
         disable_progress_bars()
-    api = HfApi()
-    repo_id, kind = target.repo_id, target.repo_type
-    with explained(target):
-        if creates:
-            api.create_repo(repo_id, repo_type=kind, private=target.private, exist_ok=True)
-        if target.branch:
-            api.create_branch(
-                repo_id, repo_type=kind, branch=target.branch, revision=target.revision, exist_ok=True
-            )
-        there = api.list_repo_files(repo_id, repo_type=kind, revision=target.branch) if replaces else []
+    api, branch = HfApi(), config.branch
+    where: Any = {"repo_id": config.repo_id, "repo_type": repo_type}
+    with explained(**where):
+        if parent_commit is None:
+            api.create_repo(**where, private=config.private, exist_ok=True)
+        if branch:
+            api.create_branch(**where, branch=branch, revision=config.revision, exist_ok=True)
+        there = api.list_repo_files(**where, revision=branch) if replaces else []
         api.upload_folder(
-            repo_id=repo_id,
-            repo_type=kind,
+            **where,
             folder_path=folder,
-            revision=target.branch,
+            revision=branch,
             commit_message=message,
             delete_patterns=[escape(file) for file in matching(there, replaces)] or None,
             parent_commit=parent_commit,
         )
         if tag:
             with suppress(RevisionNotFoundError):
-                api.delete_tag(repo_id, repo_type=kind, tag=tag)
-            api.create_tag(repo_id, repo_type=kind, tag=tag, revision=target.branch)
-    return target.url
+                api.delete_tag(**where, tag=tag)
+            api.create_tag(**where, tag=tag, revision=branch)
+    page = f"{constants.ENDPOINT}/{'datasets/' if repo_type == 'dataset' else ''}{config.repo_id}"
+    return f"{page}/tree/{branch}" if branch else page
 
 
 def matching(files: Iterable[str], patterns: Sequence[str]) -> list[str]:
@@ -135,11 +117,12 @@ def matching(files: Iterable[str], patterns: Sequence[str]) -> list[str]:
     ]
 
 
-def check_holds(target: Target, known_by: Sequence[str], advice: str) -> None:
+def check_holds(repo_id: str, repo_type: str, known_by: Sequence[str], advice: str) -> None:
     """Check that a repository is new, has no more than a card, or is known to be what is pushed again.
 
     Args:
-        target: the repository.
+        repo_id: its name.
+        repo_type: `dataset` or `model`.
         known_by: patterns of files; the repository must have one of them.
         advice: what to do if it has none, for the error.
 
@@ -147,53 +130,43 @@ def check_holds(target: Target, known_by: Sequence[str], advice: str) -> None:
         PublishError: it holds something else, which a push would overwrite, or the Hub refused.
     """
     api = HfApi()
-    with explained(target):
-        if not api.repo_exists(target.repo_id, repo_type=target.repo_type):
-            return
-        files = api.list_repo_files(target.repo_id, repo_type=target.repo_type)
-    there = sorted(set(files) - {".gitattributes", "README.md"})
-    if there and not matching(there, known_by):
-        raise PublishError(
-            f"{target.repo_type} {target.repo_id} holds something else ({', '.join(there[:3])}, ...): {advice}"
-        )
+    with explained(repo_id, repo_type):
+        is_there = api.repo_exists(repo_id, repo_type=repo_type)
+        files = api.list_repo_files(repo_id, repo_type=repo_type) if is_there else []
+    others = sorted(set(files) - {".gitattributes", "README.md"})
+    if others and not matching(others, known_by):
+        raise PublishError(f"{repo_type} {repo_id} holds something else ({', '.join(others[:3])}, ...): {advice}")
 
 
 @contextmanager
-def explained(target: Target) -> Generator[None]:
-    """Turn what the Hub's client raises into a PublishError."""
+def explained(repo_id: str, repo_type: str = "model") -> Generator[None]:
+    """Turn what the Hub's client raises about a repository into a PublishError."""
     try:
         yield
     except Exception as error:
-        if (why := _explain(error, target)) is None:
+        if (why := _explain(error)) is None:
             raise
-        raise PublishError(" ".join(why.split())) from error
+        raise PublishError(f"{repo_type} {repo_id} on {constants.ENDPOINT}: {' '.join(why.split())}") from error
 
 
-def _explain(error: BaseException, target: Target) -> str | None:
-    where, hub = f"{target.repo_type} {target.repo_id}", constants.ENDPOINT
-    if isinstance(error, RevisionNotFoundError):
-        return f"{where} has no revision {target.revision or target.branch or 'main'!r} on {hub}"
-    if isinstance(error, LocalTokenNotFoundError):
-        return f"there is no token for {hub}: set HF_TOKEN, or run `hf auth login`"
+def _explain(error: BaseException) -> str | None:
+    """What an error of the Hub's client means and what helps; None if it is another kind of error."""
+    kind = type(error).__name__
     status = error.response.status_code if isinstance(error, HfHubHTTPError) and error.response is not None else 0
+    if isinstance(error, LocalTokenNotFoundError):
+        return f"there is no token: {LOG_IN}"
+    if isinstance(error, RevisionNotFoundError):
+        return "it has no such revision: see --branch and --revision"
     if isinstance(error, RepositoryNotFoundError) and status != 401:
-        return f"there is no {where} on {hub}, or the token gives no access to it"
-    refusals = {
-        401: f"{hub} refused the token, or there is none: set HF_TOKEN, or run `hf auth login`",
-        403: f"the token may not write to {where} on {hub}",
-        412: f"{where} on {hub} was changed meanwhile, nothing was pushed: run the same command again",
-        429: f"{hub} asks for fewer requests (429 Too Many Requests): wait some minutes, then {AGAIN}",
-    }
-    if status >= 500:
-        return f"{hub} has a fault of its own ({status}) and did not take {where}: wait, then {AGAIN}"
+        return "it is not there, or the token gives no access to it"
     if status >= 400:
-        return refusals.get(status) or f"{hub} refused {where} ({status}): {str(error)[:300]}"
+        other = f"the Hub has a fault of its own: wait, then {AGAIN}" if status >= 500 else f"{error}"[:300]
+        return f"refused with status {status}: {ADVICE.get(status, other)}"
     if isinstance(error, httpx.TimeoutException):
-        return f"{hub} did not answer in time ({type(error).__name__}) about {where}: {AGAIN}"
+        return f"the Hub did not answer in time ({kind}): {AGAIN}"
     if isinstance(error, UNREADABLE):
-        why = f"gave an answer that is none of a Hub's ({type(error).__name__})"
-        return f"{hub} {why} about {where}: check HF_ENDPOINT and your proxy"
+        return f"the answer is none of a Hub's ({kind}): check HF_ENDPOINT and your proxy"
     if isinstance(error, httpx.HTTPError | LocalEntryNotFoundError):
-        return f"lost the connection to {hub} ({type(error).__name__}) about {where}: {AGAIN}"
+        return f"lost the connection ({kind}): {AGAIN}"
     # An upload in a thread is reported with its cause.
-    return _explain(error.__cause__, target) if isinstance(error, RuntimeError) and error.__cause__ else None
+    return _explain(error.__cause__) if isinstance(error, RuntimeError) and error.__cause__ else None

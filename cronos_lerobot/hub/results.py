@@ -20,6 +20,7 @@ from cronos_lerobot.evaluation.policy_source import ADAPTER_CONFIG, UNDECISIVE
 from cronos_lerobot.evaluation.results import read_evaluation
 from cronos_lerobot.hub.benchmark import task_id
 from cronos_lerobot.hub.cards import describe_source
+from cronos_lerobot.hub.checkpoint import is_repository
 from cronos_lerobot.hub.config import ResultsConfig
 from cronos_lerobot.hub.push import PublishError, explained
 from cronos_lerobot.hub.stage import clean_json, read_json, readable
@@ -37,12 +38,7 @@ FILLED_IN = (
 
 
 def read_own_results(config: ResultsConfig) -> list[dict[str, Any]]:
-    """Read the results of the policy in the repository that they go to, one for each suite and split.
-
-    Raises:
-        ValueError: --results is missing, or they are of another policy, or of several commits or benchmarks.
-        FileNotFoundError: there are none.
-    """
+    """Read the results, one for each suite and split, and check that they are of the repository's policy."""
     if config.results is None:
         raise ValueError("--results=<output folder of cronos-eval, or a results.json> is required")
     results = read_evaluation(config.results)
@@ -60,13 +56,9 @@ def read_own_results(config: ResultsConfig) -> list[dict[str, Any]]:
 
 
 def find_commit(config: ResultsConfig) -> str | None:
-    """The commit that the results are written onto; others may push meanwhile.
-
-    Raises:
-        PublishError: the policy's repository or the revision is missing.
-    """
+    """The commit that the results are written onto; others may push meanwhile."""
     api = HfApi()
-    with explained(config.target):
+    with explained(config.repo_id):
         branches = {branch.name for branch in api.list_repo_refs(config.repo_id).branches}
         revision = config.branch if config.branch in branches else config.revision
         return api.model_info(config.repo_id, revision=revision).sha
@@ -82,14 +74,18 @@ def write_results(
         folder: to write into.
         results: of `read_own_results`.
         commit: of the repository, whose results and policy are read.
-
-    Raises:
-        ValueError: the results are not of this benchmark, or not of all of it.
-        PublishError: the repository has another policy now than was evaluated, or its results cannot be read.
     """
     evaluated = results[0]["policy_revision"]
-    _check_commit(evaluated, config, commit)
-    with explained(config.target):
+    with explained(config.repo_id):
+        try:
+            is_same = _policy_files(config.repo_id, evaluated) == _policy_files(config.repo_id, commit)
+        except RevisionNotFoundError:
+            is_same = False
+        if not is_same:
+            raise PublishError(
+                f"the results are of {config.repo_id} at commit {evaluated}, and the repository has another "
+                "policy now: evaluate again, with a new --output_dir"
+            )
         policy = read_json(Path(HfApi().hf_hub_download(config.repo_id, CONFIG_NAME, revision=evaluated)))
     benchmark = _load(config, results[0])
     entries = make_entries(results, policy, benchmark, config)
@@ -99,21 +95,6 @@ def write_results(
     path.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=110))
     values = ", ".join(f"{entry.task_id} {entry.value:g}" for entry in entries)
     return f"results on {describe_source(benchmark.source)}: {values}"
-
-
-def _check_commit(evaluated: str, config: ResultsConfig, commit: str | None) -> None:
-    """Check that the policy of the commit that was evaluated is the one at `commit`."""
-    name = config.repo_id
-    with explained(config.target):
-        try:
-            is_same = _policy_files(name, evaluated) == _policy_files(name, commit)
-        except RevisionNotFoundError:
-            is_same = False
-    if not is_same:
-        raise PublishError(
-            f"the results are of {name} at commit {evaluated}, and the repository has another policy now: "
-            "evaluate again, with a new --output_dir"
-        )
 
 
 def _policy_files(repo_id: str, revision: str | None) -> dict[str, str]:
@@ -130,7 +111,7 @@ def _load(config: ResultsConfig, results: Mapping[str, Any]) -> Benchmark:
     """The benchmark's repository, checked to be what was evaluated."""
     evaluated = results["benchmark"]
     name = config.benchmark or str(evaluated.get("source"))
-    if name.partition("@")[0].count("/") != 1 or Path(name).is_dir():
+    if not is_repository(name.partition("@")[0]):
         raise ValueError(f"--benchmark=<owner>/<repository>[@<revision>] is required: {name} was evaluated")
     benchmark = load_benchmark(name, results["scene"])
     # The environment and its version are in the fingerprint.
@@ -152,10 +133,6 @@ def make_entries(
         policy: config.json of the policy that was evaluated.
         benchmark: that it was evaluated on.
         config: what to publish.
-
-    Raises:
-        ValueError: there is nothing to publish, results are damaged, or they are not of the benchmark's own
-            evaluation or of the policy as it is, and --partial is not set.
     """
     suites = [suite.strip() for suite in config.suites.split(",")]
     if unknown := set(suites) - set(SUITES):
@@ -176,14 +153,39 @@ def make_entries(
 
 def _entry(results: Mapping[str, Any], caveat: str, source: str, source_url: str | None) -> EvalResultEntry:
     dataset_id, _, revision = source.partition("@")
+    value, notes = _score(results)
     return EvalResultEntry(
         dataset_id=dataset_id,
         dataset_revision=revision or None,
         task_id=task_id(results["suite"], results["split"]),
-        value=_value(results),
+        value=round(value, 4),
         date=results["date"],
         source_url=source_url,
-        notes="; ".join([f"PARTIAL: {caveat}"] * bool(caveat) + _notes(results)),
+        notes="; ".join([f"PARTIAL: {caveat}"] * bool(caveat) + [f"n={results['n']}", notes, _setting(results)]),
+    )
+
+
+def _score(results: Mapping[str, Any]) -> tuple[float, str]:
+    """The value of the leaderboard, and its interval in words."""
+    if results["suite"] == "sequential":
+        length = results["average_chain_length"]
+        positions = ", ".join(f"{100 * position['success']:.1f}" for position in results["positions"])
+        interval = "average chain length, 95 % interval {:.2f} to {:.2f}".format(*length["ci95"])
+        return length["mean"], f"{interval}; SEQ 0, 1, ... {positions} %"
+    low, high = results["ci95"]
+    return 100 * results["success"], f"success in %, 95 % interval {100 * low:.1f} to {100 * high:.1f}"
+
+
+def _setting(results: Mapping[str, Any]) -> str:
+    """How it was evaluated, as far as a reader of the leaderboard needs it."""
+    versions = results["versions"]
+    packages = [
+        f"{name} {versions[name]}" for name in ("cronos-lerobot", "lerobot_env_cronos") if name in versions
+    ]
+    seen = results["obs_type"] + " with the privileged state" * bool(results["reads_privileged_state"])
+    seen += " and the task" * (results["observation"]["task_observation"] != "none")
+    return "; ".join(
+        [describe_sampling(results["temperature"]), f"seed {results['seed']}", seen, ", ".join(packages)]
     )
 
 
@@ -242,47 +244,20 @@ def describe_setting(results: Mapping[str, Any]) -> str:
     )
 
 
-def _value(scores: Mapping[str, Any]) -> float:
-    if scores["suite"] == "sequential":
-        return round(scores["average_chain_length"]["mean"], 4)
-    return round(100 * scores["success"], 4)
-
-
-def _notes(scores: Mapping[str, Any]) -> list[str]:
-    """What a reader of the leaderboard needs: size, interval, settings."""
-    if scores["suite"] == "sequential":
-        low, high = scores["average_chain_length"]["ci95"]
-        positions = ", ".join(f"{100 * position['success']:.1f}" for position in scores["positions"])
-        what = [f"average chain length, 95 % interval {low:.2f} to {high:.2f}", f"SEQ 0, 1, ... {positions} %"]
-    else:
-        low, high = scores["ci95"]
-        what = [f"success in %, 95 % interval {100 * low:.1f} to {100 * high:.1f}"]
-    how = [describe_sampling(scores["temperature"]), f"seed {scores['seed']}"]
-    versions = scores["versions"]
-    packages = [
-        f"{name} {versions[name]}" for name in ("cronos-lerobot", "lerobot_env_cronos") if name in versions
-    ]
-    seen = scores["obs_type"] + " with the privileged state" * bool(scores["reads_privileged_state"])
-    seen += " and the task" * (scores["observation"]["task_observation"] != "none")
-    return [f"n={scores['n']}", *what, *how, seen, ", ".join(packages)]
-
-
 def _published(config: ResultsConfig, commit: str | None) -> list[dict[str, Any]]:
     """The entries that the repository has at a commit."""
-    with explained(config.target):
+    with explained(config.repo_id):
         try:
             path = HfApi().hf_hub_download(config.repo_id, FILE, revision=commit)
         except RemoteEntryNotFoundError:
             return []
     try:
         entries = yaml.safe_load(Path(path).read_text()) or []
-    except (yaml.YAMLError, UnicodeDecodeError):
-        entries = None
-    if not isinstance(entries, list) or not all(
-        isinstance(entry, dict) and isinstance(entry.get("dataset"), dict) for entry in entries
-    ):
-        raise PublishError(f"{FILE} of {config.repo_id} is no list of results: mend or delete it first")
-    return entries
+        if all(isinstance(entry["dataset"], dict) for entry in entries):
+            return entries
+    except (yaml.YAMLError, UnicodeDecodeError, TypeError, KeyError):
+        pass
+    raise PublishError(f"{FILE} of {config.repo_id} is no list of results: mend or delete it first")
 
 
 def merge(there: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from jinja2 import TemplateError
+
 SECRETS = re.compile(r"\b(?:(?:hf_|gh[oprsu]_|AKIA)[A-Za-z0-9]{12,}|(?:github_pat_|sk-)[\w-]{12,})")
 """Access tokens, by how they begin."""
 HOMES = re.compile(r"(?<![\w.-])(?:/home/|/Users/)[^/\s'\",\]})]+|(?<![\w.-])/root(?![\w.-])")
@@ -107,11 +109,7 @@ def _changed(value: Any, changes: dict[str, Any]) -> str | None:
 
 
 def read_json(file: Path) -> Any:
-    """Read a JSON file of somebody else.
-
-    Raises:
-        ValueError: it is too large or damaged.
-    """
+    """Read a JSON file of somebody else."""
     if file.stat().st_size > MAX_JSON:
         raise ValueError(f"{file} has more than {MAX_JSON // 10**6} MB")
     with readable(file):
@@ -123,5 +121,5 @@ def readable(file: Path) -> Generator[None]:
     """Turn whatever goes wrong with the content of a file into a ValueError that names it."""
     try:
         yield
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError, TemplateError) as error:
         raise ValueError(f"{file} is damaged: {f'{type(error).__name__}: {error}':.300}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from importlib import import_module
 
 from cronos_lerobot.scripts.flags import (
@@ -60,26 +61,6 @@ def _answer(module: str, arguments: list[str]) -> None:
         sys.exit(2)
 
 
-def train() -> None:
-    """`cronos-train`."""
-    _run("train")
-
-
-def evaluate() -> None:
-    """`cronos-eval`."""
-    _run("eval")
-
-
-def record_demos() -> None:
-    """`cronos-record-demos`."""
-    _run("record_demos")
-
-
-def publish() -> None:
-    """`cronos-publish`."""
-    _run("publish")
-
-
-def streams() -> None:
-    """`cronos-streams`."""
-    _run("streams")
+train, evaluate, record_demos, publish, streams = (
+    partial(_run, module) for module in ("train", "eval", "record_demos", "publish", "streams")
+)

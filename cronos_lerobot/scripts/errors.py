@@ -1,7 +1,8 @@
-"""One `error:` line for what a user got wrong, the same in every command."""
+"""How every command ends: one `error:` line for what a user got wrong, and nothing where nobody reads on."""
 
 from __future__ import annotations
 
+import os
 import sys
 from argparse import ArgumentError
 from collections.abc import Generator
@@ -57,3 +58,15 @@ def reason(error: Exception | str) -> str:
         )
     text = " ".join(line.strip() for line in str(error).splitlines() if line.strip())
     return text or type(error).__name__
+
+
+@contextmanager
+def ends_with_its_reader() -> Generator[None]:
+    """Print until nobody reads any more, as after ten lines of `| head`, and end without a traceback."""
+    try:
+        yield
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Python flushes once more at its end (the library reference's note on SIGPIPE).
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)

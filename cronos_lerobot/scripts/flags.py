@@ -50,19 +50,31 @@ def read_flags(source: Source, arguments: Sequence[str]) -> list[Flag]:
 
 
 def check_flags(flags: Sequence[Flag], arguments: Sequence[str]) -> str | None:
-    """What is wrong with the names of the arguments' flags; None if nothing is."""
-    names = {flag.name for flag in flags} | {"config_path"}
+    """What is wrong with the arguments' flags, which may not exist or be null; None if nothing is."""
+    known = {flag.name: flag for flag in flags}
+    given = [flag.removeprefix("--").partition("=") for flag in join_values(arguments) if flag.startswith("--")]
     # Of a policy's checkpoint and of your own modules nothing is known here.
-    open_groups = [name.removesuffix("*") for name in names if name.endswith(".*")]
-    open_groups += [a.removeprefix("--").split("path")[0] for a in arguments if re.match(r"--\w+\.path\b", a)]
+    open_groups = [name.removesuffix("*") for name in known if name.endswith(".*")]
+    open_groups += [name.removesuffix("path") for name, _, _ in given if name.endswith(".path")]
     has_plugins = any("discover_packages_path" in argument for argument in arguments)
-    for argument in arguments:
-        name = argument.removeprefix("--").partition("=")[0]
-        if not argument.startswith("--") or name in names or "discover_packages_path" in name:
-            continue
-        if not any(name.startswith(group) for group in open_groups) and not has_plugins:
-            return f"unrecognized arguments: {argument}"
+    for name, _, value in given:
+        if flag := known.get(name):
+            # draccus gives None to numbers and booleans, too.
+            if value in ("null", "~") and flag.kind in ("int", "float", "bool") and flag.default != "None":
+                return f"null is no value of --{name}"
+        elif not (has_plugins or name == "config_path" or name.startswith(tuple(open_groups))):
+            return f"unrecognized arguments: --{name}={value}"
     return None
+
+
+def join_values(arguments: Sequence[str]) -> list[str]:
+    """The arguments with `--name value` as `--name=value`."""
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1].startswith("--") and "=" not in joined[-1] and not argument.startswith("--"):
+            argument = f"{joined.pop()}={argument}"
+        joined.append(argument)
+    return joined
 
 
 def format_flags(flags: Sequence[Flag]) -> str:

@@ -45,13 +45,15 @@ def publish_benchmark(config: BenchmarkConfig) -> None:
 
     if not config.dry_run:
         # Benchmarks that were made in another way have only the data.
-        check_holds(config.target, (ENV_FILE, DATA), "choose another --repo_id")
-        for target in config.targets[1:]:
-            check_holds(target, (ENV_FILE,), "choose another --repo_id, or --env_hub=false")
+        check_holds(config.repo_id, "dataset", (ENV_FILE, DATA), "choose another --repo_id")
+        if config.env_hub:
+            check_holds(config.repo_id, "model", (ENV_FILE,), "choose another --repo_id, or --env_hub=false")
     # Data and code are two repositories with commits of their own. The tag is one name for both.
     benchmark = choose_benchmark(config)
     tag = f"benchmark-{benchmark.fingerprint}"
-    _publish(config, partial(write_benchmark_repository, benchmark=benchmark), replaces=REPLACES, tag=tag)
+    types = ("dataset", "model") if config.env_hub else ("dataset",)
+    write = partial(write_benchmark_repository, benchmark=benchmark)
+    _publish(config, write, *types, replaces=REPLACES, tag=tag)
     if not config.dry_run:
         where = "--env.benchmark" + " and in LeRobot's make_env" * config.env_hub
         print(f"{config.repo_id}@{tag} is this benchmark, in {where}")
@@ -67,7 +69,7 @@ def publish_stream(config: StreamConfig) -> None:
     assert config.root is not None
     with not_being_recorded(config.root):
         tag = version if config.branch is None else None
-        _publish(config, write_stream_repository, replaces=REPLACES, tag=tag)
+        _publish(config, write_stream_repository, "dataset", replaces=REPLACES, tag=tag)
 
 
 def publish_policy(config: PolicyConfig) -> None:
@@ -75,7 +77,7 @@ def publish_policy(config: PolicyConfig) -> None:
     config.validate()
     from cronos_lerobot.hub.policy import FILES, write_policy_repository
 
-    _publish(config, write_policy_repository, replaces=FILES)
+    _publish(config, write_policy_repository, "model", replaces=FILES)
 
 
 def publish_results(config: ResultsConfig) -> None:
@@ -85,12 +87,11 @@ def publish_results(config: ResultsConfig) -> None:
 
     results = read_own_results(config)
     commit = find_commit(config)
-    write = partial(write_results, results=results, commit=commit)
-    _publish(config, write, creates=False, parent_commit=commit)
+    _publish(config, partial(write_results, results=results, commit=commit), "model", parent_commit=commit)
 
 
-def _publish(config: Any, write: Callable[[Any, Path], str], **push: Any) -> None:
-    """Write the tree, then push it or copy it to the dry run's folder."""
+def _publish(config: Any, write: Callable[[Any, Path], str], *repo_types: str, **push: Any) -> None:
+    """Write the tree, then push it to repositories of these types, or copy it to the dry run's folder."""
     with tempfile.TemporaryDirectory(prefix="cronos_publish_") as name:
         folder = Path(name)
         what = write(config, folder)
@@ -100,7 +101,7 @@ def _publish(config: Any, write: Callable[[Any, Path], str], **push: Any) -> Non
             size = f"{len(sizes)} files, {sum(sizes) / 1e6:.2f} MB"
             print(f"dry run: {what}\n{size} in {config.output_dir}; nothing was pushed")
             return
-        urls = [push_folder(folder, target, f"Publish {what}", **push) for target in config.targets]
+        urls = [push_folder(folder, config, kind, f"Publish {what}", **push) for kind in repo_types]
     print("\n".join([f"published {what}", *urls]))
 
 
@@ -116,8 +117,4 @@ def main() -> None:
     """Entry point of `cronos-publish`."""
     # They may bring scenes with them.
     register_third_party_plugins()
-    run_subcommand(__doc__ or "", COMMANDS, (ValueError, OSError, ImportError, PublishError))
-
-
-if __name__ == "__main__":
-    main()
+    run_subcommand(COMMANDS, PublishError)

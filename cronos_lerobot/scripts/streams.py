@@ -39,7 +39,6 @@ import json
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -74,13 +73,10 @@ class SourceConfig:
 
         Raises:
             ValueError: no name is given, or it has no recorded streams.
-            ImportError: the module cannot be imported.
             FileNotFoundError: there is no dataset in `root`.
         """
         if self.repo_id is None:
             raise ValueError("--dataset.repo_id=<user/name> is required, and --dataset.root=<folder> if local")
-        if self.discover_packages_path is not None:
-            import_module(self.discover_packages_path)
         if self.root is not None and not (self.root / "meta/info.json").is_file():
             raise FileNotFoundError(f"no LeRobotDataset in --dataset.root={self.root}")
         return StreamDataset(self.repo_id, self.root, self.revision, streaming=streaming)
@@ -218,8 +214,4 @@ def main() -> None:
     """Entry point of `cronos-streams`."""
     # Streams may be of a scene that one of them brings.
     register_third_party_plugins()
-    run_subcommand(__doc__ or "", COMMANDS, (ValueError, OSError, ImportError))
-
-
-if __name__ == "__main__":
-    main()
+    run_subcommand(COMMANDS)

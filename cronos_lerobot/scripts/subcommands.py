@@ -10,37 +10,22 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-import draccus
-from draccus.utils import ParsingError
-from httpx import HTTPError
-from yaml import YAMLError
-
-from cronos_lerobot.scripts.errors import stop
+from cronos_lerobot.command_line import import_plugins, parse_command_line
+from cronos_lerobot.scripts.errors import error_line
+from cronos_lerobot.scripts.flags import join_values
 
 
-def run_subcommand(
-    help_text: str,
-    commands: Mapping[str, tuple[type, Callable[[Any], None]]],
-    errors: tuple[type[Exception], ...] = (ValueError, OSError),
-) -> None:
-    """Parse the command line and run the command that it names.
+def run_subcommand(commands: Mapping[str, tuple[type, Callable[[Any], None]]], *errors: type[Exception]) -> None:
+    """Parse the command line and run the command that it names; `entry` has answered unknown names.
 
     Args:
-        help_text: printed for `--help` and where no command is given.
         commands: config class and function by name.
-        errors: end the program with one line; any other is a bug and shows its traceback.
+        errors: end the program with one line, as the user's errors do.
     """
-    name, *arguments = sys.argv[1:] or ["--help"]
-    if name in ("--help", "-h"):
-        print(help_text)
-        return
-    if name not in commands:
-        sys.exit(f"error: unknown command {name!r}; valid commands: {list(commands)}")
+    name, *arguments = sys.argv[1:]
     config_class, run = commands[name]
-    try:
-        run(draccus.parse(config_class, args=quote_texts(config_class, arguments)))
-    except (*errors, ParsingError, YAMLError, HTTPError) as error:
-        stop(error)
+    with error_line(ImportError, *errors):
+        run(parse_command_line(config_class, quote_texts(config_class, import_plugins(arguments))))
 
 
 def quote_texts(config_class: type, arguments: Sequence[str]) -> list[str]:
@@ -52,18 +37,13 @@ def quote_texts(config_class: type, arguments: Sequence[str]) -> list[str]:
         config_class: a dataclass with the flags.
         arguments: `--name=value` or `--name value`.
     """
-    joined: list[str] = []
-    for argument in arguments:
-        if joined and joined[-1].startswith("--") and "=" not in joined[-1] and not argument.startswith("--"):
-            argument = f"{joined.pop()}={argument}"
-        joined.append(argument)
-    pairs = [argument.partition("=") for argument in joined]
-    return [
-        f"{name}={json.dumps(value, ensure_ascii=False)}"
-        if value not in ("", "null") and _is_text(config_class, name.removeprefix("--").split("."))
-        else f"{name}{equals}{value}"
-        for name, equals, value in pairs
-    ]
+    quoted = []
+    for flag in join_values(arguments):
+        name, equals, value = flag.partition("=")
+        if value not in ("", "null") and _is_text(config_class, name.removeprefix("--").split(".")):
+            value = json.dumps(value, ensure_ascii=False)
+        quoted.append(f"{name}{equals}{value}")
+    return quoted
 
 
 def _is_text(config_class: type, names: Sequence[str]) -> bool:

@@ -19,7 +19,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from cronos_lerobot.hub.config import PolicyConfig
-from cronos_lerobot.hub.push import PublishError, Target, explained
+from cronos_lerobot.hub.push import PublishError, explained
 from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.ranks import choose_gpu, join_ranks
 from cronos_lerobot.scripts.errors import WORK_ERRORS, error_line, reason, stop
@@ -118,7 +118,7 @@ def told_how_to_push(config: CronosTrainConfig) -> Generator[None]:
     assert config.output_dir is not None
     repository = str(config.policy.repo_id)
     try:
-        with explained(Target(repository, "model")):
+        with explained(repository):
             yield
     except (PublishError, ValueError, OSError, HTTPError) as error:
         command = f"cronos-publish policy --path={config.output_dir} --repo_id={repository}"

@@ -84,14 +84,6 @@ class Repository:
         added = {str(path.relative_to(folder)): File(path.read_bytes(), is_lfs=False) for path in paths}
         return self.commit(branch, f"Add {folder.name}", added, [])
 
-    def history(self, revision: str) -> list[Commit]:
-        """Commits of a revision, the latest first."""
-        found, commit = [], self.find(revision)
-        while commit is not None:
-            found.append(commit)
-            commit = self.commits[commit.parents[0]] if commit.parents else None
-        return found
-
 
 @dataclass
 class Faults:

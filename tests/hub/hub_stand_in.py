@@ -49,7 +49,6 @@ ROUTES: list[tuple[str, str, str]] = [
     ("GET", rf"/api/{REPO}", "info"),
     ("GET", rf"/api/{REPO}/revision/(?P<revision>[^/]+)", "info"),
     ("GET", rf"/api/{REPO}/refs", "refs"),
-    ("GET", rf"/api/{REPO}/commits/(?P<revision>[^/]+)", "history"),
     ("GET", rf"/api/{REPO}/tree/(?P<revision>[^/]+)(?:/(?P<path>.*))?", "list_tree"),
     ("POST", rf"/api/{REPO}/paths-info/(?P<revision>[^/]+)", "paths_info"),
     ("POST", r"/(?P<prefix>datasets/)?(?P<name>[^/]+/[^/]+)\.git/info/lfs/objects/batch", "lfs_batch"),
@@ -232,14 +231,6 @@ class Handler(BaseHTTPRequestHandler):
             )
         }
         return self._json(listed | {"converts": []})
-
-    def _history(self, kind: str, name: str, revision: str) -> Reply:
-        repository = self._repository(kind, name)
-        self._commit_of(repository, revision)
-        return self._json([
-            {"id": commit.oid, "title": commit.message, "message": "", "date": commit.date, "authors": []}
-            for commit in repository.history(revision)
-        ])  # fmt: skip
 
     # Uploads ----------------------------------------------------------------------------------------------
 

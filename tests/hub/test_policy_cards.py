@@ -16,8 +16,7 @@ from cronos_lerobot.agents.imitation.config import ImitationConfig
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.steering.config import SteeringConfig
 from cronos_lerobot.evaluation.policy_source import files_fingerprint
-from cronos_lerobot.hub.eval_flags import environment_flags
-from cronos_lerobot.hub.runs import find_checkpoint, is_repository
+from cronos_lerobot.hub.checkpoint import environment_flags, find_checkpoint, is_repository
 from policies import STATE, STEPS, commands, dry_run, features_of, rows, train_config, write_model, write_run
 
 TOLD = STATE | {"task_observation": "one_hot"}
@@ -89,7 +88,6 @@ def test_the_numbers_and_the_configuration_of_a_run(tmp_path):
     assert ["--env.scene", "playroom_2x2"] in cells
     assert not [row for row in cells if row[0] == "--protocol.task_switch_interval"], "it has its default"
     assert [row[0] for row in cells if len(row) == 6 and row[0].isdigit()] == ["0", str(STEPS // 2), str(STEPS)]
-    assert (tmp_path / "out/curves/evaluation.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_checkpoint_in_the_middle_has_what_came_before_it(tmp_path):
@@ -202,14 +200,14 @@ def test_where_a_policy_may_be(tmp_path):
     run = write_run(tmp_path)
     model = run / f"checkpoints/{STEPS:07d}/pretrained_model"
     for path in (run, model.parent, model):
-        found = find_checkpoint(path)
-        assert (found.model, found.run.folder) == (model, run)
+        found, logged = find_checkpoint(path)
+        assert (found, logged.folder) == (model, run)
     (tmp_path / "theirs").mkdir()
     (tmp_path / "theirs/pretrained_model").symlink_to(model)
     with pytest.raises(ValueError, match="--path="):
         find_checkpoint(tmp_path / "theirs")
     (run / "metrics.jsonl").unlink()
-    assert find_checkpoint(run).run is None, "it is lerobot-train's"
+    assert find_checkpoint(run) == (model, None), "it is lerobot-train's"
     with pytest.raises(FileNotFoundError, match="--path="):
         find_checkpoint(tmp_path)
 
@@ -239,7 +237,7 @@ def test_nothing_private_or_foreign_is_pushed(tmp_path, monkeypatch, capsys):
     (folder / "train_config.json").write_text(json.dumps(trained))
     card = dry_run(run, tmp_path / "out")
     names = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*") if path.is_file()}
-    assert names == {"README.md", "config.json", "train_config.json", "model.safetensors", "curves/evaluation.png"}
+    assert names == {"README.md", "config.json", "train_config.json", "model.safetensors"}
     pushed = b"".join((tmp_path / "out" / name).read_bytes() for name in names)
     for secret in (TOKEN, "melanie", "grant", "KEY"):
         assert secret.encode() not in pushed
@@ -253,15 +251,10 @@ def test_nothing_private_or_foreign_is_pushed(tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "refused").exists()
 
 
-@pytest.mark.parametrize(
-    "wrong", [[], {"type": 3}, {"type": "act", "input_features": [1]}, {"type": "act", "tags": 5}]
-)
+@pytest.mark.parametrize("wrong", [[], {"type": "act", "input_features": [1]}, {"type": "act", "tags": 5}])
 def test_a_damaged_policy_is_named(tmp_path, wrong):
     model = write_model(tmp_path / "model")
     (model / "config.json").write_text(json.dumps(wrong))
-    if wrong == {"type": 3}:
-        assert "`3`" in dry_run(model, tmp_path / "out")
-        return
     with pytest.raises(ValueError, match="damaged"):
         dry_run(model, tmp_path / "out")
 

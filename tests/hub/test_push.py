@@ -7,7 +7,7 @@ from lerobot_env_cronos import load_benchmark
 from cronos_lerobot.hub import push
 from cronos_lerobot.hub.config import PublishConfig
 from cronos_lerobot.hub.policy import FILES
-from cronos_lerobot.hub.push import PublishError, Target, check_holds, limit_waiting, matching, push_folder
+from cronos_lerobot.hub.push import PublishError, check_holds, limit_waiting, matching, push_folder
 
 
 @pytest.fixture
@@ -20,23 +20,30 @@ def tree(tmp_path):
 @pytest.mark.parametrize(
     ("answer", "said"),
     [
-        ((429, b"slow down"), "429 Too Many Requests"),
-        ((500, b"<html>\n\n<body>Oops</body>"), r"fault of its own \(500\)"),
-        ((503, b""), r"fault of its own \(503\)"),
-        ((200, b"<html>Log in to the hotel's network</html>"), "none of a Hub's"),
-        ((200, b"[]"), "none of a Hub's"),
-        ((418, b"I am\na teapot"), r"\(418\)"),
+        ((429, b"slow down"), "429"),
+        ((500, b"<html>\n\n<body>Oops</body>"), "500"),
+        ((503, b""), "503"),
+        ((200, b"<html>Log in to the hotel's network</html>"), "HF_ENDPOINT"),
+        ((200, b"[]"), "HF_ENDPOINT"),
+        ((418, b"I am\na teapot"), "418"),
     ],
 )
 def test_an_answer_of_another_kind(here, tree, answer, said):
     here.faults.answer = answer
     for use in (
-        lambda: push_folder(tree, Target("me/wrong", "model"), "Publish"),
-        lambda: check_holds(Target("me/wrong", "model"), ["env.py"], "choose another"),
+        lambda: push_folder(tree, PublishConfig("me/wrong"), "model", "Publish"),
+        lambda: check_holds("me/wrong", "model", ["env.py"], "choose another"),
     ):
         with pytest.raises(PublishError, match=said) as error:
             use()
         assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("fault", "said"), [("refuse_tokens", "401.*HF_TOKEN"), ("read_only_tokens", "403")])
+def test_a_token_that_may_not_write(here, tree, fault, said):
+    setattr(here.faults, fault, True)
+    with pytest.raises(PublishError, match=said):
+        push_folder(tree, PublishConfig("me/forbidden"), "model", "Publish")
 
 
 def test_a_server_that_never_answers(here, tree, monkeypatch):
@@ -45,7 +52,7 @@ def test_a_server_that_never_answers(here, tree, monkeypatch):
     here.repositories["models", "me/silent"] = Repository("models", "me/silent")
     here.faults.is_silent = True
     with pytest.raises(PublishError, match="did not answer in time"):
-        push_folder(tree, Target("me/silent", "model"), "Publish", creates=False, replaces=["*"])
+        push_folder(tree, PublishConfig("me/silent"), "model", "Publish", replaces=["*"])
     with pytest.raises(ValueError, match="me/silent"):
         load_benchmark("me/silent", "kitchen_2x2")
 

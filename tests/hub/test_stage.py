@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from cronos_lerobot.hub.cards import code, command, render_card, table
+from cronos_lerobot.hub.cards import cell, command, render_card
 from cronos_lerobot.hub.stage import clean, stage, write_text
 
 TOKEN = "hf_" + "aB3" * 11
@@ -95,15 +95,14 @@ def test_damaged_json_is_named(folder, tmp_path, text):
 def test_a_value_on_a_card_stays_in_its_line_and_its_code(tmp_path):
     evil = "x`\n```\n# Injected\n<img src=x>|y"
     assert command(["cronos-eval", f"--a={evil}"]) == "cronos-eval \\\n    '--a=x # Injected <img src=x>|y'"
-    assert table([(code(evil), 1)], "a", "b").splitlines()[2] == "| `x # Injected <img src=x>\\|y` | 1 |"
-    values = dict.fromkeys(("license", "base_model", "dataset", "scene", "policy_type", "repo_id"), evil)
-    lists = dict.fromkeys(
-        ("features", "flags", "changed", "by_kind", "evaluations", "settings", "differences"), ()
-    )
-    flags = dict.fromkeys(("is_adapter", "is_steered", "is_reset_free", "curve"), False)
+    assert cell(evil) == "`x # Injected <img src=x>\\|y`"
+    values = dict.fromkeys(("license", "base_model", "dataset", "scene", "repo_id"), evil)
+    values |= dict.fromkeys(("is_adapter", "is_steered", "is_reset_free", "run"))
+    results = [{"suite": evil, "split": evil, "success": 0.5, "ci95": [0, 1], "n": 2}]
     evaluate = {name: [name, f"--policy.path={evil}"] for name in ("cronos-eval", "lerobot-eval")}
+    lists = {name: [evil] for name in ("tags", "settings", "differences")}
     card = render_card(
-        "policy", run=None, tags=[evil], scores=[(code(evil),) * 5], evaluate=evaluate, **values, **lists, **flags
+        "policy", policy={"type": evil}, results=results, flags={evil: evil}, evaluate=evaluate, **values, **lists
     )
     assert not [line for line in card.splitlines() if line.startswith(("# Injected", "<img"))]
     assert card.count("\n```") == 6

@@ -61,6 +61,10 @@ TRAIN = find_class(*CONFIGS["train"])
         (["--policy.type=act", "--policy.chunks=8"], "--policy.chunks"),
         (["--policy.path=me/policy", "--policy.whatever=8"], None),
         (["--policy.type=my_own", "--policy.whatever=8"], None),
+        (["--steps", "null"], "--steps"),
+        (["--save_checkpoint=null"], "--save_checkpoint"),
+        (["--algorithm.value_coef=null"], "--algorithm.value_coef"),
+        (["--record.repo_id=null", "--protocol.scene_reset_interval=null"], None),
         (["--discover_packages_path=mine", "--algorithm.type=my_own", "--algorithm.whatever=8"], None),
     ],
 )

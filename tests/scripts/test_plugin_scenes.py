@@ -7,7 +7,7 @@ import sys
 import pytest
 from forked_commands import run_forked
 
-from cronos_lerobot.hub.eval_flags import environment_flags
+from cronos_lerobot.hub.checkpoint import environment_flags
 from cronos_lerobot.scripts import streams
 
 PLUGIN = """
@@ -21,7 +21,7 @@ import sys
 from cronos_lerobot.scripts.{module} import main
 from lerobot_env_cronos import SCENES
 
-sys.argv = ["{module}", "--help"]
+sys.argv = ["{module}", "{command}"]
 try:
     main()
 except SystemExit:
@@ -54,8 +54,8 @@ def test_a_module_with_the_scene_of_streams_is_imported(tmp_path, monkeypatch, c
     assert f"my_scene_to_{command}" in sys.modules
 
 
-@pytest.mark.parametrize("module", ["streams", "publish"])
-def test_a_command_imports_installed_plugins_before_it_looks_for_a_scene(tmp_path, module):
+@pytest.mark.parametrize(("module", "command"), [("streams", "check"), ("publish", "benchmark")])
+def test_a_command_imports_installed_plugins_before_it_looks_for_a_scene(tmp_path, module, command):
     package = tmp_path / "lerobot_env_study"
     package.mkdir()
     (package / "__init__.py").write_text(PLUGIN)
@@ -63,7 +63,9 @@ def test_a_command_imports_installed_plugins_before_it_looks_for_a_scene(tmp_pat
     installed.mkdir()
     (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: lerobot_env_study\nVersion: 1.0\n")
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
-    done = run_forked([sys.executable, "-c", CODE.format(module=module)], env=environment, check=True)
+    done = run_forked(
+        [sys.executable, "-c", CODE.format(module=module, command=command)], env=environment, check=True
+    )
     assert "study_1x1" in done.stdout.rpartition("scenes:")[2].split()
 
 

@@ -26,7 +26,7 @@ class Config:
 def parsed(monkeypatch, *arguments) -> Config:
     found = []
     monkeypatch.setattr(sys, "argv", ["command", "show", *arguments])
-    run_subcommand("", {"show": (Config, found.append)})
+    run_subcommand({"show": (Config, found.append)})
     return found[0]
 
 
