@@ -7,6 +7,9 @@ import pytest
 from hub_repositories import File, Repository
 
 from cronos_lerobot.hub import env_file
+from cronos_lerobot.hub.config import BenchmarkConfig
+from cronos_lerobot.hub.push import PublishError
+from cronos_lerobot.scripts import publish
 
 SMALL = ("--scene=playroom_2x2", "--num_configurations=2", "--num_orderings=2", "--chain_length=2",
          "--pictures=false")  # fmt: skip
@@ -96,22 +99,20 @@ make_env("me/env_bench", trust_remote_code=True)
     assert "need the package lerobot_env_cronos" in outcome.output
 
 
-def test_a_model_or_dataset_of_the_same_name_is_not_overwritten(hub, commands):
+def test_a_model_or_dataset_of_the_same_name_is_not_overwritten(here, monkeypatch):
     for kind, name, file in (
         ("models", "me/taken", "config.json"),
         ("datasets", "me/my_stream", "meta/info.json"),
     ):
-        hub.repositories[kind, name] = Repository(kind, name)
-        hub.repositories[kind, name].commit("main", "mine", {file: File(b"{}", is_lfs=False)}, [])
-    publish = ("cronos-publish", "benchmark", *SMALL, "--seed=5")
-    for kind, name in (("dataset", "me/my_stream"), ("model", "me/taken")):
-        outcome = commands.try_(*publish, f"--repo_id={name}")
-        assert outcome.code == 1
-        assert f"{kind} {name} holds something else" in outcome.output
-    assert ("datasets", "me/taken") not in hub.repositories
-    commands.run(*publish, "--repo_id=me/taken", "--env_hub=false")
-    assert "env.py" in hub.tree("datasets", "me/taken")
-    assert set(hub.tree("models", "me/taken")) == {"config.json"}
+        here.repositories[kind, name] = Repository(kind, name)
+        here.repositories[kind, name].commit("main", "mine", {file: File(b"{}", is_lfs=False)}, [])
+        with pytest.raises(PublishError, match=name):
+            publish.publish_benchmark(BenchmarkConfig(name, pictures=False))
+    assert ("datasets", "me/taken") not in here.repositories
+    pushed = []
+    monkeypatch.setattr(publish, "push_folder", lambda folder, config, kind, *_, **__: str(pushed.append(kind)))
+    publish.publish_benchmark(BenchmarkConfig("me/taken", pictures=False, env_hub=False))
+    assert pushed == ["dataset"]
 
 
 def test_a_clone_below_a_folder_that_is_called_like_the_hubs_is_no_download(tmp_path, monkeypatch):
