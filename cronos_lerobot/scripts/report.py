@@ -107,8 +107,7 @@ def compare(arguments: Sequence[str]) -> None:
     """Print the comparison that the arguments of `cronos-report compare` name."""
     args = make_compare_parser().parse_args(arguments)
     from cronos_lerobot.report.compare import compare_sides, read_side, to_json, to_text
-    from cronos_lerobot.scripts.closed_pipe import ends_with_its_reader
-    from cronos_lerobot.scripts.errors import error_line
+    from cronos_lerobot.scripts.errors import ends_with_its_reader, error_line
 
     with error_line():
         (a, notes_a), (b, notes_b) = read_side(args.a), read_side(args.b)
