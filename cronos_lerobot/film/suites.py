@@ -15,8 +15,7 @@ from cronos_lerobot.evaluation.results import VIDEOS
 from cronos_lerobot.evaluation.suites import INDEPENDENT, SEQUENTIAL, STREAM, Start
 from cronos_lerobot.film.encode import write_mp4
 from cronos_lerobot.film.overlay import Status, draw_status
-from cronos_lerobot.film.png import encode_palette_png, to_png
-from cronos_lerobot.film.sheets import draw_grid
+from cronos_lerobot.film.sheets import draw_grid, encode_palette_png, to_png
 
 FPS = 20
 """Four times as fast as it happened."""

@@ -15,8 +15,7 @@ from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.scene.scenes import get_scene
 from lerobot_env_cronos.simulation.rendering import RENDERERS
 
-from cronos_lerobot.film.png import encode_palette_png
-from cronos_lerobot.film.sheets import PICTURE, draw_task_sheet
+from cronos_lerobot.film.sheets import PICTURE, draw_task_sheet, encode_palette_png
 
 CAMERAS = ("front", "bridge")
 

@@ -8,8 +8,7 @@ import numpy as np
 from lerobot_env_cronos import Benchmark, CronosVectorEnv
 from PIL import Image, ImageDraw
 
-from cronos_lerobot.film.png import encode_palette_png
-from cronos_lerobot.film.sheets import PICTURE, caption_font, draw_task_sheet
+from cronos_lerobot.film.sheets import PICTURE, caption_font, draw_task_sheet, encode_palette_png
 from cronos_lerobot.film.task_pictures import CAMERAS
 
 ROW_PICTURE = (320, 240)

@@ -17,7 +17,7 @@ import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from cronos_lerobot.film.png import to_png
+from cronos_lerobot.film.sheets import to_png
 from cronos_lerobot.report import figures, tables
 from cronos_lerobot.report.load import CRONOS_EVAL, LEROBOT_EVAL, TRAIN, Loaded, Video
 
