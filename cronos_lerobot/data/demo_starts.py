@@ -7,6 +7,8 @@ from lerobot_env_cronos import Scene, Task
 from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS, sample_configuration
 from lerobot_env_cronos.expert.reach import sample_reach_configuration
 
+from cronos_lerobot.ranges import ranged
+
 ARM_POSES = ("home", "random", "after_task", "either")
 FREE_LAYOUTS = {"random": sample_configuration, "reach": sample_reach_configuration}
 """How layouts are drawn that are no configuration of the benchmark."""
@@ -17,12 +19,12 @@ LAYOUTS = ("train", *FREE_LAYOUTS)
 class StartConfig:
     """Where a demonstration starts."""
 
-    layouts: str = "train"
+    layouts: str = ranged("train", choices=LAYOUTS)
     """`train`: the training configurations in turn; `random`: freshly drawn in the spawn area; `reach`:
     freshly drawn wherever the arm can do the scene's tasks, at any yaw."""
-    num_configurations: int = NUM_CONFIGURATIONS
+    num_configurations: int = ranged(NUM_CONFIGURATIONS, minimum=1)
     """With `layouts=train`, only the first N training configurations."""
-    arm_pose: str = "home"
+    arm_pose: str = ranged("home", choices=ARM_POSES)
     """`home`; `random`: at a random place above the table; `after_task`: where another task left it; `either`:
     in every second episode after another task where that left it, and at home in the others."""
     occupied_receptacles: bool = False
@@ -30,7 +32,7 @@ class StartConfig:
     misplaced_objects: bool = False
     """The task's object lies on another receptacle, where another task has put it. With `occupied_receptacles`
     either, with equal chances for each task that may have come before."""
-    earlier_tasks: int = 1
+    earlier_tasks: int = ranged(1, minimum=1)
     """Where a demonstration begins after another task: after 1 to N of them, with equal chances. The last one is
     as above, those before it are any others. From two on all objects may lie on receptacles, and two on one, as
     in a stream that goes on without a scene reset."""
@@ -38,23 +40,11 @@ class StartConfig:
     """Checkpoint or Hub id of a policy that does the earlier tasks instead of the expert: 1 to `earlier_tasks` of
     any, each for `max_steps`, whether it succeeds or not. Demonstrations then begin where its own streams get
     stuck (as in DAgger, Ross et al. 2011, an expert for the states of the learner)."""
-    leaning_share: float = 0.0
+    leaning_share: float = ranged(0.0, minimum=0, maximum=1)
     """Share of the layouts in which one object has fallen over the edge of another body, from 0 to 1."""
-    share: float = 1.0
+    share: float = ranged(1.0, minimum=0, maximum=1)
     """Share of the episodes that `arm_pose`, `occupied_receptacles`, `misplaced_objects`, `earlier_tasks` and
     `policy` apply to; the others start at home, with every object on the table."""
-
-    def __post_init__(self) -> None:
-        """Check the choices."""
-        for name, valid in (("layouts", LAYOUTS), ("arm_pose", ARM_POSES)):
-            if (value := getattr(self, name)) not in valid:
-                raise ValueError(f"--start.{name} must be one of {list(valid)}, got {value!r}")
-        for name, low, high in (
-            ("num_configurations", 1, float("inf")), ("earlier_tasks", 1, float("inf")), ("share", 0, 1),
-            ("leaning_share", 0, 1),
-        ):  # fmt: skip
-            if not low <= (value := getattr(self, name)) <= high:
-                raise ValueError(f"--start.{name} must be from {low} to {high}, got {value}")
 
     @property
     def is_after_another(self) -> bool:

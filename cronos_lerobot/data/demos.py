@@ -22,6 +22,7 @@ from cronos_lerobot.data.perturbations import (
 )
 from cronos_lerobot.data.schema import CONFIGURATION, SUCCESS, TRUNCATED
 from cronos_lerobot.data.writer import SegmentWriter
+from cronos_lerobot.ranges import ranged
 
 MAX_FAILURES_IN_A_ROW = 200
 
@@ -44,9 +45,9 @@ class Expert(Protocol):
 class DemoConfig:
     """What a demonstration is."""
 
-    max_steps: int = 80
+    max_steps: int = ranged(80, minimum=1)
     """Control steps until an episode counts as failed, also if its object has lain too short by then."""
-    steps_after_release: int = 3
+    steps_after_release: int = ranged(3, minimum=0)
     """Frames kept after the object lies on its receptacle and is released."""
     keep_failures: bool = False
     """Also keep episodes that did not succeed within `max_steps`."""
@@ -55,11 +56,6 @@ class DemoConfig:
     start: StartConfig = field(default_factory=StartConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     misses: MissConfig = field(default_factory=MissConfig)
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        if self.max_steps < 1 or self.steps_after_release < 0:
-            raise ValueError(f"--max_steps must be at least 1, --steps_after_release at least 0: {self}")
 
 
 @dataclass

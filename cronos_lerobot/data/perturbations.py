@@ -14,6 +14,8 @@ from lerobot_env_cronos.scene.scenes import BODIES
 from lerobot_env_cronos.simulation.kinematics import inverse_kinematics
 from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW
 
+from cronos_lerobot.ranges import ranged
+
 MOTION = slice(0, 6)
 """The end-effector part of an action; the gripper command is never perturbed by noise."""
 
@@ -22,44 +24,38 @@ MOTION = slice(0, 6)
 class NoiseConfig:
     """Bursts of noise on the executed action; within a burst the arm is pushed one constant way."""
 
-    share: float = 0.0
+    share: float = ranged(0.0, minimum=0, maximum=1)
     """Share of the episodes that have bursts, from 0 to 1."""
-    rate: float = 0.15
+    rate: float = ranged(0.15, minimum=0, maximum=1)
     """Probability per control step that a burst begins."""
-    min_steps: int = 1
+    min_steps: int = ranged(1, minimum=1)
     """Shortest burst [control steps]."""
     max_steps: int = 4
     """Longest burst [control steps]."""
-    scale: float = 0.6
+    scale: float = ranged(0.6, minimum=0)
     """Standard deviation of the push, as a fraction of half the action range of each dimension."""
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
-        if not (0 <= self.share <= 1 and 0 <= self.rate <= 1 and self.scale >= 0):
-            raise ValueError(
-                f"--noise.share and --noise.rate must be from 0 to 1, --noise.scale at least 0: {self}"
-            )
-        if not 1 <= self.min_steps <= self.max_steps:
-            raise ValueError(f"--noise.min_steps must be from 1 to --noise.max_steps: {self}")
+        """Check what goes with what."""
+        if self.min_steps > self.max_steps:
+            raise ValueError(f"--noise.min_steps must be at most --noise.max_steps: {self}")
 
 
 @dataclass
 class MissConfig:
     """Deliberately missed grasps: the gripper first closes beside the object, then the expert recovers."""
 
-    share: float = 0.0
+    share: float = ranged(0.0, minimum=0, maximum=1)
     """Share of the episodes that begin with a miss, from 0 to 1."""
-    min_offset_m: float = 0.025
+    min_offset_m: float = ranged(0.025, above=0)
     """Smallest horizontal distance between the object and where the gripper closes [m]."""
     max_offset_m: float = 0.06
     """Largest such distance [m]."""
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
-        if not 0 <= self.share <= 1:
-            raise ValueError(f"--misses.share must be from 0 to 1, got {self.share}")
-        if not 0 < self.min_offset_m <= self.max_offset_m:
-            raise ValueError(f"--misses.min_offset_m must be above 0 and at most --misses.max_offset_m: {self}")
+        """Check what goes with what."""
+        if self.min_offset_m > self.max_offset_m:
+            raise ValueError(f"--misses.min_offset_m must be at most --misses.max_offset_m: {self}")
 
 
 class ActionNoise:

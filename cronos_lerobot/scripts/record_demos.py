@@ -8,8 +8,6 @@ cronos-record-demos --env.type=cronos --env.scene=kitchen_2x2 \\
 
 import logging
 import shutil
-import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,13 +17,12 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
-from lerobot_env_cronos import CronosVectorEnv, Task, get_scene
+from lerobot_env_cronos import CronosVectorEnv, get_scene
 from lerobot_env_cronos.config import CronosEnvConfig, is_of_this_package
 from lerobot_env_cronos.episodic import find_task
 from lerobot_env_cronos.simulation.gl import RenderingError
 from tqdm import tqdm
 
-from cronos_lerobot.agents.base import Actor
 from cronos_lerobot.command_line import parse_command_line
 from cronos_lerobot.data.demo_starts import check_starts
 from cronos_lerobot.data.demos import DemoCollector, DemoConfig, ExpertError, tasks_of
@@ -38,6 +35,7 @@ from cronos_lerobot.evaluation.config import SuitesConfig
 from cronos_lerobot.evaluation.policy_env import check_observations
 from cronos_lerobot.evaluation.policy_source import files_fingerprint, find_policy, load_policy_config
 from cronos_lerobot.locks import FolderLock
+from cronos_lerobot.ranges import check_ranges, ranged
 from cronos_lerobot.scripts.errors import error_line, stop
 
 MAY_DIFFER = (
@@ -54,7 +52,7 @@ class DemoDatasetConfig:
     """Its name, "owner/name"."""
     root: Path | None = None
     """Its folder; LeRobot's cache (`$HF_LEROBOT_HOME/<repo_id>`) when null."""
-    num_episodes: int = 500
+    num_episodes: int = ranged(500, minimum=1)
     """Episodes to have in the end, all tasks together."""
     video: bool = True
     """Store pixels as mp4; with `false` as PNG in the data files: exact, about twice as large, and faster for
@@ -70,25 +68,18 @@ class RecordDemosConfig(DemoConfig):
     env: EnvConfig = field(default_factory=CronosEnvConfig)
     """Scene and observations; `--env.task` restricts the demonstrations to one task."""
     dataset: DemoDatasetConfig = field(default_factory=DemoDatasetConfig)
-    seed: int = 0
+    seed: int = ranged(0, minimum=0)
     """Decides layouts, noise, misses and starts."""
-    num_envs: int = 32
+    num_envs: int = ranged(32, minimum=1)
     """Streams that the expert acts in at once."""
     resume: bool = False
     """Add to a dataset that is already there, until it has `dataset.num_episodes`."""
 
     def __post_init__(self) -> None:
         """Check what draccus cannot."""
-        super().__post_init__()
+        check_ranges(self)
         if not is_of_this_package(self.env):
             raise ValueError(f"the scripted expert needs --env.type=cronos, got {self.env.type!r}")
-        for name, value, least in (
-            ("dataset.num_episodes", self.dataset.num_episodes, 1),
-            ("num_envs", self.num_envs, 1),
-            ("seed", self.seed, 0),
-        ):
-            if value < least:
-                raise ValueError(f"--{name} must be at least {least}, got {value}")
         if not self.dataset.repo_id:
             raise ValueError("--dataset.repo_id is required, e.g. --dataset.repo_id=me/kitchen_demos")
         if self.resume and self.dataset.overwrite:
@@ -109,10 +100,10 @@ def record_demos(cfg: RecordDemosConfig) -> None:
     _collect(cfg, *_open(cfg))
 
 
-def _open(
-    cfg: RecordDemosConfig,
-) -> tuple[CronosVectorEnv, SegmentWriter, Actor | None, Sequence[Task]]:
-    """Streams, the dataset, the policy that does the earlier tasks, and the tasks to demonstrate."""
+def _open(cfg: RecordDemosConfig) -> tuple[SegmentWriter, DemoCollector]:
+    """The dataset, and who fills it."""
+    from lerobot_env_cronos.expert.expert import ScriptedExpert
+
     assert isinstance(cfg.env, CronosEnvConfig)
     scene = get_scene(cfg.env.scene)
     task = find_task(scene.name, cfg.env.task)
@@ -121,7 +112,11 @@ def _open(
     check_starts(cfg.start, scene, tasks)
     # Once: the last checkpoint of a run that goes on is soon another one.
     source = None if cfg.start.policy is None else find_policy(cfg.start.policy).folder
-    policy = None if source is None else _load_policy(source, cfg.env)
+    policy = None
+    if source is not None:
+        config = load_policy_config(source, ["--device=cpu"])
+        check_observations(config, cfg.env)
+        policy = load_actor(config, cfg.env, getattr(config, "temperature", SuitesConfig.temperature))
     # Before there is a dataset: whether pictures can be drawn here.
     env.observe(np.arange(1))
     writer = open_writer(cfg, env, source)
@@ -129,50 +124,19 @@ def _open(
         seed = cfg.seed + writer.num_episodes
         policy.seed(seed)
         policy.begin(np.arange(cfg.num_envs), [(seed, i) for i in range(cfg.num_envs)])
-    return env, writer, policy, tasks
+    expert = ScriptedExpert(env)
+    return writer, DemoCollector(env, expert, writer, cfg, seed=cfg.seed, tasks=tasks, policy=policy)
 
 
-def _load_policy(folder: Path, env: CronosEnvConfig) -> Actor:
-    """The policy of a checkpoint, at its own sampling temperature if it has one.
-
-    Raises:
-        ValueError: the checkpoint is damaged, or the environment does not show it what it takes.
-    """
-    config = load_policy_config(folder, ["--device=cpu"])
-    check_observations(config, env)
-    return load_actor(config, env, getattr(config, "temperature", SuitesConfig.temperature))
-
-
-def _collect(
-    cfg: RecordDemosConfig,
-    env: CronosVectorEnv,
-    writer: SegmentWriter,
-    policy: Actor | None,
-    tasks: Sequence[Task],
-) -> None:
-    from lerobot_env_cronos.expert.expert import ScriptedExpert
-
-    start = time.perf_counter()
+def _collect(cfg: RecordDemosConfig, writer: SegmentWriter, collector: DemoCollector) -> None:
+    before, total = writer.num_episodes, cfg.dataset.num_episodes
     try:
-        with writer:
-            before = writer.num_episodes
-            expert = ScriptedExpert(env)
-            collector = DemoCollector(env, expert, writer, cfg, seed=cfg.seed, tasks=tasks, policy=policy)
-            with tqdm(total=cfg.dataset.num_episodes, initial=before, unit="episode") as bar:
-                frames = 0
-
-                def show(length: int) -> None:
-                    nonlocal frames
-                    frames += length
-                    bar.set_postfix_str(f"{frames / (time.perf_counter() - start):.0f} frames/s", refresh=False)
-                    bar.update()
-
-                try:
-                    collector.collect(cfg.dataset.num_episodes - before, show)
-                except KeyboardInterrupt:
-                    logging.warning("interrupted: keeping the episodes recorded so far")
+        with writer, tqdm(total=total, initial=before, unit="episode") as bar:
+            collector.collect(total - before, lambda _: bar.update())
+    except KeyboardInterrupt:
+        logging.warning("interrupted: keeping the episodes recorded so far")
     finally:
-        env.close()
+        collector.env.close()
     rate = collector.successes / max(collector.finished, 1)
     logging.info(
         f"{writer.num_episodes} episodes, {writer.num_frames} frames in {writer.root};"
