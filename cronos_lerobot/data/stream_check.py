@@ -1,5 +1,7 @@
 """Checks that recorded streams are whole: every step once, every annotation where it belongs."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import pandas as pd
 from lerobot.utils.constants import DONE
@@ -24,14 +26,17 @@ COLUMNS = (
 """What a check reads of every frame."""
 SCENE_RESETS = (Intervention.INITIAL, Intervention.SCENE_RESET, Intervention.DIVERGENCE)
 """After these the whole scene is new."""
+COUNTS = (STREAM_INTERVENTIONS, TOTAL_INTERVENTIONS)
 
 
 class StreamError(ValueError):
     """A recorded stream is not whole."""
 
 
-def check(frames: pd.DataFrame, total_frames: int, total_episodes: int, *, is_finished: bool = True) -> None:
-    """Check every frame's place in its stream.
+def check(
+    files: Iterable[pd.DataFrame], total_frames: int, total_episodes: int, *, is_finished: bool = True
+) -> None:
+    """Check every frame's place in its stream. One file is in memory at a time.
 
     - LeRobot's indices count frames and episodes without a gap, and an episode is one segment of one stream.
     - The steps of each stream go from 0 up by 1, its segments too.
@@ -42,7 +47,8 @@ def check(frames: pd.DataFrame, total_frames: int, total_episodes: int, *, is_fi
     - All streams of a finished recording end at the same step: they step together.
 
     Args:
-        frames: the columns `COLUMNS` of a whole recording, in LeRobot's order; a filtered one has gaps.
+        files: the columns `COLUMNS` of a whole recording, in LeRobot's order, by files of whole episodes; a
+            filtered recording has gaps.
         total_frames: as `info.json` counts them.
         total_episodes: the same.
         is_finished: whether the recording was not killed and does not go on.
@@ -50,14 +56,23 @@ def check(frames: pd.DataFrame, total_frames: int, total_episodes: int, *, is_fi
     Raises:
         StreamError: names the stream, the step and what is wrong there.
     """
-    if len(frames) != total_frames:
-        raise StreamError(f"the data files hold {len(frames)} frames, info.json counts {total_frames}")
-    _expect(frames, frames["index"] == np.arange(len(frames)), "index")
-    _check_episodes(frames, total_episodes)
-    steps = frames.groupby(STREAM_ID).size()
-    if missing := sorted(set(range(min(int(steps.index.max()), len(steps)) + 1)) - set(steps.index)):
-        raise StreamError(f"stream {missing[0]} is missing; recorded are the first ones up to {steps.index.max()}")
-    _check_streams(frames.sort_values([STREAM_ID, STEP], kind="stable").reset_index(drop=True))
+    num_frames, num_episodes, firsts, lasts = 0, 0, [], []
+    for frames in files:
+        _expect(frames, frames["index"] == np.arange(len(frames)) + num_frames, "index")
+        first = frames["frame_index"] == 0
+        _expect(frames, frames["episode_index"] == first.cumsum() - 1 + num_episodes, "episode_index")
+        _check_within(frames, first)
+        firsts.append(frames[first])
+        lasts.append(frames[first.shift(-1, fill_value=True)])
+        num_frames += len(frames)
+        num_episodes += int(first.sum())
+    for name, count, total in (("frames", num_frames, total_frames), ("episodes", num_episodes, total_episodes)):
+        if count != total:
+            raise StreamError(f"the data files hold {count} {name}, info.json counts {total}")
+    segments = pd.concat(firsts, ignore_index=True).sort_values([STREAM_ID, STEP], kind="stable")
+    ends = pd.concat(lasts, ignore_index=True).loc[segments.index].reset_index(drop=True)
+    _check_between(segments.reset_index(drop=True), ends)
+    steps = ends.groupby(STREAM_ID)[STEP].max() + 1
     shortest, longest = steps.idxmin(), steps.idxmax()
     # A flush writes the segments that have ended by then, of some streams one more than of others.
     if is_finished and steps[shortest] < steps[longest]:
@@ -67,50 +82,59 @@ def check(frames: pd.DataFrame, total_frames: int, total_episodes: int, *, is_fi
         )
 
 
-def _check_episodes(frames: pd.DataFrame, total: int) -> None:
-    first = frames["frame_index"] == 0
-    _expect(frames, frames["episode_index"] == first.cumsum() - 1, "episode_index")
-    if (count := int(first.sum())) != total:
-        raise StreamError(f"the data files hold {count} episodes, info.json counts {total}")
-    for name in (STREAM_ID, SEGMENT_INDEX):
-        _expect(frames, first | (frames[name].diff() == 0), name)
+def _check_within(frames: pd.DataFrame, first: pd.Series) -> None:
+    """Check frames after frames of their own segment, and what is true of every frame."""
+    rise = frames[[STREAM_ID, SEGMENT_INDEX, SEGMENTS_SINCE_RESET, "frame_index", STEP, *COUNTS]].diff()
+    for name in (STREAM_ID, SEGMENT_INDEX, SEGMENTS_SINCE_RESET):
+        _expect(frames, first | (rise[name] == 0), name)
     for name in ("frame_index", STEP):
-        _expect(frames, first | (frames[name].diff() == 1), name)
-
-
-def _check_streams(frames: pd.DataFrame) -> None:
-    """Check all streams, one after the other, each in the order of its steps."""
-    begins = frames[STREAM_ID].diff() != 0
-    ends = begins.shift(-1, fill_value=True)
-    first = frames["frame_index"] == 0
-    step = frames[STEP].diff()
-    twice, gap = ~begins & (step == 0), (begins & (frames[STEP] != 0)) | (~begins & (step != 1))
-    _expect(frames, ~twice, STEP, "is there twice")
-    if gap.any():
-        at = int(np.flatnonzero(gap)[0])
-        low = 0 if begins[at] else frames[STEP][at - 1] + 1
-        raise StreamError(f"stream {frames[STREAM_ID][at]}: steps {low} to {frames[STEP][at] - 1} are missing")
-    segment = first.groupby(frames[STREAM_ID]).cumsum() - 1
-    _expect(frames, frames[SEGMENT_INDEX] == segment, SEGMENT_INDEX)
-    event = frames[EVENT]
-    _expect(frames, (event != Intervention.NONE) == first, EVENT)
-    _expect(frames, (event == Intervention.INITIAL) == begins, EVENT)
-    # The recording may end with a segment or inside one.
-    cut = first.shift(-1, fill_value=False)
-    _expect(frames, (frames[TRUNCATED].astype(bool) == cut) | ends, TRUNCATED)
+        _expect(frames, first | (rise[name] == 1), name)
+    _expect(frames, (frames[EVENT] != Intervention.NONE) == first, EVENT)
+    _expect(frames, ~frames[TRUNCATED].astype(bool) | first.shift(-1, fill_value=True), TRUNCATED)
     _expect(frames, ~frames[DONE].astype(bool), DONE, "is True, but a stream never ends")
-    new, rise = event.isin(SCENE_RESETS), frames[SEGMENTS_SINCE_RESET].diff()
-    _expect(frames, (new & (frames[SEGMENTS_SINCE_RESET] == 0)) | (~new & (rise == first)), SEGMENTS_SINCE_RESET)
     helped = frames[INTERVENED].astype(bool)
-    help_begins = helped & (begins | ~helped.shift(fill_value=False))
+    help_begins = helped & ~helped.shift(fill_value=False)
+    _check_counts(frames[~first], rise[~first], help_begins[~first].astype(int), help_begins[~first])
+
+
+def _check_between(segments: pd.DataFrame, ends: pd.DataFrame) -> None:
+    """Check the first frames of all segments, stream by stream and in order, after the last frames before them.
+
+    Args:
+        segments: their first frames.
+        ends: their last frames.
+    """
+    there = set(segments[STREAM_ID])
+    if missing := sorted(set(range(min(max(there), len(there)) + 1)) - there):
+        raise StreamError(f"stream {missing[0]} is missing; recorded are the first ones up to {max(there)}")
+    before = ends.shift()
+    begins = segments[STREAM_ID] != before[STREAM_ID]
+    due = (before[STEP] + 1).where(~begins, 0)
+    _expect(segments, segments[STEP] >= due, STEP, "is there twice")
+    if (gap := segments[STEP] > due).any():
+        at = int(np.flatnonzero(gap)[0])
+        stream, step = segments[STREAM_ID][at], segments[STEP][at]
+        raise StreamError(f"stream {stream}: steps {int(due[at])} to {step - 1} are missing")
+    _expect(segments, segments[SEGMENT_INDEX] == segments.groupby(STREAM_ID).cumcount(), SEGMENT_INDEX)
+    event = segments[EVENT]
+    _expect(segments, (event == Intervention.INITIAL) == begins, EVENT)
+    # The recording may end with a segment or inside one.
+    is_last = begins.shift(-1, fill_value=True)
+    _expect(ends, ends[TRUNCATED].astype(bool) | is_last, TRUNCATED)
+    switches = (before[SEGMENTS_SINCE_RESET] + 1).where(~event.isin(SCENE_RESETS), 0)
+    _expect(segments, segments[SEGMENTS_SINCE_RESET] == switches, SEGMENTS_SINCE_RESET)
+    help_begins = segments[INTERVENED].astype(bool) & ~ends[INTERVENED].astype(bool).shift(fill_value=False)
     least = event.isin(COUNTED_INTERVENTIONS).astype(int) + help_begins
-    for name in (STREAM_INTERVENTIONS, TOTAL_INTERVENTIONS):
-        rise = frames[name].diff().where(~begins, least)
+    rise = segments[[*COUNTS]] - before[[*COUNTS]]
+    _check_counts(segments[~begins], rise[~begins], least[~begins], ~begins[~begins])
+
+
+def _check_counts(frames: pd.DataFrame, rise: pd.DataFrame, least: pd.Series, may_rise: pd.Series) -> None:
+    """Check how much the counts of interventions rise at frames: by `least` at least."""
+    for name in COUNTS:
         # Several kinds may come together; the frame carries the strongest. Other streams count at any time.
-        may_rise = first | help_begins | (name == TOTAL_INTERVENTIONS)
-        _expect(
-            frames, (rise >= least) & (may_rise | (rise == 0)), name, "is not what the interventions add up to"
-        )
+        fits = (rise[name] >= least) & (may_rise | (rise[name] == 0) | (name == TOTAL_INTERVENTIONS))
+        _expect(frames, fits, name, "is not what the interventions add up to")
 
 
 def _expect(frames: pd.DataFrame, holds: pd.Series, name: str, what: str = "is wrong") -> None:

@@ -203,7 +203,7 @@ class StreamDataset:
         rows = cast(pa.Table, table).to_pandas()
         if len(there) == len(ours) and not rows[ours].isna().any(axis=None):
             return rows
-        frames = self.annotations(["episode_index", *SEGMENT_COLUMNS])
+        frames = pd.concat(self.annotations(["episode_index", *SEGMENT_COLUMNS]), ignore_index=True)
         by_episode = frames.groupby("episode_index")
         found = by_episode.first()
         found[[SUCCESS, INTERVENED]] = by_episode[[SUCCESS, INTERVENED]].any()
@@ -317,15 +317,12 @@ class StreamDataset:
             frames.append(frame)
         return frames[0], frames[1]
 
-    def annotations(self, names: Sequence[str]) -> pd.DataFrame:
-        """Columns of single numbers, of all frames that `info.json` counts, in LeRobot's order."""
-        tables = []
+    def annotations(self, names: Sequence[str]) -> Iterator[pd.DataFrame]:
+        """Columns of single numbers, of all frames in LeRobot's order, a file at a time."""
         for file in (name for name in named_files(self.meta) if name.startswith("data/")):
             if self.is_local:
                 check_parquet(self.meta.root / file, self.meta.root)
-            tables.append(pq.read_table(f"{self._base}/{file}", columns=list(names), filesystem=self._files))
-        # A killed recording may have left rows behind that it had not counted yet.
-        return pa.concat_tables(tables).slice(0, self.meta.total_frames).to_pandas()
+            yield pq.read_table(f"{self._base}/{file}", columns=list(names), filesystem=self._files).to_pandas()
 
     def check(self, *, is_finished: bool = True) -> None:
         """Check that every stream is whole.
