@@ -25,8 +25,8 @@ from lerobot.datasets.utils import (
 PATTERNS = ("[", "*", "?", "::")
 """What `datasets` takes for a pattern or an archive in a path. LeRobot hands it the paths of data files, so that
 it finds nothing there, or also what is in a folder beside it."""
-MAX_ROWS_PER_BYTE = 1
-"""A parquet file with more rows than bytes is no recording: it would take a million times its size in memory."""
+MAX_GROWTH = 20
+"""Values, or bytes, that a byte of a parquet file may become, besides a row: beyond that it is no recording."""
 
 
 class DatasetFileError(ValueError):
@@ -56,12 +56,15 @@ def open_metadata(
         DatasetFileError: a file of `meta/` in `root` is missing or damaged, or leads out of the dataset.
         ValueError: another version of LeRobot made it, or the Hub has no version of it.
     """
-    if root is not None:
-        check_meta_is_there(Path(root), repo_id)
     try:
+        if root is not None:
+            _check_meta_is_there(Path(root), repo_id)
         meta = LeRobotDatasetMetadata(repo_id, root, revision)
     except (CompatibilityError, NotImplementedError) as error:
-        raise _other_version(repo_id) from error
+        raise ValueError(
+            f"{repo_id} has another version of LeRobot's format than {CODEBASE_VERSION}: convert it as LeRobot's "
+            "documentation says"
+        ) from error
     except (KeyError, TypeError, json.JSONDecodeError, pa.ArrowInvalid) as error:
         raise DatasetFileError(f"meta/ of {repo_id} cannot be read: {brief(error)}") from error
     except RuntimeError as error:
@@ -70,77 +73,55 @@ def open_metadata(
         raise ValueError(
             f"{repo_id} on the Hub has no tag {CODEBASE_VERSION}: give a --dataset.revision that it has"
         ) from error
-    check_names(meta)
-    return meta
-
-
-def check_names(meta: LeRobotDatasetMetadata) -> None:
-    """Check that all files of a dataset lie in its folder.
-
-    Raises:
-        DatasetFileError: names what leads out of it.
-    """
+    # Names that lead out of the folder.
     for path, expected in ((meta.data_path, DEFAULT_DATA_PATH), (meta.video_path, DEFAULT_VIDEO_PATH)):
         if path not in (expected, None):
             raise DatasetFileError(f"{INFO_PATH} keeps files at {brief(path)}, LeRobot at {expected}")
     for name in meta.features:
         if "/" in name or "\\" in name or name in (".", ".."):
             raise DatasetFileError(f"{INFO_PATH} has a feature {brief(name)}, which is no name of a file")
+    return meta
 
 
-def check_meta_is_there(root: Path, repo_id: str) -> None:
+def _check_meta_is_there(root: Path, repo_id: str) -> None:
     """Check that `meta/` is whole if there is a dataset in a folder.
 
     What LeRobot does not find in a folder it downloads into it, over what is there.
-
-    Raises:
-        DatasetFileError: names the missing file.
-        ValueError: another version of LeRobot made it, or see `check_path`.
     """
     check_path(root)
     if not any((root / name).exists() for name in (INFO_PATH, EPISODES_DIR, DATA_DIR)):
         return
     if not (root / INFO_PATH).is_file():
         raise DatasetFileError(f"{root / INFO_PATH} is missing")
-    try:
-        info = json.loads((root / INFO_PATH).read_text())
-        version, has_episodes = info["codebase_version"], bool(info["total_episodes"])
-        check_version_compatibility(repo_id, version, CODEBASE_VERSION)
-    except (CompatibilityError, NotImplementedError) as error:
-        raise _other_version(repo_id) from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise DatasetFileError(f"{root / INFO_PATH} is damaged: {brief(error)}") from error
+    info = json.loads((root / INFO_PATH).read_text())
+    check_version_compatibility(repo_id, info["codebase_version"], CODEBASE_VERSION)
     # The first segment brings the other files.
-    if not has_episodes:
-        return
-    if not (root / DEFAULT_TASKS_PATH).is_file():
-        raise DatasetFileError(f"{root / DEFAULT_TASKS_PATH} is missing")
-    episodes = sorted((root / EPISODES_DIR).glob("*/*.parquet"))
-    if not episodes:
-        raise DatasetFileError(f"{root / EPISODES_DIR} is missing")
-    for path in (root / DEFAULT_TASKS_PATH, *episodes):
-        check_parquet(path, root)
+    if info["total_episodes"]:
+        episodes = sorted((root / EPISODES_DIR).glob("*/*.parquet")) or [root / EPISODES_DIR]
+        for path in (root / DEFAULT_TASKS_PATH, *episodes):
+            check_parquet(path, root)
 
 
-def check_parquet(path: Path, root: Path) -> pq.FileMetaData:
-    """Look at the end of a parquet file, before anything of it is read.
-
-    Returns:
-        What it says of its rows and columns.
+def check_parquet(path: Path, root: Path) -> None:
+    """Look at what a parquet file says of its size, before anything of it is read.
 
     Raises:
-        DatasetFileError: the file is missing, damaged, or says of itself what no recording is.
+        DatasetFileError: the file is missing, damaged, or holds far more than a recording of its size.
     """
     relative = path.relative_to(root)
     try:
         metadata = pq.read_metadata(path)
-    except FileNotFoundError:
+    except (FileNotFoundError, IsADirectoryError):
         raise DatasetFileError(f"{relative} is missing") from None
     except (pa.ArrowInvalid, OSError) as error:
         raise DatasetFileError(f"{relative} is damaged: {brief(error)}") from error
-    if metadata.num_rows > path.stat().st_size * MAX_ROWS_PER_BYTE:
-        raise DatasetFileError(f"{relative} has {metadata.num_rows} rows in {path.stat().st_size} bytes")
-    return metadata
+    # The sums are what a reader goes by; the total of the rows is only said.
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    values = sum(group.column(i).num_values for group in groups for i in range(group.num_columns))
+    rows, size = sum(group.num_rows for group in groups), path.stat().st_size
+    decoded = sum(group.total_byte_size for group in groups)
+    if rows > size or max(values, decoded) > size * MAX_GROWTH or min(rows, values, decoded) < 0:
+        raise DatasetFileError(f"{relative} has {rows} rows, {values} values, {decoded} bytes in {size} bytes")
 
 
 def check_path(root: Path) -> None:
@@ -194,10 +175,3 @@ def named_files(meta: LeRobotDatasetMetadata) -> list[str]:
 def missing_files(meta: LeRobotDatasetMetadata) -> list[str]:
     """Return those of `named_files` that the dataset's folder lacks."""
     return [file for file in named_files(meta) if not (meta.root / file).is_file()]
-
-
-def _other_version(repo_id: str) -> ValueError:
-    return ValueError(
-        f"{repo_id} has another version of LeRobot's format than {CODEBASE_VERSION}: convert it as LeRobot's "
-        "documentation says"
-    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any, cast
@@ -60,33 +60,33 @@ def check_dataset(root: Path) -> Origin:
     if not meta.total_episodes:
         raise DatasetFileError(f"the dataset in {root} has no episode yet")
     origin = read_origin(root, meta.features, f"the dataset in {root}")
-    check_columns(meta, origin)
-    rows = _rows(meta)
+    _check_columns(meta, origin)
+    rows = _episode_rows(meta)
     counted = len(rows), int(rows["length"].sum())
     if counted != (meta.total_episodes, meta.total_frames):
         raise DatasetFileError(
             f"meta/episodes has {counted[0]} episodes and {counted[1]} frames, info.json counts"
             f" {meta.total_episodes} and {meta.total_frames}"
         )
-    for path, episodes in tqdm(_by_file(rows, "data", DEFAULT_DATA_PATH), unit="file", desc="data", disable=None):
-        _check_data(root, path, episodes.set_index("episode_index")["length"], meta)
+    for path, episodes in _by_file(rows, "data", DEFAULT_DATA_PATH):
+        _check_data(root, path, episodes["length"], meta)
     for key in meta.video_keys:
-        files = _by_file(rows, f"videos/{key}", DEFAULT_VIDEO_PATH.replace("{video_key}", key))
-        for path, episodes in tqdm(files, unit="file", desc=key, disable=None):
+        for path, episodes in _by_file(rows, f"videos/{key}", DEFAULT_VIDEO_PATH.replace("{video_key}", key)):
             frames = round(episodes[f"videos/{key}/to_timestamp"].max() * meta.fps)
             _check_video(root, path, frames, meta.features[key]["shape"], meta.fps)
     return origin
 
 
-def check_columns(meta: LeRobotDatasetMetadata, origin: Origin) -> None:
-    """Check that a dataset has the columns that its kind promises, of this robot.
-
-    Raises:
-        DatasetFileError: names what it lacks or has otherwise.
-    """
+def _check_columns(meta: LeRobotDatasetMetadata, origin: Origin) -> None:
+    """Check that a dataset has the columns that its kind promises, of this robot."""
+    assert meta.episodes is not None
     promised = [ACTION, REWARD, SUCCESS, DONE, TRUNCATED, *(STREAM_COLUMNS if origin.kind == STREAMS else ())]
-    if lost := [name for name in promised if name not in meta.features]:
-        raise DatasetFileError(f"the dataset has lost columns of {origin.kind}: {lost}")
+    lost = [name for name in promised if name not in meta.features]
+    lost += [name for name in EPISODE_COLUMNS[origin.kind] if name not in meta.episodes.column_names]
+    if lost:
+        raise DatasetFileError(
+            f"the dataset has lost columns of {origin.kind}, as LeRobot's tools leave it: {lost}"
+        )
     if not any(name.startswith("observation.") for name in meta.features):
         raise DatasetFileError("the dataset has no observation")
     names, fps = meta.features[ACTION]["names"], meta.fps
@@ -94,43 +94,39 @@ def check_columns(meta: LeRobotDatasetMetadata, origin: Origin) -> None:
         raise DatasetFileError(
             f"the actions are {brief(names)} at {fps} Hz, the scene has {list(ACTION_NAMES)} at {CONTROL_HZ} Hz"
         )
-    assert meta.episodes is not None
-    if lost := [name for name in EPISODE_COLUMNS[origin.kind] if name not in meta.episodes.column_names]:
-        raise DatasetFileError(f"meta/episodes has lost the columns {lost}, as LeRobot's editing tools leave it")
     scene = get_scene(origin.scene)
     known = {task.instruction for task in (*scene.tasks, *scene.reset_tasks)}
     if unknown := sorted(set(meta.tasks.index if meta.tasks is not None else []) - known):
         raise DatasetFileError(f"the dataset has tasks that {scene.name} has not: {brief(unknown)}")
 
 
-def _rows(meta: LeRobotDatasetMetadata) -> pd.DataFrame:
+def _episode_rows(meta: LeRobotDatasetMetadata) -> pd.DataFrame:
     """What `meta/episodes` says of the files, of the episodes that `info.json` counts."""
     assert meta.episodes is not None
     names = ["episode_index", "length", "data/chunk_index", "data/file_index"]
     for key in meta.video_keys:
         names += [f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "to_timestamp")]
-    table = meta.episodes.with_format("arrow").select_columns(names)[:]
-    rows = cast(pa.Table, table).to_pandas()
-    return rows[rows["episode_index"] < meta.total_episodes]
+    table = cast(pa.Table, meta.episodes.with_format("arrow").select_columns(names)[:])
+    rows = table.to_pandas().set_index("episode_index")
+    return rows[rows.index < meta.total_episodes]
 
 
-def _by_file(rows: pd.DataFrame, folder: str, template: str) -> list[tuple[str, pd.DataFrame]]:
+def _by_file(rows: pd.DataFrame, folder: str, template: str) -> Iterator[tuple[str, pd.DataFrame]]:
     """Files that rows name, with the rows that name them."""
     groups = rows.groupby([f"{folder}/chunk_index", f"{folder}/file_index"])
-    return [(template.format(chunk_index=chunk, file_index=file), group) for (chunk, file), group in groups]
+    for (chunk, file), group in tqdm(groups, unit="file", desc=folder, disable=None):
+        yield template.format(chunk_index=chunk, file_index=file), group
 
 
 def _check_data(root: Path, relative: str, lengths: pd.Series, meta: LeRobotDatasetMetadata) -> None:
     check_parquet(root / relative, root)
     promised = get_hf_features_from_features(meta.features).arrow_schema
     try:
-        stored = pq.read_schema(root / relative)
-        if wrong := [field.name for field in promised if field not in stored]:
-            raise DatasetFileError(f"{relative} has not the columns {brief(wrong)} that info.json promises")
         table = pq.read_table(root / relative)
     except (pa.ArrowInvalid, OSError) as error:
         raise DatasetFileError(f"{relative} is damaged: {brief(error)}") from error
-    # A killed recording may have left rows behind that it had not counted yet.
+    if lost := [name for name in promised.names if name not in table.column_names]:
+        raise DatasetFileError(f"{relative} has not the columns {brief(lost)} that info.json promises")
     found = pd.Series(table["episode_index"].to_numpy()).value_counts().reindex(lengths.index, fill_value=0)
     if (wrong := np.flatnonzero(found != lengths)).size:
         episode = lengths.index[wrong[0]]
