@@ -14,9 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+from draccus.utils import DecodingError
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.utils.utils import flatten_dict
 from lerobot_env_cronos import CronosVectorEnv, check_environment_id, gymnasium_id
 
-from cronos_lerobot.data.schema import FORMAT, STREAM_ID, SUCCESS, Features
+from cronos_lerobot.data.schema import FORMAT, ROBOT_TYPE, STREAM_ID, SUCCESS, Features
 from cronos_lerobot.dataset_metadata import brief
 from cronos_lerobot.provenance import git_commit, package_versions
 from cronos_lerobot.whole_files import written_whole
@@ -99,7 +102,8 @@ def origin_of(
         gymnasium_id(env.scene.name),
         env.benchmark.fingerprint,
         "a folder" if Path(source).exists() else source,
-        dict(flags),
+        # As a file gives them back: a tuple is a list.
+        json.loads(json.dumps(flags)),
         package_versions(),
         git_commit(),
         start_policy,
@@ -114,26 +118,28 @@ def flags_of(config: Any, only: Sequence[str] | None = None) -> dict[str, Any]:
         only: the fields to take; all when None.
     """
     encoded = draccus.encode(config)
-    return _flatten({name: value for name, value in encoded.items() if only is None or name in only}, "")
+    flags = flatten_dict({name: encoded[name] for name in only or encoded}, sep=".")
+    kept = {name: value for name, value in flags.items() if not set(name.split(".")) & set(NO_FLAGS)}
+    for name, value in kept.items():
+        if name.split(".")[-1] in MAYBE_FOLDERS and isinstance(value, str) and Path(value).is_dir():
+            kept[name] = "a folder"
+    return kept
 
 
-def _flatten(encoded: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    flags: dict[str, Any] = {}
-    for name, value in encoded.items():
-        if name in NO_FLAGS:
-            continue
-        if isinstance(value, dict) and value:
-            flags |= _flatten(value, f"{prefix}{name}.")
-        else:
-            is_folder = name in MAYBE_FOLDERS and isinstance(value, str) and Path(value).is_dir()
-            flags[prefix + name] = "a folder" if is_folder else value
-    return flags
-
-
-def marked(features: Features, origin: Origin) -> Features:
-    """The features with format, environment and benchmark in the one that they judge."""
-    mark = {name: getattr(origin, name) for name in ("format", "environment", "benchmark")}
-    return features | {SUCCESS: features[SUCCESS] | {"info": mark}}
+def create_dataset(
+    repo_id: str, root: Path, fps: int, features: Features, origin: Origin | None, robot_type: str = ROBOT_TYPE
+) -> LeRobotDatasetMetadata:
+    """Start an empty dataset that says where it comes from; format, environment and benchmark also in SUCCESS."""
+    if origin is not None:
+        mark = {name: getattr(origin, name) for name in ("format", "environment", "benchmark")}
+        features = features | {SUCCESS: features[SUCCESS] | {"info": mark}}
+    has_video = any(feature["dtype"] == "video" for feature in features.values())
+    meta = LeRobotDatasetMetadata.create(
+        repo_id, fps, features, robot_type=robot_type, root=root, use_videos=has_video
+    )
+    if origin is not None:
+        write_origin(root, origin)
+    return meta
 
 
 def write_origin(root: Path, origin: Origin) -> None:
@@ -157,12 +163,13 @@ def with_changes(there: Origin, here: Origin, num_episodes: int) -> Origin:
         num_episodes: that the dataset keeps; what had changed after them has not.
     """
     kept = [change for change in there.resumed if change["episodes"] < num_episodes]
-    now, before = _as_json(here.flags), _as_json(there.flags)
+    before = dict(there.flags)
     for change in kept:
         before |= change["flags"]
-    names = [name for name in now if name.startswith(CHANGEABLE) and now[name] != before.get(name)]
-    if names and there.flags:
-        kept.append({"episodes": num_episodes, "flags": {name: now[name] for name in sorted(names)}})
+    names = sorted(name for name in here.flags if name.startswith(CHANGEABLE))
+    changed = {name: here.flags[name] for name in names if here.flags[name] != before.get(name)}
+    if changed and there.flags:
+        kept.append({"episodes": num_episodes, "flags": changed})
     return replace(there, resumed=kept)
 
 
@@ -180,22 +187,16 @@ def read_origin(root: Path, features: Mapping[str, Mapping[str, Any]], what: str
     mark = (features.get(SUCCESS) or {}).get("info") or {}
     kind = STREAMS if STREAM_ID in features else DEMONSTRATIONS
     try:
-        stored = json.loads((root / ORIGIN).read_text())
-    except FileNotFoundError:
-        stored: dict[str, Any] = {"kind": kind, **mark}
-    except ValueError as error:
+        file = root / ORIGIN
+        stored = json.loads(file.read_text()) if file.is_file() else {"kind": kind, **mark}
+        found = stored.get("format") if mark else None
+        if found == FORMAT:
+            check_environment_id(stored.get("environment"), what, "record it anew")
+            origin = draccus.decode(Origin, stored)
+    except (json.JSONDecodeError, DecodingError, AttributeError) as error:
         raise ValueError(f"{root / ORIGIN} is damaged: {brief(error)}") from error
-    found = stored.get("format") if mark and isinstance(stored, dict) else None
     if found != FORMAT:
         raise ValueError(f"{what} has the format {brief(found)}, this version reads {FORMAT}: record it anew")
-    check_environment_id(stored.get("environment"), what, "record it anew")
-    defaults = Origin("", "", "")
-    for name, value in stored.items():
-        if isinstance(default := getattr(defaults, name, None), list | dict) and not isinstance(
-            value, type(default)
-        ):
-            raise ValueError(f"{root / ORIGIN} is damaged: {name} is {brief(value)}")
-    origin = Origin(**{name: stored[name] for name in Origin.__dataclass_fields__ if name in stored})
     for name, value in mark.items():
         if value != getattr(origin, name, None):
             raise ValueError(f"{what}: {ORIGIN} and info.json have another {name}")
@@ -221,15 +222,8 @@ def check_same(there: Origin, here: Origin, what: str, ignored: tuple[str, ...] 
             raise ValueError(f"{what} cannot be resumed: its {name} is {brief(had)}, not {brief(has)}")
     if there.kind != DEMONSTRATIONS:
         return
-    had, has = there.flags, _as_json(here.flags)
-    for name in sorted(had.keys() | has.keys()):
-        if name not in ignored and had.get(name) != has.get(name):
+    for name in sorted({*there.flags, *here.flags} - set(ignored)):
+        if (had := there.flags.get(name)) != (has := here.flags.get(name)):
             raise ValueError(
-                f"{what} cannot be resumed: it was recorded with --{name}={brief(had.get(name))}, not"
-                f" {brief(has.get(name))}"
+                f"{what} cannot be resumed: it was recorded with --{name}={brief(had)}, not {brief(has)}"
             )
-
-
-def _as_json(flags: Mapping[str, Any]) -> dict[str, Any]:
-    """Flags as a file gives them back: a tuple is a list."""
-    return json.loads(json.dumps(flags))

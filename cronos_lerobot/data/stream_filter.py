@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -17,13 +17,20 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import DEFAULT_FEATURES
 from tqdm import tqdm
 
-from cronos_lerobot.data.origin import SEGMENTS, marked, write_origin
+from cronos_lerobot.data.origin import SEGMENTS, create_dataset
 from cronos_lerobot.data.recorder import segment_row
-from cronos_lerobot.data.schema import DECISION_COLUMNS, SEGMENT_COLUMNS, STREAM_COLUMNS, SUCCESS, TRUNCATED
+from cronos_lerobot.data.schema import (
+    DECISION_COLUMNS,
+    SEGMENT_COLUMNS,
+    STREAM_COLUMNS,
+    STREAM_ID,
+    SUCCESS,
+    TRUNCATED,
+)
 from cronos_lerobot.data.stats import DatasetStats, Stats, episode_stats, to_array
-from cronos_lerobot.data.storage import INCOMPLETE, Shard, stats_of_row
+from cronos_lerobot.data.storage import INCOMPLETE, GrowingDataset, stats_of_row
 from cronos_lerobot.data.streams import Segment, StreamDataset
-from cronos_lerobot.data.video import Clip, CopiedVideoFile, read_frames
+from cronos_lerobot.data.video import CopiedVideoFile, read_frames
 from cronos_lerobot.dataset_metadata import check_path
 from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.protocol.interventions import BEFORE_SEGMENTS
@@ -115,10 +122,38 @@ def filter_streams(
     """
     root = Path(root)
     check_path(root)
+    segments = _wanted_segments(source, wanted)
+    done = {
+        "source": source.repo_id,
+        "source_segments": len(source.segments),
+        "segments": len(segments),
+        "filter": asdict(wanted),
+        "frames_after_success": frames_after_success,
+    }
+    origin = replace(source.origin, filters=[*source.origin.filters, done])
+    dropped = set(DEFAULT_FEATURES)
+    if schema != "streams":
+        origin, dropped = replace(origin, kind=SEGMENTS), dropped | {*STREAM_COLUMNS, *DECISION_COLUMNS}
+    features = {key: feature for key, feature in source.meta.features.items() if key not in dropped}
+    with FolderLock(root):
+        if root.exists():
+            raise FileExistsError(f"{root} exists: give another --output.root")
+        partial = root.with_name(f".{root.name}.partial")
+        shutil.rmtree(partial, ignore_errors=True)
+        meta = create_dataset(repo_id, partial, source.meta.fps, features, origin, source.meta.robot_type)
+        dataset = GrowingDataset(meta, DatasetStats(meta.features), CopiedVideoFile)
+        for segment, rows, stats in _read(source, segments):
+            _copy(source, segment, rows, stats, meta, dataset, frames_after_success)
+        dataset.publish()
+        shutil.rmtree(partial / INCOMPLETE)
+        os.replace(partial, root)
+    return len(segments)
+
+
+def _wanted_segments(source: StreamDataset, wanted: SegmentFilter) -> list[Segment]:
     if not source.is_local:
         raise ValueError(f"{source.repo_id} is streamed from the Hub; open it with streaming=False to filter it")
     for name, given, there in (
-        ("schema", [schema], SCHEMAS),
         ("filter.streams", wanted.streams, source.streams),
         ("filter.tasks", wanted.tasks, sorted({segment.task for segment in source.segments})),
     ):
@@ -127,93 +162,7 @@ def filter_streams(
     segments = sorted((s for s in source.segments if wanted(s)), key=lambda s: s.episode)
     if not segments:
         raise ValueError(f"none of the {len(source.segments)} segments fits {wanted}")
-    done = {
-        "source": source.repo_id,
-        "source_segments": len(source.segments),
-        "segments": len(segments),
-        "filter": asdict(wanted),
-        "frames_after_success": frames_after_success,
-    }
-    with FolderLock(root):
-        if root.exists():
-            raise FileExistsError(f"{root} exists: give another --output.root")
-        partial = root.with_name(f".{root.name}.partial")
-        shutil.rmtree(partial, ignore_errors=True)
-        writer = _Writer(source, repo_id, partial, schema, done)
-        for segment, rows, stats in _read(source, segments):
-            writer.add(segment, rows, stats, _length(segment, frames_after_success))
-        writer.close()
-        os.replace(partial, root)
-    return len(segments)
-
-
-class _Writer:
-    """Appends segments of another dataset, a shard at a time."""
-
-    def __init__(
-        self, source: StreamDataset, repo_id: str, root: Path, schema: str, done: Mapping[str, Any]
-    ) -> None:
-        self._source = source
-        self._keeps_stream = schema == "streams"
-        dropped = set(DEFAULT_FEATURES)
-        dropped |= set() if self._keeps_stream else {*STREAM_COLUMNS, *DECISION_COLUMNS}
-        features = {key: feature for key, feature in source.meta.features.items() if key not in dropped}
-        origin = replace(source.origin, filters=[*source.origin.filters, done])
-        if not self._keeps_stream:
-            origin = replace(origin, kind=SEGMENTS)
-        self._meta = LeRobotDatasetMetadata.create(
-            repo_id, source.meta.fps, marked(features, origin), robot_type=source.meta.robot_type, root=root,
-            use_videos=bool(source.meta.video_keys),
-        )  # fmt: skip
-        write_origin(root, origin)
-        self._stats = DatasetStats(self._meta.features)
-        self._tasks: dict[str, int] = {}
-        self._shard: Shard | None = None
-        self._num_shards = 0
-        self._videos: dict[str, CopiedVideoFile] = {}
-
-    def add(self, segment: Segment, rows: pa.Table, stats: Stats, length: int) -> None:
-        """Write the first `length` frames of a segment, whose rows and statistics are given."""
-        clips = {key: self._source.clip(segment, key) for key in self._meta.video_keys}
-        if length < segment.length:
-            clips = {key: Clip(clip.path, clip.start, length) for key, clip in clips.items()}
-            rows = _end_with_cut(rows.slice(0, length))
-            stats = self._stats_of(rows, clips)
-        stats = {key: stats[key] for key in self._meta.features if key in stats}
-        frames = {name: to_array(rows[name]) for name in SEGMENT_COLUMNS}
-        row = segment_row(frames) if self._keeps_stream else {SUCCESS: bool(frames[SUCCESS].any())}
-        task_index = self._tasks.setdefault(segment.task, len(self._tasks))
-        self._shard_for(clips, length).copy(rows, clips, segment.task, task_index, row, stats)
-
-    def close(self) -> None:
-        """Complete the dataset."""
-        self._publish()
-        shutil.rmtree(self._meta.root / INCOMPLETE)
-
-    def _publish(self) -> None:
-        if self._shard is not None:
-            self._shard.publish(self._tasks)
-        self._shard = None
-
-    def _shard_for(self, clips: Mapping[str, Clip], length: int) -> Shard:
-        if self._shard is not None and (
-            self._shard.is_full_for(length) or not all(self._videos[key].fits(clips[key]) for key in clips)
-        ):
-            self._publish()
-        if self._shard is None:
-            self._shard = Shard(self._meta, self._num_shards, self._stats, self._open_video)
-            self._num_shards += 1
-        return self._shard
-
-    def _open_video(self, key: str, path: Path) -> CopiedVideoFile:
-        self._videos[key] = CopiedVideoFile(path, self._meta.fps)
-        return self._videos[key]
-
-    def _stats_of(self, rows: pa.Table, clips: Mapping[str, Clip]) -> Stats:
-        frames = {name: to_array(rows[name]) for name in self._meta.features if name in rows.column_names}
-        for key, clip in clips.items():
-            frames[key] = read_frames(clip.path, clip.start, clip.length, self._meta.fps)
-        return episode_stats(frames, self._meta.features)
+    return segments
 
 
 def _read(source: StreamDataset, segments: Sequence[Segment]) -> Iterator[tuple[Segment, pa.Table, Stats]]:
@@ -234,10 +183,31 @@ def _read(source: StreamDataset, segments: Sequence[Segment]) -> Iterator[tuple[
                 bar.update()
 
 
-def _length(segment: Segment, frames_after_success: int | None) -> int:
-    if frames_after_success is None or segment.success_frame is None:
-        return segment.length
-    return min(segment.length, segment.success_frame + 1 + frames_after_success)
+def _copy(
+    source: StreamDataset,
+    segment: Segment,
+    rows: pa.Table,
+    stats: Stats,
+    meta: LeRobotDatasetMetadata,
+    dataset: GrowingDataset,
+    frames_after_success: int | None,
+) -> None:
+    """Copy a segment, or what there is of it until some frames after its success."""
+    length = segment.length
+    if frames_after_success is not None and segment.success_frame is not None:
+        length = min(length, segment.success_frame + 1 + frames_after_success)
+    clips = {key: replace(source.clip(segment, key), length=length) for key in meta.video_keys}
+    if length < segment.length:
+        rows = _end_with_cut(rows.slice(0, length))
+        columns = {name: to_array(rows[name]) for name in meta.features if name in rows.column_names}
+        for key, clip in clips.items():
+            columns[key] = read_frames(clip.path, clip.start, length, meta.fps)
+        stats = episode_stats(columns, meta.features)
+    stats = {key: stats[key] for key in meta.features if key in stats}
+    row = segment_row({name: to_array(rows[name]) for name in SEGMENT_COLUMNS})
+    if STREAM_ID not in meta.features:
+        row = {SUCCESS: row[SUCCESS]}
+    dataset.copy(rows, clips, segment.task, row, stats)
 
 
 def _end_with_cut(rows: pa.Table) -> pa.Table:

@@ -13,7 +13,7 @@ see what the last action brought.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from cronos_lerobot.agents.ppo.gae import compute_gae
 from cronos_lerobot.data.origin import Origin
 from cronos_lerobot.data.schema import STEP, STREAM_ID, SUCCESS, VALUE
 from cronos_lerobot.data.streams import StreamDataset
+from cronos_lerobot.ranges import check_ranges, ranged
 from cronos_lerobot.whole_files import written_whole
 
 PROGRESS, ADVANTAGE = "progress", "advantage"
@@ -51,19 +52,15 @@ MADE_WITH = b"cronos"
 class Weighting:
     """How progress is computed."""
 
-    weight_by: str = PROGRESS
+    weight_by: str = ranged(PROGRESS, choices=WEIGHT_BY)
     """`progress`: how near the segment came to grasp and success; `advantage`: GAE of its rewards and values."""
-    gamma: float | None = None
+    gamma: float | None = ranged(None, minimum=0, maximum=1)
     """Discount per control step, from 0 to 1; null is 0.98 for progress, and the run's for advantage."""
-    gae_lambda: float | None = None
+    gae_lambda: float | None = ranged(None, minimum=0, maximum=1)
     """Weight of the longer returns in an advantage, from 0 to 1; null is the run's."""
 
     def __post_init__(self) -> None:
-        if self.weight_by not in WEIGHT_BY:
-            raise ValueError(f"--weight_by must be one of {list(WEIGHT_BY)}, got {self.weight_by!r}")
-        for name, value in (("gamma", self.gamma), ("gae_lambda", self.gae_lambda)):
-            if value is not None and not 0 <= value <= 1:
-                raise ValueError(f"--{name} must be from 0 to 1, got {value}")
+        check_ranges(self)
 
     def discounts(self, origin: Origin) -> tuple[float, float]:
         """gamma and gae_lambda with numbers instead of null.
@@ -76,9 +73,8 @@ class Weighting:
         """
         if self.weight_by == PROGRESS:
             return PROGRESS_GAMMA if self.gamma is None else self.gamma, 0.0
-        defaults = {"gamma": ADVANTAGE_GAMMA, "gae_lambda": ADVANTAGE_LAMBDA}
         found = []
-        for name, default in defaults.items():
+        for name, default in (("gamma", ADVANTAGE_GAMMA), ("gae_lambda", ADVANTAGE_LAMBDA)):
             values, given = origin.values(f"algorithm.{name}", default), getattr(self, name)
             if given is None and len(values) > 1:
                 raise ValueError(f"the recorded run was resumed with another {name}, {values}: give --{name}")
@@ -109,14 +105,17 @@ def write_progress(streams: StreamDataset, output: Path, weighting: Weighting) -
             f"{streams.repo_id} has no {VALUE}: its agent has no critic; --weight_by={PROGRESS} needs none"
         )
     names = [*INDICES, STREAM_ID, STEP, REWARD, SUCCESS, *(() if is_progress else (VALUE,))]
-    frames = streams.annotations(names).sort_values("index", kind="stable")
+    frames = pd.concat(streams.annotations(names)).sort_values("index", kind="stable")
     if is_progress:
         # What is not said is the default of `cronos-train`: LeRobot's tools drop it.
         rows = _progress_rows(frames, streams.origin.flags.get("protocol.reward", "difference"), gamma)
     else:
         made_with["gae_lambda"] = gae_lambda
         _check_values(frames)
-        rows = _advantage_rows(frames, gamma, gae_lambda)
+        rows = [
+            summed_advantages(rewards.astype(np.float64), values.astype(np.float64), gamma, gae_lambda)
+            for rewards, values in _segments(frames, REWARD, VALUE)
+        ]
     columns = {name: frames[name].to_numpy(np.int64) for name in INDICES}
     columns[COLUMN] = np.concatenate(rows).astype(np.float32)
     table = pa.table(columns).replace_schema_metadata({MADE_WITH: json.dumps(made_with).encode()})
@@ -127,24 +126,21 @@ def write_progress(streams: StreamDataset, output: Path, weighting: Weighting) -
 
 def _progress_rows(frames: pd.DataFrame, reward: str, gamma: float) -> list[np.ndarray]:
     rows = []
-    for segment in _segments(frames, [REWARD, SUCCESS, STREAM_ID, STEP]):
-        levels = reward_levels(segment[REWARD].astype(np.float64), segment[SUCCESS].astype(np.bool_), reward)
+    for rewards, successes, streams, steps in _segments(frames, REWARD, SUCCESS, STREAM_ID, STEP):
+        levels = reward_levels(rewards.astype(np.float64), successes.astype(np.bool_), reward)
         if levels is None:
             raise ValueError(
-                f"stream {segment[STREAM_ID][0]}, step {segment[STEP][0]}: the rewards are not those of"
-                f" --protocol.reward={reward} ({GRASP_REWARD} grasped, {SUCCESS_REWARD} complete);"
-                f" --weight_by={ADVANTAGE} takes any reward"
+                f"stream {streams[0]}, step {steps[0]}: the rewards are not those of --protocol.reward={reward}"
+                f" ({GRASP_REWARD} grasped, {SUCCESS_REWARD} complete); --weight_by={ADVANTAGE} takes any reward"
             )
         rows.append(progress(levels, gamma))
     return rows
 
 
-def _segments(frames: pd.DataFrame, names: Sequence[str]) -> Iterator[dict[str, np.ndarray]]:
+def _segments(frames: pd.DataFrame, *names: str) -> Iterator[tuple[np.ndarray, ...]]:
     """Columns of one episode after the other."""
     begins = np.flatnonzero(np.diff(frames["episode_index"].to_numpy())) + 1
-    columns = {name: np.split(frames[name].to_numpy(), begins) for name in names}
-    for parts in zip(*columns.values(), strict=True):
-        yield dict(zip(columns, parts, strict=True))
+    return zip(*(np.split(frames[name].to_numpy(), begins) for name in names), strict=True)
 
 
 def _check_values(frames: pd.DataFrame) -> None:
@@ -162,13 +158,6 @@ def _check_values(frames: pd.DataFrame) -> None:
             f"{VALUE} is that of the frame before in {repeated} of {within.sum()} frames: the policy played "
             f"several actions a decision, and advantages need a value of every frame{instead}"
         )
-
-
-def _advantage_rows(frames: pd.DataFrame, gamma: float, gae_lambda: float) -> list[np.ndarray]:
-    return [
-        summed_advantages(segment[REWARD].astype(np.float64), segment[VALUE].astype(np.float64), gamma, gae_lambda)
-        for segment in _segments(frames, [REWARD, VALUE])
-    ]
 
 
 def reward_levels(rewards: np.ndarray, successes: np.ndarray, reward: str) -> np.ndarray | None:

@@ -30,8 +30,11 @@ def check_video_size(flag: str, size: Sequence[int]) -> None:
 class VideoFile:
     """One mp4 being written. Frame k lies at exactly k / fps seconds."""
 
-    def __init__(self, path: Path, fps: int, height: int, width: int, encoder: RGBEncoderConfig) -> None:
+    def __init__(
+        self, path: Path, fps: int, height: int, width: int, encoder: RGBEncoderConfig | None = None
+    ) -> None:
         """Open `path` (its folder must exist) for frames of `height` x `width` pixels."""
+        encoder = encoder or fast_encoder()
         # LeRobot's video probing leaves libav printing at INFO level, a page of x264 statistics per file.
         av.logging.set_libav_level(av.logging.ERROR)
         self.path = path
@@ -48,6 +51,10 @@ class VideoFile:
         self._stream.height = height
         self._stream.width = width
         self._stream.time_base = self._time_base
+
+    def fits(self, frames: np.ndarray) -> bool:
+        """Whether the file takes an episode: any."""
+        return True
 
     def append(self, frames: np.ndarray) -> None:
         """Encode an episode, uint8 (T, H, W, 3) RGB; its first frame becomes a keyframe."""
@@ -101,7 +108,7 @@ class CopiedVideoFile:
     All clips must begin at a keyframe and come from the same encoder with the same settings.
     """
 
-    def __init__(self, path: Path, fps: int) -> None:
+    def __init__(self, path: Path, fps: int, *_size: int) -> None:
         """Open `path` (its folder must exist)."""
         self.num_frames = 0
         self._fps = fps

@@ -17,15 +17,14 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.utils import INFO_PATH
 from lerobot.utils.constants import DEFAULT_FEATURES
 
-from cronos_lerobot.data.origin import Origin, check_same, marked, read_origin, with_changes, write_origin
-from cronos_lerobot.data.schema import ROBOT_TYPE, Features, frame_format
+from cronos_lerobot.data.origin import Origin, check_same, create_dataset, read_origin, with_changes, write_origin
+from cronos_lerobot.data.schema import Features, frame_format
 from cronos_lerobot.data.stats import DatasetStats
-from cronos_lerobot.data.storage import INCOMPLETE, Shard, next_shard_index, truncate
-from cronos_lerobot.data.video import MAX_FILE_DURATION_S, VideoFile, fast_encoder
+from cronos_lerobot.data.storage import INCOMPLETE, GrowingDataset, truncate
+from cronos_lerobot.data.video import MAX_FILE_DURATION_S, VideoFile
 from cronos_lerobot.dataset_metadata import brief, check_path, open_metadata
 from cronos_lerobot.locks import FolderLock
 
@@ -128,7 +127,6 @@ class SegmentWriter:
         fps: int,
         *,
         resume: int | None = None,
-        robot_type: str = ROBOT_TYPE,
         max_pending_bytes: int = 256 * 2**20,
         flush_interval_s: float = FLUSH_INTERVAL_S,
         origin: Origin | None = None,
@@ -142,7 +140,6 @@ class SegmentWriter:
             features: LeRobot's feature dictionary, without the bookkeeping columns (`timestamp`, ...).
             fps: frames per second, the control frequency.
             resume: how many of the first episodes to keep, -1 for all; None starts a new dataset.
-            robot_type: for `info.json`.
             max_pending_bytes: segments waiting for the encoder; `add_segment` blocks when it is exceeded.
             flush_interval_s: the longest that a segment waits for a flush [s].
             origin: where it comes from; what is appended later has to be of the same.
@@ -155,35 +152,43 @@ class SegmentWriter:
             ValueError: it has fewer episodes or other features than given, or another origin.
             OSError: `root` cannot be made, or another process writes to it (FolderInUseError).
         """
-        root = Path(root)
-        check_path(root)
-        self.features = features
-        self._flush_interval_s, self._max_pending = flush_interval_s, max_pending_bytes
-        if resume is not None and not (root / INFO_PATH).is_file():
+        self.root, self.features = Path(root), features
+        check_path(self.root)
+        if resume is not None and not (self.root / INFO_PATH).is_file():
             raise FileNotFoundError(f"no LeRobotDataset to resume in {root}")
+        self._flush_interval_s, self._max_pending = flush_interval_s, max_pending_bytes
         with ExitStack() as on_failure:
-            self._lock = on_failure.enter_context(FolderLock(root))
+            self._lock = on_failure.enter_context(FolderLock(self.root))
             if resume is None:
-                self._create(repo_id, root, fps, robot_type, origin)
+                self._meta = create_dataset(repo_id, self.root, fps, features, origin)
+                stats = DatasetStats(self._meta.features)
             else:
-                self._resume(repo_id, root, resume, origin, may_differ)
-            self._start()
+                stats = self._resume(repo_id, resume, origin, may_differ)
             on_failure.pop_all()
-
-    @property
-    def root(self) -> Path:
-        """The dataset's folder."""
-        return self._meta.root
+        meta = self._meta
+        self._dataset = GrowingDataset(meta, stats, VideoFile)
+        tasks = [] if meta.episodes is None else meta.episodes["tasks"]
+        self.episodes_before: Counter[str] = Counter(chain.from_iterable(tasks))
+        """Episodes of each task that were there when writing began."""
+        self._max_frames = int(MAX_FILE_DURATION_S * meta.fps)
+        self._canvas: dict[str, np.ndarray] = {}
+        self._oldest = 0.0
+        self._failure: BaseException | None = None
+        self._pending = 0
+        self._room = threading.Condition()
+        self._queue: queue.SimpleQueue[_Segment | _Flush | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._work, name="segment-writer", daemon=True)
+        self._thread.start()
 
     @property
     def num_episodes(self) -> int:
         """Episodes on disk, as of the last flush."""
-        return self._on_disk[0]
+        return self._dataset.on_disk[0]
 
     @property
     def num_frames(self) -> int:
         """Frames on disk, as of the last flush."""
-        return self._on_disk[1]
+        return self._dataset.on_disk[1]
 
     def add_segment(
         self,
@@ -248,47 +253,20 @@ class SegmentWriter:
         """Finalize, also after an exception: what was recorded until then stays."""
         self.finalize()
 
-    def _create(self, repo_id: str, root: Path, fps: int, robot_type: str, origin: Origin | None) -> None:
-        has_video = any(feature["dtype"] == "video" for feature in self.features.values())
-        features = self.features if origin is None else marked(self.features, origin)
-        self._meta = LeRobotDatasetMetadata.create(
-            repo_id, fps, features, robot_type=robot_type, root=root, use_videos=has_video
-        )
-        if origin is not None:
-            write_origin(root, origin)
-        self._stats = DatasetStats(self._meta.features)
-
     def _resume(
-        self, repo_id: str, root: Path, num_episodes: int, origin: Origin | None, may_differ: tuple[str, ...]
-    ) -> None:
-        what = f"the dataset in {root}"
-        self._meta = open_metadata(repo_id, root)
+        self, repo_id: str, num_episodes: int, origin: Origin | None, may_differ: tuple[str, ...]
+    ) -> DatasetStats:
+        """Drop what is not kept of the dataset; returns the statistics of what is."""
+        what = f"the dataset in {self.root}"
+        meta = self._meta = open_metadata(repo_id, self.root)
         if origin is not None:
-            there = read_origin(root, self._meta.features, what)
+            there = read_origin(self.root, meta.features, what)
             check_same(there, origin, what, may_differ)
-        _check_features(self._meta.features, self.features, what)
-        self._stats = truncate(self._meta, self._meta.total_episodes if num_episodes < 0 else num_episodes)
+        _check_features(meta.features, self.features, what)
+        stats = truncate(meta, meta.total_episodes if num_episodes < 0 else num_episodes)
         if origin is not None:
-            write_origin(root, with_changes(there, origin, self._meta.total_episodes))
-
-    def _start(self) -> None:
-        meta = self._meta
-        self._tasks: dict[str, int] = {} if meta.tasks is None else dict(meta.tasks["task_index"])
-        self._max_shard_frames = int(MAX_FILE_DURATION_S * meta.fps)
-        self._shard: Shard | None = None
-        self._canvas: dict[str, np.ndarray] = {}
-        self._oldest = 0.0
-        self._on_disk = meta.info.total_episodes, meta.info.total_frames
-        tasks = [] if meta.episodes is None else meta.episodes["tasks"]
-        self.episodes_before: Counter[str] = Counter(chain.from_iterable(tasks))
-        """Episodes of each task that were there when writing began."""
-        self._next_shard = next_shard_index(meta)
-        self._failure: BaseException | None = None
-        self._pending = 0
-        self._room = threading.Condition()
-        self._queue: queue.SimpleQueue[_Segment | _Flush | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._work, name="segment-writer", daemon=True)
-        self._thread.start()
+            write_origin(self.root, with_changes(there, origin, meta.total_episodes))
+        return stats
 
     def _check_alive(self) -> None:
         self._check_failure()
@@ -303,8 +281,8 @@ class SegmentWriter:
         if set(frames) != set(self.features):
             raise ValueError(f"a segment has the columns {sorted(frames)}, not {sorted(self.features)}")
         length = len(next(iter(frames.values())))
-        if not 1 <= length <= self._max_shard_frames:
-            raise ValueError(f"a segment needs 1 to {self._max_shard_frames} frames, got {length}")
+        if not 1 <= length <= self._max_frames:
+            raise ValueError(f"a segment needs 1 to {self._max_frames} frames, got {length}")
         for key, feature in self.features.items():
             shape, dtype = frame_format(feature)
             array = frames[key]
@@ -317,7 +295,8 @@ class SegmentWriter:
                 if self._failure is None:
                     self._handle(item)
             except BaseException as failure:  # handed to the caller's thread by `_check_failure`
-                self._fail(failure)
+                self._failure = failure
+                self._dataset.abandon()
             if isinstance(item, _Flush):
                 item.done.set()
             else:
@@ -326,7 +305,7 @@ class SegmentWriter:
                     self._room.notify_all()
 
     def _next_item(self) -> _Segment | _Flush | None:
-        if self._shard is None:
+        if not self._dataset.num_unpublished:
             return self._queue.get()
         remaining = self._oldest + self._flush_interval_s - time.monotonic()
         if remaining > 0:
@@ -334,28 +313,14 @@ class SegmentWriter:
                 return self._queue.get(timeout=remaining)
         return _Flush()
 
-    def _fail(self, failure: BaseException) -> None:
-        """Give up, and what was being written with it: on a full disk others may need the room."""
-        self._failure = failure
-        shard, self._shard = self._shard, None
-        if shard is not None:
-            shard.abandon()
-        shutil.rmtree(self.root / INCOMPLETE, ignore_errors=True)
-
     def _handle(self, item: _Segment | _Flush) -> None:
         if isinstance(item, _Flush):
-            self._publish()
+            self._dataset.publish()
             return
-        length = len(next(iter(item.frames.values())))
-        if self._shard is not None and self._shard.is_full_for(length):
-            self._publish()
-        if self._shard is None:
-            self._shard = Shard(self._meta, self._next_shard, self._stats, self._open_video)
+        self._dataset.append(self._draw(item.frames), item.task, item.metadata)
+        if self._dataset.num_unpublished == 1:
             # A writer that lags would else flush after every segment, and never catch up.
             self._oldest = max(item.ended, time.monotonic() - self._flush_interval_s / 2)
-            self._next_shard += 1
-        task_index = self._tasks.setdefault(item.task, len(self._tasks))
-        self._shard.append(self._draw(item.frames), item.task, task_index, item.metadata)
         if item.written is not None:
             item.written()
 
@@ -369,16 +334,6 @@ class SegmentWriter:
                 array = array.draw(self._canvas[key])
             drawn[key] = array
         return drawn
-
-    def _publish(self) -> None:
-        if self._shard is not None:
-            self._shard.publish(self._tasks)
-            self._shard = None
-            self._on_disk = self._meta.info.total_episodes, self._meta.info.total_frames
-
-    def _open_video(self, key: str, path: Path) -> VideoFile:
-        height, width, _ = self._meta.features[key]["shape"]
-        return VideoFile(path, self._meta.fps, height, width, fast_encoder())
 
 
 def _check_features(there: Features, ours: Features, what: str) -> None:

@@ -47,10 +47,11 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from rich.console import Console
 
 from cronos_lerobot.data.file_check import check_dataset
-from cronos_lerobot.data.stream_filter import SegmentFilter, filter_streams
+from cronos_lerobot.data.stream_filter import SCHEMAS, SegmentFilter, filter_streams
 from cronos_lerobot.data.stream_statistics import make_tables, statistics
 from cronos_lerobot.data.stream_weights import Weighting, count_weights, write_progress
 from cronos_lerobot.data.streams import StreamDataset
+from cronos_lerobot.ranges import check_ranges, ranged
 from cronos_lerobot.scripts.subcommands import run_subcommand
 from cronos_lerobot.whole_files import written_whole
 
@@ -101,34 +102,29 @@ class CheckConfig:
 
 
 @dataclass
-class StatisticsConfig:
+class StatisticsConfig(CheckConfig):
     """Count successes, and what segments began after."""
 
-    dataset: SourceConfig = field(default_factory=SourceConfig)
-    """The streams."""
     output: Path | None = None
     """Write the counts to this JSON file, too."""
 
 
 @dataclass
-class FilterConfig:
+class FilterConfig(CheckConfig):
     """Write some segments as an ordinary LeRobotDataset."""
 
-    dataset: SourceConfig = field(default_factory=SourceConfig)
-    """The streams."""
     output: OutputConfig = field(default_factory=OutputConfig)
     """The dataset to write."""
     filter: SegmentFilter = field(default_factory=SegmentFilter)
     """Which segments; everything given must fit."""
-    schema: str = "demonstrations"
+    schema: str = ranged("demonstrations", choices=SCHEMAS)
     """Columns to write: `demonstrations`, so that LeRobot can merge the two; `streams` keeps all, as
     `cronos-streams` needs them."""
-    frames_after_success: int | None = None
+    frames_after_success: int | None = ranged(None, minimum=0)
     """Cut a segment this many frames after the first in which its task was complete; null keeps it whole."""
 
     def __post_init__(self) -> None:
-        if self.frames_after_success is not None and self.frames_after_success < 0:
-            raise ValueError(f"--frames_after_success must be at least 0, got {self.frames_after_success}")
+        check_ranges(self)
 
 
 @dataclass

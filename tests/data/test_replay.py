@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from lerobot.datasets import LeRobotDataset
-from lerobot.rl import ReplayBuffer
 from lerobot.rl.buffer import random_shift
 from lerobot_env_cronos import CronosVectorEnv
 from synthetic_streams import make_step
@@ -86,23 +84,6 @@ def test_dones_truncations_and_successors_are_those_that_happened(recorded):
         assert reward == earned
         np.testing.assert_array_equal(following, after, err_msg=f"stream {i}, step {t}")
         assert (done, truncated) == (False, t in (4, 14))
-
-
-def test_lerobots_own_function_takes_no_cut_for_an_end_but_knows_no_successor_there(recorded):
-    root, tape = recorded
-    dataset = LeRobotDataset("me/stream", root=root)
-    buffer = ReplayBuffer.from_lerobot_dataset(
-        dataset, device="cpu", state_keys=KEYS, image_augmentation_function=random_shift, use_drq=False
-    )
-    assert len(buffer) == STREAMS * K * SEGMENTS
-    assert not buffer.dones.any(), "no false end, so that a value is bootstrapped at every cut"
-    assert not buffer.truncateds.any(), "it stores no truncation"
-    frames = dataset.hf_dataset.with_format("numpy")[:]
-    for row in range(len(buffer)):
-        i, t = int(frames["cronos.stream_id"][row]), int(frames["cronos.step"][row])
-        following = torch.cat([buffer.next_states[key][row] for key in KEYS]).numpy()
-        own, after = tape[i, t][0], tape[i, t][3]
-        np.testing.assert_array_equal(following, own if t % K == K - 1 else after)
 
 
 def test_what_no_buffer_can_hold_is_refused(recorded):

@@ -5,7 +5,6 @@ from lerobot.configs import FeatureType
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from synthetic_segments import observation_space
 
-from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.data.schema import demonstration_features, stream_features
 
 
@@ -25,18 +24,3 @@ def test_pictures_that_cannot_be_encoded_are_refused(shape):
     pixels = gymnasium.spaces.Dict({"front": gymnasium.spaces.Box(0, 255, shape, np.uint8)})
     with pytest.raises(ValueError, match="pixels"):
         demonstration_features(gymnasium.spaces.Dict({"pixels": pixels}))
-
-
-def test_images_may_have_an_odd_size():
-    pixels = gymnasium.spaces.Dict({"front": gymnasium.spaces.Box(0, 255, (63, 64, 3), np.uint8)})
-    features = demonstration_features(gymnasium.spaces.Dict({"pixels": pixels}), video=False)
-    assert features["observation.images.front"]["shape"] == (63, 64, 3)
-    assert features["observation.images.front"]["dtype"] == "image"
-
-
-def test_observation_columns_follow_the_features():
-    space = gymnasium.vector.utils.batch_space(observation_space(), 4)
-    columns = observation_columns(space.sample())
-    features = demonstration_features(observation_space())
-    assert set(columns) == {key for key in features if key.startswith("observation.")}
-    assert all(column.shape == (4, *features[key]["shape"]) for key, column in columns.items())

@@ -126,14 +126,13 @@ def test_files_that_would_grow_too_long_are_split(source, tmp_path, monkeypatch)
 
 
 def test_mistakes_leave_nothing_behind(source, tmp_path):
-    for options, schema, named in (
-        ({"min_policy_version": 99}, "streams", "none of the 24 segments"),
-        ({"streams": [0, 99]}, "streams", "--filter.streams"),
-        ({"tasks": ["fly"]}, "streams", "--filter.tasks"),
-        ({}, "state", "--schema"),
+    for options, named in (
+        ({"min_policy_version": 99}, "none of the 24 segments"),
+        ({"streams": [0, 99]}, "--filter.streams"),
+        ({"tasks": ["fly"]}, "--filter.tasks"),
     ):
         with pytest.raises(ValueError, match=named):
-            filter_streams(source, SegmentFilter(**options), "me/none", tmp_path / "d", schema=schema)
+            filter_streams(source, SegmentFilter(**options), "me/none", tmp_path / "d")
     assert not list(tmp_path.iterdir())
     with pytest.raises(ValueError, match=r"--filter\.events"):
         SegmentFilter(events=["reset", "initial"])
@@ -191,6 +190,7 @@ def test_command(source, tmp_path, monkeypatch, capsys):
         (["check"], "--dataset.repo_id"),
         (["check", "--dataset.repo_id=me/s", "--dataset.root=nowhere"], "--dataset.root=nowhere"),
         (["filter", "--frames_after_success=-1"], "--frames_after_success"),
+        (["filter", "--schema=state"], "--schema"),
         (["filter", "--dataset.repo_id=me/s"], "--output.repo_id"),
     ],
     ids=str,

@@ -34,21 +34,14 @@ policies = {
     "smolvla": ["--policy.type=smolvla", f"--policy.vlm_model_name={folder / 'vlm'}", "--policy.num_vlm_layers=2",
                 f"--policy.chunk_size={chunk}", f"--policy.n_action_steps={chunk}",
                 "--policy.resize_imgs_with_padding=[32, 32]", "--policy.max_action_dim=7"],
-    "tokens": ["--policy.type=pocketvla"],
     "flow": ["--policy.type=pocketvla", "--policy.head=flow", f"--policy.chunk_size={chunk}",
              f"--policy.n_action_steps={chunk}"],
-    "act": ["--policy.type=act", f"--policy.chunk_size={chunk}", f"--policy.n_action_steps={chunk}",
-            "--policy.pretrained_backbone_weights=null", "--policy.dim_model=16", "--policy.n_heads=2"],
 }
 for name, flags in policies.items():
     batches.append([])
     sys.argv[1:] = [f"--output_dir={folder / name}", *common, *flags]
-    refused = None
-    try:
-        main()
-    except TypeError as error:
-        refused = str(error)
-    print("RESULT", json.dumps([name, batches[-1], refused]))
+    main()
+    print("RESULT", json.dumps([name, batches[-1]]))
 """
 
 
@@ -70,15 +63,12 @@ def results(tmp_path_factory) -> dict:
     done = run_forked(command, env=os.environ | {"PYTHONPATH": path})
     assert done.returncode == 0, done.stderr[-4000:]
     lines = [line.removeprefix("RESULT ") for line in done.stdout.splitlines() if line.startswith("RESULT ")]
-    found = {name: (batches, refused) for name, batches, refused in map(json.loads, lines)}
-    found["folder"] = folder
-    return found
+    return dict(map(json.loads, lines)) | {"folder": folder}
 
 
 @pytest.mark.parametrize("policy", ["smolvla", "flow"])
 def test_policies_with_chunks_learn_with_the_weights_worked_out_by_hand(results, policy):
-    batches, refused = results[policy]
-    assert refused is None
+    batches = results[policy]
     by_hand = np.concatenate(WEIGHTS)
     # Two batches of 13 are every frame of the stream once.
     assert sorted(index for indices, _ in batches for index in indices) == list(range(26))
@@ -86,17 +76,3 @@ def test_policies_with_chunks_learn_with_the_weights_worked_out_by_hand(results,
         expected = by_hand[indices]
         np.testing.assert_allclose(weights, expected * 13 / expected.sum(), atol=1e-4)
     assert (results["folder"] / policy / "checkpoints/last/pretrained_model/model.safetensors").is_file()
-
-
-def test_a_policy_of_single_actions_looks_one_frame_ahead(results):
-    batches, refused = results["tokens"]
-    assert refused is None
-    weights = {index: weight for indices, found in batches for index, weight in zip(indices, found, strict=True)}
-    assert len(weights) == 26
-    # It held its grasp for one step, then lost it: a small weight, then none.
-    assert weights[8] > weights[9] == 0
-
-
-def test_lerobot_refuses_policies_without_a_loss_per_sample(results):
-    _, refused = results["act"]
-    assert refused == "ACTPolicy.forward() got an unexpected keyword argument 'reduction'"
