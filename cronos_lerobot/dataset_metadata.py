@@ -117,7 +117,8 @@ def check_parquet(path: Path, root: Path) -> None:
         raise DatasetFileError(f"{relative} is damaged: {brief(error)}") from error
     # The sums are what a reader goes by; the total of the rows is only said.
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
-    values = sum(group.column(i).num_values for group in groups for i in range(group.num_columns))
+    lists = [i for i in range(metadata.num_columns) if metadata.schema.column(i).max_repetition_level]
+    values = sum(group.column(i).num_values for group in groups for i in lists)
     rows, size = sum(group.num_rows for group in groups), path.stat().st_size
     decoded = sum(group.total_byte_size for group in groups)
     if rows > size or max(values, decoded) > size * MAX_GROWTH or min(rows, values, decoded) < 0:

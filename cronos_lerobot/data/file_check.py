@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any, cast
@@ -41,11 +41,15 @@ EPISODE_COLUMNS = {
 """What the rows of `meta/episodes` have besides LeRobot's columns."""
 
 
-def check_dataset(root: Path) -> Origin:
+def check_dataset(root: Path, take: Callable[[pa.Table], object] = lambda rows: None) -> Origin:
     """Check that a dataset in a folder is ours and whole, by reading it.
 
     Every data file is read, of every mp4 all packets are counted and the first and the last frame decoded; of
     pictures in data files the first and the last.
+
+    Args:
+        root: the folder.
+        take: called with the rows of every data file, in LeRobot's order.
 
     Returns:
         Where it comes from.
@@ -69,7 +73,7 @@ def check_dataset(root: Path) -> Origin:
             f" {meta.total_episodes} and {meta.total_frames}"
         )
     for path, episodes in _by_file(rows, "data", DEFAULT_DATA_PATH):
-        _check_data(root, path, episodes["length"], meta)
+        take(_read_data(root, path, episodes["length"], meta))
     for key in meta.video_keys:
         for path, episodes in _by_file(rows, f"videos/{key}", DEFAULT_VIDEO_PATH.replace("{video_key}", key)):
             frames = round(episodes[f"videos/{key}/to_timestamp"].max() * meta.fps)
@@ -118,7 +122,7 @@ def _by_file(rows: pd.DataFrame, folder: str, template: str) -> Iterator[tuple[s
         yield template.format(chunk_index=chunk, file_index=file), group
 
 
-def _check_data(root: Path, relative: str, lengths: pd.Series, meta: LeRobotDatasetMetadata) -> None:
+def _read_data(root: Path, relative: str, lengths: pd.Series, meta: LeRobotDatasetMetadata) -> pa.Table:
     check_parquet(root / relative, root)
     promised = get_hf_features_from_features(meta.features).arrow_schema
     try:
@@ -136,6 +140,7 @@ def _check_data(root: Path, relative: str, lengths: pd.Series, meta: LeRobotData
     for key in meta.image_keys:
         for row in (0, table.num_rows - 1):
             _check_picture(table[key][row].as_py(), meta.features[key]["shape"], f"{relative}, row {row}: {key}")
+    return table
 
 
 def _check_picture(stored: Any, shape: Sequence[int], what: str) -> None:

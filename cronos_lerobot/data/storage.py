@@ -176,6 +176,7 @@ class GrowingDataset:
             with contextlib.suppress(Exception):
                 file.close()
         self._shard = None
+        self._num_episodes, self._num_frames = self.on_disk
         shutil.rmtree(self._meta.root / INCOMPLETE, ignore_errors=True)
 
     def _bookkeeping(self, length: int, task: str) -> dict[str, np.ndarray]:

@@ -1,7 +1,5 @@
 """Checks that recorded streams are whole: every step once, every annotation where it belongs."""
 
-from collections.abc import Iterable
-
 import numpy as np
 import pandas as pd
 from lerobot.utils.constants import DONE
@@ -19,10 +17,10 @@ from cronos_lerobot.data.schema import (
 )
 from cronos_lerobot.protocol.interventions import COUNTED_INTERVENTIONS, Intervention
 
-COLUMNS = (
+COLUMNS = [
     "index", "episode_index", "frame_index", STREAM_ID, STEP, SEGMENT_INDEX, SEGMENTS_SINCE_RESET, EVENT,
     STREAM_INTERVENTIONS, TOTAL_INTERVENTIONS, INTERVENED, DONE, TRUNCATED,
-)  # fmt: skip
+]  # fmt: skip
 """What a check reads of every frame."""
 SCENE_RESETS = (Intervention.INITIAL, Intervention.SCENE_RESET, Intervention.DIVERGENCE)
 """After these the whole scene is new."""
@@ -33,10 +31,8 @@ class StreamError(ValueError):
     """A recorded stream is not whole."""
 
 
-def check(
-    files: Iterable[pd.DataFrame], total_frames: int, total_episodes: int, *, is_finished: bool = True
-) -> None:
-    """Check every frame's place in its stream. One file is in memory at a time.
+class StreamCheck:
+    """Checks every frame's place in its stream, a file at a time.
 
     - LeRobot's indices count frames and episodes without a gap, and an episode is one segment of one stream.
     - The steps of each stream go from 0 up by 1, its segments too.
@@ -45,41 +41,56 @@ def check(
     - The last frame of a segment that another one follows is truncated, no other is, and none is done.
     - The task switches since the scene reset are 0 after one and rise by 1 at every other segment.
     - All streams of a finished recording end at the same step: they step together.
-
-    Args:
-        files: the columns `COLUMNS` of a whole recording, in LeRobot's order, by files of whole episodes; a
-            filtered recording has gaps.
-        total_frames: as `info.json` counts them.
-        total_episodes: the same.
-        is_finished: whether the recording was not killed and does not go on.
-
-    Raises:
-        StreamError: names the stream, the step and what is wrong there.
     """
-    num_frames, num_episodes, firsts, lasts = 0, 0, [], []
-    for frames in files:
-        _expect(frames, frames["index"] == np.arange(len(frames)) + num_frames, "index")
+
+    def __init__(self) -> None:
+        self._num_frames, self._num_episodes = 0, 0
+        self._firsts: list[pd.DataFrame] = []
+        self._lasts: list[pd.DataFrame] = []
+
+    def add(self, frames: pd.DataFrame) -> None:
+        """Take the columns `COLUMNS` of the next file, which has whole episodes.
+
+        Raises:
+            StreamError: names the stream, the step and what is wrong there.
+        """
+        _expect(frames, frames["index"] == np.arange(len(frames)) + self._num_frames, "index")
         first = frames["frame_index"] == 0
-        _expect(frames, frames["episode_index"] == first.cumsum() - 1 + num_episodes, "episode_index")
+        _expect(frames, frames["episode_index"] == first.cumsum() - 1 + self._num_episodes, "episode_index")
         _check_within(frames, first)
-        firsts.append(frames[first])
-        lasts.append(frames[first.shift(-1, fill_value=True)])
-        num_frames += len(frames)
-        num_episodes += int(first.sum())
-    for name, count, total in (("frames", num_frames, total_frames), ("episodes", num_episodes, total_episodes)):
-        if count != total:
-            raise StreamError(f"the data files hold {count} {name}, info.json counts {total}")
-    segments = pd.concat(firsts, ignore_index=True).sort_values([STREAM_ID, STEP], kind="stable")
-    ends = pd.concat(lasts, ignore_index=True).loc[segments.index].reset_index(drop=True)
-    _check_between(segments.reset_index(drop=True), ends)
-    steps = ends.groupby(STREAM_ID)[STEP].max() + 1
-    shortest, longest = steps.idxmin(), steps.idxmax()
-    # A flush writes the segments that have ended by then, of some streams one more than of others.
-    if is_finished and steps[shortest] < steps[longest]:
-        raise StreamError(
-            f"stream {shortest} ends after {steps[shortest]} steps, stream {longest} after {steps[longest]}: the"
-            " recording broke off, goes on or was filtered"
-        )
+        self._firsts.append(frames[first])
+        self._lasts.append(frames[first.shift(-1, fill_value=True)])
+        self._num_frames += len(frames)
+        self._num_episodes += int(first.sum())
+
+    def finish(self, total_frames: int, total_episodes: int, *, is_finished: bool = True) -> None:
+        """Check what only the whole recording tells; a filtered one has gaps.
+
+        Args:
+            total_frames: as `info.json` counts them.
+            total_episodes: the same.
+            is_finished: whether the recording was not killed and does not go on.
+
+        Raises:
+            StreamError: names the stream, the step and what is wrong there.
+        """
+        for name, count, total in (
+            ("frames", self._num_frames, total_frames),
+            ("episodes", self._num_episodes, total_episodes),
+        ):
+            if count != total:
+                raise StreamError(f"the data files hold {count} {name}, info.json counts {total}")
+        segments = pd.concat(self._firsts, ignore_index=True).sort_values([STREAM_ID, STEP], kind="stable")
+        ends = pd.concat(self._lasts, ignore_index=True).loc[segments.index].reset_index(drop=True)
+        _check_between(segments.reset_index(drop=True), ends)
+        steps = ends.groupby(STREAM_ID)[STEP].max() + 1
+        shortest, longest = steps.idxmin(), steps.idxmax()
+        # A flush writes the segments that have ended by then, of some streams one more than of others.
+        if is_finished and steps[shortest] < steps[longest]:
+            raise StreamError(
+                f"stream {shortest} ends after {steps[shortest]} steps, stream {longest} after {steps[longest]}:"
+                " the recording broke off, goes on or was filtered"
+            )
 
 
 def _check_within(frames: pd.DataFrame, first: pd.Series) -> None:

@@ -45,7 +45,7 @@ from cronos_lerobot.data.schema import (
     TRUNCATED,
 )
 from cronos_lerobot.data.stats import to_array
-from cronos_lerobot.data.stream_check import COLUMNS, check
+from cronos_lerobot.data.stream_check import COLUMNS, StreamCheck
 from cronos_lerobot.data.video import Clip, read_frames
 from cronos_lerobot.dataset_metadata import (
     brief,
@@ -334,8 +334,10 @@ class StreamDataset:
         Raises:
             StreamError: a step is missing or there twice, or an annotation is wrong.
         """
-        frames = self.annotations(COLUMNS)
-        check(frames, self.meta.total_frames, self.meta.total_episodes, is_finished=is_finished)
+        check = StreamCheck()
+        for frames in self.annotations(COLUMNS):
+            check.add(frames)
+        check.finish(self.meta.total_frames, self.meta.total_episodes, is_finished=is_finished)
 
 
 def _reset(segment: Segment) -> tuple[int, int]:

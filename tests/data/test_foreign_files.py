@@ -81,7 +81,7 @@ def test_a_small_file_of_very_many_numbers_is_not_read(root, in_one_row):
     pq.write_table(pa.table({"index": column}), path)
     assert path.stat().st_size < 100_000
     for read in (check_dataset, lambda root: StreamDataset("me/stream", root, streaming=True).check()):
-        with pytest.raises(DatasetFileError, match=r"file-000\.parquet has \d+ rows, 10000000 values"):
+        with pytest.raises(DatasetFileError, match=r"file-000\.parquet has \d+ rows, \d+ values"):
             read(root)
 
 

@@ -211,6 +211,10 @@ def test_a_full_disk_leaves_nothing_of_the_flush_that_failed(tmp_path, segments,
     writer.add_segment(*segments[2], episode_metadata={"number": 2})
     with pytest.raises(RecordingError, match="No space left"):
         writer.flush()
+    # Also when the next flush is long due.
+    writer._flush_interval_s = 0.0
+    with pytest.raises(RecordingError, match="No space left"):
+        writer.finalize()
     assert {path for path in (tmp_path / "d").rglob("*") if path.is_file()} == before
     monkeypatch.undo()
     assert_holds(tmp_path / "d", segments[:2])
