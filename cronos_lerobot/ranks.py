@@ -24,14 +24,17 @@ BUCKET_BYTES = 64 * 2**20
 
 
 class Ranks:
-    """One process: what it shares with the others is its own."""
+    """The processes of a run, which run in step: all but `share_of` and `own...` waits until all have called it.
 
-    rank = 0
-    """Number of this process, from 0."""
-    count = 1
-    """Processes of the run, on all nodes."""
-    local_count = 1
-    """Processes of the run on this node."""
+    Args:
+        rank: of this one, from 0.
+        count: of all, on all nodes.
+        local_count: of those on this node.
+    """
+
+    def __init__(self, rank: int = 0, count: int = 1, local_count: int = 1) -> None:
+        self.rank, self.count, self.local_count = rank, count, local_count
+        self._control = dist.new_group(backend="gloo", timeout=TIMEOUT) if count > 1 else None
 
     @property
     def is_main(self) -> bool:
@@ -45,10 +48,7 @@ class Ranks:
             ValueError: they cannot be shared out evenly.
         """
         if num_envs % self.count:
-            raise ValueError(
-                f"num_envs is the number of streams of all processes together: {num_envs} cannot be shared out "
-                f"evenly over {self.count} processes; take a multiple of {self.count}."
-            )
+            raise ValueError(f"--num_envs={num_envs}, of all processes, must be a multiple of {self.count}.")
         size = num_envs // self.count
         return slice(self.rank * size, (self.rank + 1) * size)
 
@@ -65,92 +65,43 @@ class Ranks:
 
     def concatenate(self, array: np.ndarray, axis: int = 0) -> np.ndarray:
         """All processes' arrays, of one shape and type, joined along `axis` in the order of the ranks."""
-        return array
-
-    def collect(self, array: np.ndarray) -> np.ndarray:
-        """All processes' arrays, joined along axis 0, in the first process; its own in every other."""
-        return array
-
-    def gather(self, value: Any) -> list[Any]:
-        """All processes' values, in the order of the ranks."""
-        return [value]
-
-    def gather_to_main(self, value: Any) -> list[Any]:
-        """All processes' values, in the order of the ranks, in the first process; its own in every other."""
-        return [value]
-
-    def broadcast(self, value: Any, source: int = 0) -> Any:
-        """The value of process `source`."""
-        return value
-
-    def average_gradients(self, parameters: Sequence[Tensor]) -> None:
-        """Replace every gradient by its mean over the processes."""
-
-    def copy_from_main(self, tensors: Iterable[Tensor]) -> None:
-        """Overwrite `tensors` by those of the first process."""
-        self.copy_from(0, tensors)
-
-    def copy_from(self, source: int, tensors: Iterable[Tensor]) -> None:
-        """Overwrite `tensors` by those of process `source`."""
-
-    def check_alike(self, state: dict[str, Any]) -> None:
-        """Check that `state` is the same in all processes.
-
-        Raises:
-            RuntimeError: it is not; a run that went on would be neither one run nor several.
-        """
-
-    def leave(self) -> None:
-        """Part from the other processes."""
-
-
-class LaunchedRanks(Ranks):
-    """Processes that run in step: every method but `share_of` and `own` waits until all have called it.
-
-    Args:
-        rank: of this one.
-        count: of all.
-        local_count: of those on this node.
-    """
-
-    def __init__(self, rank: int, count: int, local_count: int) -> None:
-        self.rank, self.count, self.local_count = rank, count, local_count
-        self._control = dist.new_group(backend="gloo", timeout=TIMEOUT)
-
-    def concatenate(self, array: np.ndarray, axis: int = 0) -> np.ndarray:
-        """All processes' arrays, of one shape and type, joined along `axis` in the order of the ranks."""
-        own = _to_bytes(array)
+        if self.count == 1:
+            return array
+        own = torch.from_numpy(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
         parts = [torch.empty_like(own) for _ in range(self.count)]
         dist.all_gather(parts, own, group=self._control)
-        return np.concatenate([_from_bytes(part, array) for part in parts], axis=axis)
-
-    def collect(self, array: np.ndarray) -> np.ndarray:
-        """All processes' arrays, joined along axis 0, in the first process; its own in every other."""
-        own = _to_bytes(array)
-        parts = [torch.empty_like(own) for _ in range(self.count)] if self.is_main else None
-        dist.gather(own, parts, dst=0, group=self._control)
-        return array if parts is None else np.concatenate([_from_bytes(part, array) for part in parts])
+        arrays = [part.numpy().view(array.dtype).reshape(array.shape) for part in parts]
+        return np.concatenate(arrays, axis=axis)
 
     def gather(self, value: Any) -> list[Any]:
         """All processes' values, in the order of the ranks."""
-        values: list[Any] = [None] * self.count
-        dist.all_gather_object(values, value, group=self._control)
+        values = [value] * self.count
+        if self.count > 1:
+            dist.all_gather_object(values, value, group=self._control)
         return values
 
     def gather_to_main(self, value: Any) -> list[Any]:
         """All processes' values, in the order of the ranks, in the first process; its own in every other."""
-        values: list[Any] | None = [None] * self.count if self.is_main else None
-        dist.gather_object(value, values, dst=0, group=self._control)
-        return [value] if values is None else values
+        values = [value] * self.count if self.is_main else None
+        if self.count > 1:
+            dist.gather_object(value, values, dst=0, group=self._control)
+        return values or [value]
+
+    def collect(self, array: np.ndarray) -> np.ndarray:
+        """All processes' arrays, joined along axis 0, in the first process; its own in every other."""
+        return array if self.count == 1 else np.concatenate(self.gather_to_main(array))
 
     def broadcast(self, value: Any, source: int = 0) -> Any:
         """The value of process `source`."""
         values = [value]
-        dist.broadcast_object_list(values, src=source, group=self._control)
+        if self.count > 1:
+            dist.broadcast_object_list(values, src=source, group=self._control)
         return values[0]
 
     def average_gradients(self, parameters: Sequence[Tensor]) -> None:
         """Replace every gradient by its mean over the processes; one that a process has not counts as 0."""
+        if self.count == 1:
+            return
         has_gradient = np.array([[parameter.grad is not None for parameter in parameters]])
         gradients = []
         for i in np.flatnonzero(self.concatenate(has_gradient).any(axis=0)):
@@ -163,8 +114,14 @@ class LaunchedRanks(Ranks):
             for gradient, part in zip(bucket, mean.split([gradient.numel() for gradient in bucket]), strict=True):
                 gradient.copy_(part.view_as(gradient))
 
+    def copy_from_main(self, tensors: Iterable[Tensor]) -> None:
+        """Overwrite `tensors` by those of the first process."""
+        self.copy_from(0, tensors)
+
     def copy_from(self, source: int, tensors: Iterable[Tensor]) -> None:
         """Overwrite `tensors` by those of process `source`."""
+        if self.count == 1:
+            return
         for tensor in tensors:
             contiguous = tensor.detach().contiguous()
             dist.broadcast(contiguous, src=source)
@@ -187,7 +144,8 @@ class LaunchedRanks(Ranks):
 
     def leave(self) -> None:
         """Part from the other processes."""
-        dist.destroy_process_group()
+        if self.count > 1:
+            dist.destroy_process_group()
 
 
 def join_ranks(device: str | None) -> Ranks:
@@ -204,7 +162,7 @@ def join_ranks(device: str | None) -> Ranks:
     if accelerator.num_processes == 1:
         return Ranks()
     local_count = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    return LaunchedRanks(accelerator.process_index, accelerator.num_processes, local_count)
+    return Ranks(accelerator.process_index, accelerator.num_processes, local_count)
 
 
 def choose_gpu(device: str | None) -> None:
@@ -212,17 +170,10 @@ def choose_gpu(device: str | None) -> None:
 
     Args:
         device: of the policy; without a number (`cuda`), as of any other, the current one stays.
-
-    Raises:
-        ValueError: there is no such GPU.
     """
     place = torch.device(device or "cpu")
-    if place.type != "cuda" or place.index is None:
-        return
-    if place.index >= (count := torch.cuda.device_count()):
-        valid = ", ".join(f"cuda:{index}" for index in range(count))
-        raise ValueError(f"--policy.device={device}: PyTorch finds no such GPU; valid ones: {valid or 'none'}.")
-    torch.cuda.set_device(place)
+    if place.type == "cuda" and place.index is not None:
+        torch.cuda.set_device(place)
 
 
 def bit_sum(tensors: Iterable[Tensor]) -> int:
@@ -230,14 +181,6 @@ def bit_sum(tensors: Iterable[Tensor]) -> int:
     as_int = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
     sums = [t.detach().contiguous().view(as_int[t.element_size()]).sum(dtype=torch.int64) for t in tensors]
     return int(torch.stack(sums).sum())
-
-
-def _to_bytes(array: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
-
-
-def _from_bytes(tensor: Tensor, template: np.ndarray) -> np.ndarray:
-    return tensor.numpy().view(template.dtype).reshape(template.shape)
 
 
 def _buckets(tensors: Iterable[Tensor]) -> Iterator[list[Tensor]]:

@@ -8,10 +8,8 @@ Example:
 import logging
 import signal
 import sys
-from collections.abc import Generator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import torch
 from httpx import HTTPError
@@ -24,11 +22,10 @@ from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.ranks import choose_gpu, join_ranks
 from cronos_lerobot.scripts.errors import WORK_ERRORS, error_line, reason, stop
 from cronos_lerobot.scripts.publish import publish_policy
-from cronos_lerobot.training.checkpoint import read_state, save_model
+from cronos_lerobot.training.checkpoint import read_state
 from cronos_lerobot.training.config import AUTO, CronosTrainConfig, check, complete
 from cronos_lerobot.training.factory import make_parts
-from cronos_lerobot.training.reading import read_config
-from cronos_lerobot.training.resume import check_resumed
+from cronos_lerobot.training.reading import check_resumed, read_config
 from cronos_lerobot.training.run import Run
 from cronos_lerobot.training.run_folder import check_links, clear_unfinished, is_finished, last_checkpoint
 from cronos_lerobot.training.stopping import StopRequest, end_by
@@ -54,8 +51,7 @@ def train(config: CronosTrainConfig) -> None:
         end_by(request.number or signal.SIGTERM)
     try:
         if ranks.is_main:
-            with told_how_to_push(config):
-                push_to_hub(trainer.run)
+            push_to_hub(config)
     finally:
         ranks.leave()
 
@@ -97,9 +93,7 @@ def _prepare(config: CronosTrainConfig, stack: ExitStack) -> Trainer | None:
         logging.info(f"At its end the run is pushed to {config.policy.repo_id}.")
     parts = make_parts(config, ranks)
     stack.callback(parts.env.close)
-    trainer = Trainer(Run(config, parts), state)
-    trainer.open()
-    return trainer
+    return Trainer(Run(config, parts), state)
 
 
 def _claim(config: CronosTrainConfig) -> None:
@@ -111,38 +105,23 @@ def _claim(config: CronosTrainConfig) -> None:
         raise FileExistsError(f"{folder} exists; choose another --output_dir, or --resume=auto.")
 
 
-@contextmanager
-def told_how_to_push(config: CronosTrainConfig) -> Generator[None]:
-    """End the program with one line if the Hub refuses a run: what was trained is there, and this pushes it."""
-    assert config.policy is not None
-    assert config.output_dir is not None
-    repository = str(config.policy.repo_id)
-    try:
-        with explained(repository):
-            yield
-    except (PublishError, ValueError, OSError, HTTPError) as error:
-        command = f"cronos-publish policy --path={config.output_dir} --repo_id={repository}"
-        if config.policy.private:
-            command += " --private=true"
-        what = f"the run in {config.output_dir} is whole but could not be pushed; `{command}` pushes it"
-        if not config.save_checkpoint:
-            what = "what was trained could not be pushed, and --save_checkpoint=false kept none of it"
-        stop(f"{what}: {reason(error)}")
+def push_to_hub(config: CronosTrainConfig) -> None:
+    """Publish what was trained at `--policy.repo_id`, if that was given and pushing is on.
 
-
-def push_to_hub(run: Run) -> None:
-    """Publish what was trained at `--policy.repo_id`, if that was given and pushing is on."""
-    config = run.config
-    assert config.policy is not None
-    assert config.output_dir is not None
-    if not (config.policy.push_to_hub and config.policy.repo_id):
+    If the Hub refuses it, the program ends with one line: what was trained is there, and this pushes it.
+    """
+    policy, path = config.policy, config.output_dir
+    assert policy is not None
+    assert path is not None
+    if not (policy.push_to_hub and policy.repo_id):
         return
-    with TemporaryDirectory() as folder:
-        path = config.output_dir
-        if not config.save_checkpoint:
-            path = Path(folder)
-            save_model(run.agent, config, run.preprocessor, run.postprocessor, path)
-        publish_policy(PolicyConfig(config.policy.repo_id, path=path, private=config.policy.private))
+    try:
+        with explained(policy.repo_id):
+            publish_policy(PolicyConfig(policy.repo_id, path=path, private=policy.private))
+    except (PublishError, ValueError, OSError, HTTPError) as error:
+        private = " --private=true" if policy.private else ""
+        command = f"cronos-publish policy --path={path} --repo_id={policy.repo_id}{private}"
+        stop(f"the run in {path} is whole but could not be pushed; `{command}` pushes it: {reason(error)}")
 
 
 def main() -> None:

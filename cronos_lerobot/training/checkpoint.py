@@ -33,12 +33,10 @@ from lerobot_env_cronos import check_environment_id
 from safetensors import SafetensorError
 from torch.optim import Optimizer
 
-from cronos_lerobot.agents.base import LearningAgent
 from cronos_lerobot.agents.state import agent_state, as_it_was, to_saved
-from cronos_lerobot.agents.weights import load_weights, weights_file
+from cronos_lerobot.agents.weights import load_weights
 from cronos_lerobot.protocol.loop_state import LoopState
 from cronos_lerobot.protocol.own_state import load_own_states, own_states
-from cronos_lerobot.training.config import CronosTrainConfig
 from cronos_lerobot.training.run_folder import MANIFEST, describe_environment
 
 if TYPE_CHECKING:
@@ -101,18 +99,15 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
     """Read the state in a checkpoint, without executing anything that the file says.
 
     Raises:
-        FileNotFoundError: it is no checkpoint of a run.
-        ValueError: the file is damaged, or another version of this package or of the environment made it.
+        ValueError: the file is missing or damaged, or of another version of this package or of the environment.
     """
     path = checkpoint / TRAINING_STATE_DIR / STATE
-    if not path.is_file():
-        raise FileNotFoundError(f"{checkpoint} is no checkpoint of a run: it has no {TRAINING_STATE_DIR}/{STATE}.")
     try:
         state = as_it_was(torch.load(path, map_location="cpu", weights_only=True, mmap=True))
         found, environment = state["format"], state["environment"]
     except DAMAGE as error:
         # PyTorch's own message advises to load the file unsafely.
-        raise ValueError(f"{path} is damaged, or cronos-train did not write it.") from error
+        raise ValueError(f"{path} is missing or damaged, or cronos-train did not write it.") from error
     if found != FORMAT:
         raise ValueError(f"{path} has format {found}, this version reads {FORMAT}: begin a new run.")
     if environment is not None:
@@ -120,25 +115,21 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
     return state
 
 
-def restore(run: Run, checkpoint: Path, state: dict[str, Any]) -> dict[str, Any]:
+def restore(run: Run, state: dict[str, Any]) -> dict[str, Any]:
     """Bring `run` to where it was saved, but for what its config changes; returns the observers' states.
 
     Args:
-        run: just made.
-        checkpoint: its folder.
+        run: just made, of a config with a `checkpoint_path`.
         state: of `read_state`.
 
     Raises:
         ValueError: the weights or the state are damaged, or of another policy.
     """
-    weights = weights_file(run.agent.policy, checkpoint / PRETRAINED_MODEL_DIR)
+    checkpoint = Path(run.config.checkpoint_path or "")
     try:
-        load_weights(run.agent.policy, weights.parent)
-    except (*DAMAGE, SafetensorError) as error:
-        raise ValueError(f"{weights} is damaged, or of another policy: {error}") from error
-    try:
+        load_weights(run.agent.policy, checkpoint / PRETRAINED_MODEL_DIR)
         _restore(run, state)
-    except (RuntimeError, KeyError, TypeError, AttributeError) as error:
+    except (*DAMAGE, SafetensorError) as error:
         raise ValueError(f"{checkpoint} is damaged, or of another policy: {error}") from error
     return state["observers"]
 
@@ -148,16 +139,6 @@ def list_checkpoints(folder: Path) -> list[Path]:
     found = (p for p in folder.iterdir() if p.is_dir() and not p.is_symlink() and p.name.isdigit())
     # By the number: a run that was made longer than a million steps has names of other lengths.
     return sorted(found, key=lambda p: int(p.name))
-
-
-def save_model(
-    agent: LearningAgent, config: CronosTrainConfig, preprocessor: Any, postprocessor: Any, folder: Path
-) -> None:
-    """Write what LeRobot loads of a run into `folder`, and the config that it was trained with."""
-    agent.save_pretrained(folder)
-    config.save_pretrained(folder)
-    preprocessor.save_pretrained(folder)
-    postprocessor.save_pretrained(folder)
 
 
 def point_last_at(checkpoint: Path) -> None:
@@ -192,7 +173,8 @@ def _collect(run: Run, observers: dict[str, Any], env_state: dict[str, np.ndarra
 
 
 def _write(run: Run, state: dict[str, Any], folder: Path) -> None:
-    save_model(run.agent, run.config, run.preprocessor, run.postprocessor, folder / PRETRAINED_MODEL_DIR)
+    for part in (run.agent, run.config, run.preprocessor, run.postprocessor):
+        part.save_pretrained(folder / PRETRAINED_MODEL_DIR)
     path = folder / TRAINING_STATE_DIR / STATE
     path.parent.mkdir()
     try:
@@ -208,7 +190,6 @@ def _write(run: Run, state: dict[str, Any], folder: Path) -> None:
 
 
 def _restore(run: Run, state: dict[str, Any]) -> None:
-    is_elsewhere = _changes_device(state, run)
     if run.agent.optimizer is not None:
         _load_optimizer(run.agent.optimizer, state["optimizer"])
     run.loop.__dict__.update(vars(LoopState.from_state_dict(state["loop"])))
@@ -216,12 +197,29 @@ def _restore(run: Run, state: dict[str, Any]) -> None:
     run.env.set_state(state["env"])
     run.agent.load_state_dict(state["agent"])
     load_own_states(run.strategies, state["strategies"])
-    rank = run.ranks.rank
-    if rank < len(state["rng"]) and not is_elsewhere:
+    rank, count = run.ranks.rank, len(state["rng"])
+    if count != run.ranks.count:
+        logging.warning(
+            f"The checkpoint is of {count} processes, this run has {run.ranks.count}: its random numbers are "
+            "others, and an optimizer step takes the minibatches of as many processes."
+        )
+    if rank < count and not _changes_device(run, state["config"]["policy"].get("device")):
         deserialize_rng_state(state["rng"][rank])
     else:
         # Those of the first process, or of the run's beginning, would be drawn twice.
         set_seed(int(np.random.SeedSequence((run.config.seed, rank, run.loop.n)).generate_state(1)[0]))
+
+
+def _changes_device(run: Run, was: str | None) -> bool:
+    """Whether the policy was on another kind of device, which is told."""
+    now = getattr(run.config.policy, "device", None)
+    if not (was and now) or torch.device(was).type == torch.device(now).type:
+        return False
+    logging.warning(
+        f"This run began on {was} and resumes on {now}, with other random numbers and another rounding: it will "
+        "not be what it would have been there."
+    )
+    return True
 
 
 def _states(optimizer: Optimizer | dict[str, Optimizer]) -> dict[str, Any]:
@@ -244,25 +242,6 @@ def _load_optimizer(optimizer: Optimizer | dict[str, Optimizer], state: dict[str
 def _merge(states: list[dict[str, Any]]) -> dict[str, Any]:
     """Join the generators of all processes; those they have in common are alike."""
     return {kind: {name: s for state in states for name, s in state[kind].items()} for kind in ("numpy", "torch")}
-
-
-def _changes_device(state: dict[str, Any], run: Run) -> bool:
-    """Whether the policy was on another kind of device; says that, and what other processes mean."""
-    was, now = state["config"]["policy"].get("device"), getattr(run.config.policy, "device", None)
-    is_elsewhere = bool(was and now) and torch.device(was).type != torch.device(now).type
-    if not run.ranks.is_main:
-        return is_elsewhere
-    if is_elsewhere:
-        logging.warning(
-            f"This run began on {was} and resumes on {now}, with other random numbers and another rounding: it "
-            "will not be what it would have been there."
-        )
-    if (count := state["num_processes"]) != run.ranks.count:
-        logging.warning(
-            f"The checkpoint is of {count} processes, this run has {run.ranks.count}: its random numbers are "
-            "others, and an optimizer step takes the minibatches of as many processes."
-        )
-    return is_elsewhere
 
 
 def _remove_partial(folder: Path) -> None:

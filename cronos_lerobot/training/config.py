@@ -19,20 +19,71 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, PRETRAINED_MODEL_DIR
 from lerobot_env_cronos import Benchmark, CronosEnvConfig, load_benchmark
 from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
 from lerobot_env_cronos.config import is_of_this_package
+from lerobot_env_cronos.scene.scenes import CONTROL_HZ
 
 from cronos_lerobot.agents import builtin  # noqa: F401  (registers the agents)
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.registry import AGENTS
+from cronos_lerobot.data.video import MAX_FILE_DURATION_S, check_video_size
+from cronos_lerobot.data.writer import FLUSH_INTERVAL_S
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.resets import EXTRA_RESETS
 from cronos_lerobot.protocol.task_orders import TASK_ORDERS
 from cronos_lerobot.ranges import check_ranges, limits, ranged
-from cronos_lerobot.training.record_config import RecordConfig
 
 EVALUATION_ONLY = ("task", "suite", "split", "advance", "end_effector_reset")
 """Fields of the environment that only evaluations read."""
 AUTO = "auto"
 """Value of `resume` that begins a run, or continues it, or does nothing."""
+
+
+@dataclass
+class RecordConfig:
+    """Record training streams as a LeRobotDataset."""
+
+    repo_id: str | None = None
+    """Name of the dataset, user/name; null records nothing."""
+    root: Path | None = None
+    """Folder of the dataset; <output_dir>/streams by default."""
+    streams: str = "1"
+    """How many of the streams to record, the first N: a number or `all`."""
+    filmed_streams: int = ranged(0, minimum=0)
+    """Record the first N streams once more, with pictures of env.render_size (480 x 640) instead of the
+    observation's: a dataset of its own, repo_id and root with _640x480 at the end."""
+    flush_interval_s: float = ranged(FLUSH_INTERVAL_S, above=0)
+    """The longest that a finished segment waits to be written [s]; a killed run loses what waits."""
+
+    def count(self, num_envs: int) -> int:
+        """Recorded streams of `num_envs`.
+
+        Raises:
+            ValueError: `streams` is neither `all` nor a number from 1 to `num_envs`.
+        """
+        number = str(num_envs) if self.streams == "all" else str(self.streams)
+        if not (number.isdigit() and 1 <= int(number) <= num_envs):
+            raise ValueError(f"--record.streams must be `all` or 1 to {num_envs}, got {self.streams!r}.")
+        return int(number)
+
+    def check(self, num_envs: int, env: CronosEnvConfig, segment_length: int) -> None:
+        """Find at the start what the writer would stumble over after hours.
+
+        Raises:
+            ValueError: `num_envs` are fewer streams than asked for, or a video cannot hold a picture of `env` or
+                `segment_length` control steps.
+        """
+        if self.repo_id is None:
+            return
+        self.count(num_envs)
+        if segment_length > (longest := int(MAX_FILE_DURATION_S * CONTROL_HZ)):
+            raise ValueError(
+                f"--protocol.task_switch_interval must be <= {longest} to be recorded (a video of "
+                f"{MAX_FILE_DURATION_S:.0f} s), got {segment_length}."
+            )
+        if env.obs_type == "pixels_agent_pos":
+            size = (env.observation_height, env.observation_width)
+            check_video_size("--env.observation_height and --env.observation_width", size)
+        if self.filmed_streams:
+            check_video_size("--env.render_size", env.render_size)
 
 
 @dataclass
@@ -202,6 +253,8 @@ def check(config: CronosTrainConfig) -> None:
         raise ValueError(f"--eval.repetitions={options.repetitions} are all alike at --eval.temperature=0.")
     if policy.use_amp:
         raise ValueError("--policy.use_amp=true: cronos-train learns in the policy's own precision; give false.")
+    if policy.push_to_hub and policy.repo_id and not config.save_checkpoint:
+        raise ValueError(f"--save_checkpoint=false keeps nothing to push to --policy.repo_id={policy.repo_id}.")
     TASK_ORDERS.check(config.protocol.task_order)
     for name in config.protocol.extra_resets:
         EXTRA_RESETS.check(name)
@@ -209,27 +262,14 @@ def check(config: CronosTrainConfig) -> None:
     config.algorithm.check_reward(config.protocol.reward)
     if not config.checkpoint_path:
         config.algorithm.check_start()
-    check_configurations(config, load_benchmark(env.benchmark, env.scene), str(env.benchmark or env.scene))
+    _check_configurations(config, load_benchmark(env.benchmark, env.scene))
     config.record.check(config.num_envs, env, config.protocol.task_switch_interval)
 
 
-def check_configurations(config: CronosTrainConfig, benchmark: Benchmark, name: str) -> None:
-    """Check that a benchmark has as many configurations as scene resets and evaluations ask for.
-
-    Args:
-        config: of the run.
-        benchmark: whose configurations they are.
-        name: of the benchmark or scene, for the error.
-
-    Raises:
-        ValueError: it has fewer.
-    """
-    wanted = {"protocol.num_configurations": ("train", config.protocol.num_configurations)}
+def _check_configurations(config: CronosTrainConfig, benchmark: Benchmark) -> None:
+    wanted = [("protocol.num_configurations", "train", config.protocol.num_configurations)]
     if config.evaluates:
-        wanted["eval.n_episodes"] = (config.eval.split, config.eval.n_episodes)
-    for flag, (split, count) in wanted.items():
-        available = len(benchmark.configurations[split])
-        if count > available:
-            raise ValueError(
-                f"--{flag} must be <= {available}, the {split} configurations of {name}, got {count}."
-            )
+        wanted.append(("eval.n_episodes", config.eval.split, config.eval.n_episodes))
+    for flag, split, count in wanted:
+        if count > (available := len(benchmark.configurations[split])):
+            raise ValueError(f"--{flag} must be <= {available}, the {split} configurations, got {count}.")

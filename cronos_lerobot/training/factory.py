@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import logging
-from contextlib import suppress
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from httpx import HTTPError
-from huggingface_hub import hf_hub_download
 from lerobot.configs import FeatureType, PreTrainedConfig
-from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.random_utils import deserialize_rng_state, serialize_rng_state, set_seed
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
@@ -57,11 +54,8 @@ def make_parts(config: CronosTrainConfig, ranks: Ranks) -> Parts:
     env = make_env(config, num_envs, ranks.local_count)
     if config.algorithm.type == "imitation" and not samples(policy):
         check_decision(policy, preprocessor, postprocessor, env)
-
-    def make_own_eval_env(count: int) -> CronosVectorEnv:
-        return make_eval_env(config, count, ranks.local_count)
-
-    return Parts(env, make_own_eval_env, policy, preprocessor, postprocessor, ranks)
+    own_eval_env = partial(make_eval_env, config, local_processes=ranks.local_count)
+    return Parts(env, own_eval_env, policy, preprocessor, postprocessor, ranks)
 
 
 def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1) -> CronosVectorEnv:
@@ -69,27 +63,25 @@ def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1)
 
     `local_processes` of this node share its cores, unless the config says how many threads each takes.
     """
-    env_config = _cronos(config)
-    options = _env_options(env_config, local_processes)
-    return env_config.create_streams(num_envs, reward=config.protocol.reward, **options)
+    options = _env_options(config, local_processes)
+    return _cronos(config).create_streams(num_envs, reward=config.protocol.reward, **options)
 
 
 def make_eval_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1) -> CronosVectorEnv:
     """Return `num_envs` environments of the config's scene for the periodic evaluation; see `make_env`."""
-    env_config = _cronos(config)
-    return CronosVectorEnv(num_envs, env_config.scene, **_env_options(env_config, local_processes))
+    return CronosVectorEnv(num_envs, _cronos(config).scene, **_env_options(config, local_processes))
+
+
+def _env_options(config: CronosTrainConfig, local_processes: int) -> dict[str, Any]:
+    options = _cronos(config).gym_kwargs
+    if options["num_threads"] == 0 and local_processes > 1:
+        options["num_threads"] = max(1, num_cores() // local_processes)
+    return options
 
 
 def _cronos(config: CronosTrainConfig) -> CronosEnvConfig:
     assert isinstance(config.env, CronosEnvConfig)
     return config.env
-
-
-def _env_options(env_config: CronosEnvConfig, local_processes: int) -> dict[str, Any]:
-    options = env_config.gym_kwargs
-    if options["num_threads"] == 0 and local_processes > 1:
-        options["num_threads"] = max(1, num_cores() // local_processes)
-    return options
 
 
 def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any]:
@@ -173,29 +165,12 @@ def _warn(policy: PreTrainedConfig, config: CronosTrainConfig) -> None:
     env, path = _cronos(config), config.weights_path
     warn_of_inputs(policy, env)
     if path is None:
-        if not getattr(policy, "checkpoint", None):
-            logging.warning(
-                "Training a policy from scratch: its states are not normalised, its success starts at 0."
-            )
         return
     if (Path(path) / STEERING).is_file():
         logging.warning(f"The run begins without the actor ({STEERING}) in {path}, which steers the policy there.")
-    warn_of_other_scene(policy, env.scene)
-
-
-def warn_of_other_scene(policy: PreTrainedConfig, scene: str) -> None:
-    """Say so if a checkpoint, a folder or of the Hub, was trained in another scene: its sizes may be the same."""
-    folder, trained = Path(str(policy.pretrained_path)), scene
-    # What is damaged, or not there, keeps no run from beginning.
-    with suppress(ValueError, OSError, HTTPError):
-        if not folder.is_dir():
-            revision = policy.pretrained_revision
-            folder = Path(hf_hub_download(str(folder), TRAIN_CONFIG_NAME, revision=revision)).parent
-        trained = trained_scene(folder).get("scene", scene)
-    if trained != scene:
-        logging.warning(
-            f"{policy.pretrained_path} was trained in --env.scene={trained}: it does not know {scene}."
-        )
+    if (trained := trained_scene(Path(path)).get("scene", env.scene)) != env.scene:
+        # Its sizes may be the same.
+        logging.warning(f"{path} was trained in --env.scene={trained}: it does not know {env.scene}.")
 
 
 def check_demonstrations(algorithm: Any, scene: str) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lerobot.utils.utils import flatten_dict
 from tqdm import tqdm
 
 from cronos_lerobot.protocol.loop_state import LoopState
@@ -63,16 +64,16 @@ class RunLogger:
     Args:
         config: of the run; `output_dir` is set.
         loop: of the run, read for the counters.
-        offset: of `state_dict()` when resuming.
+        state: of `state_dict()` when resuming.
     """
 
-    def __init__(self, config: CronosTrainConfig, loop: LoopState, offset: int | None = None) -> None:
-        assert config.output_dir is not None
+    def __init__(self, config: CronosTrainConfig, loop: LoopState, state: dict[str, Any] | None = None) -> None:
         self.config = config
         self.loop = loop
-        self.metrics = MetricsFile(Path(config.output_dir) / METRICS, offset)
-        self._tensorboard = self._open_tensorboard(Path(config.output_dir)) if config.tensorboard else None
-        self._wandb = self._open_wandb() if config.wandb.enable else None
+        output_dir = Path(config.output_dir or "")
+        self.metrics = MetricsFile(output_dir / METRICS, (state or {}).get("offset"))
+        self._tensorboard = self._open_tensorboard(output_dir) if config.tensorboard else None
+        self._wandb = self._open_wandb(output_dir) if config.wandb.enable else None
         self._bar = tqdm(
             total=config.total_steps, initial=loop.n, unit="step", unit_scale=True, disable=None, mininterval=1.0
         )
@@ -146,11 +147,11 @@ class RunLogger:
         purge_step = self.loop.n + 1 if self.loop.n else None
         return SummaryWriter(str(output_dir / TENSORBOARD), purge_step=purge_step)
 
-    def _open_wandb(self) -> Any:
+    def _open_wandb(self, output_dir: Path) -> Any:
         from lerobot.common.wandb_utils import WandBLogger
 
         config = copy(self.config)
-        has_folder = (Path(config.output_dir or "") / "wandb").is_dir()
+        has_folder = (output_dir / "wandb").is_dir()
         # A run that was not logged there before has nothing to resume there.
         config.resume = config.checkpoint_path is not None and (has_folder or config.wandb.run_id is not None)
         return WandBLogger(config)  # ty: ignore[invalid-argument-type]
@@ -178,15 +179,12 @@ def _jsonable(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def _scalars(values: dict[str, Any], prefix: str = "") -> dict[str, float]:
-    """Flatten nested records to the finite numbers in them; a Count becomes its rate."""
-    scalars: dict[str, float] = {}
-    for name, value in values.items():
-        key = f"{prefix}{name}"
-        if isinstance(value, dict):
-            scalars |= _scalars(value, f"{key}/")
-        elif isinstance(value, Count):
-            scalars |= _scalars({name: value.rate}, prefix)
-        elif isinstance(value, int | float | np.number) and np.isfinite(value):
-            scalars[key] = float(value)
-    return scalars
+def _scalars(values: dict[str, Any]) -> dict[str, float]:
+    """The finite numbers in nested records by their paths; a Count becomes its rate."""
+    flat = flatten_dict(values)
+    numbers = {name: value.rate if isinstance(value, Count) else value for name, value in flat.items()}
+    return {
+        name: float(value)
+        for name, value in numbers.items()
+        if isinstance(value, int | float | np.number) and np.isfinite(value)
+    }

@@ -1,8 +1,7 @@
-"""The config of a run from flags and files."""
+"""The config of a run from flags and files, and what of it may not change when the run resumes."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,14 +9,25 @@ from typing import Any
 from lerobot.configs import parser
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+from lerobot.utils.utils import flatten_dict
 
 from cronos_lerobot.command_line import parse_command_line
 from cronos_lerobot.evaluation.policy_source import PINNED, follow_last, load_policy_config, pin_policy
 from cronos_lerobot.training.config import AUTO, CronosTrainConfig
-from cronos_lerobot.training.run_folder import last_checkpoint
+from cronos_lerobot.training.run_folder import describe_environment, last_checkpoint
 
-CHOICES = ("env", "policy", "algorithm")
-"""Fields whose `type` says which config they are."""
+FIXED = (
+    "seed", "num_envs", "peft", "rename_map", "env", "policy", "record.repo_id", "record.root", "record.streams",
+    "record.filmed_streams", "protocol.task_switch_interval", "protocol.learned_reset", "protocol.reward",
+    "algorithm.type", "algorithm.kl_base_coef", "algorithm.temperature", "algorithm.noise_std",
+    "algorithm.noise_level", "algorithm.noise_steps", "algorithm.critic_observation",
+)  # fmt: skip
+"""What a resumed run keeps: flags, or groups of them. Every other flag is followed."""
+FREE = (
+    "env.num_threads", "policy.device", "policy.pretrained_path", "policy.push_to_hub", "policy.repo_id",
+    "policy.private", "policy.tags", "policy.license",
+)  # fmt: skip
+"""Flags of those groups that may change: where a run computes, and where it is pushed to."""
 
 
 def load(path: str | Path, flags: Sequence[str] = ()) -> CronosTrainConfig:
@@ -47,7 +57,7 @@ def read_config(arguments: Sequence[str]) -> CronosTrainConfig:
     arguments = list(arguments)
     resume = (parser.parse_arg("resume", arguments) or "").lower()
     if resume in ("true", AUTO) and (checkpoint := _find_checkpoint(resume, arguments)):
-        return _resumed(checkpoint, arguments, resume)
+        return _resumed(checkpoint, arguments)
     file = parser.parse_arg("config_path", arguments)
     if file is None:
         config = parse_command_line(CronosTrainConfig, arguments, {"algorithm": "ppo"})
@@ -95,21 +105,23 @@ def _find_checkpoint(resume: str, arguments: list[str]) -> Path | None:
     return found
 
 
-def _resumed(checkpoint: Path, arguments: list[str], resume: str) -> CronosTrainConfig:
+def _resumed(checkpoint: Path, arguments: list[str]) -> CronosTrainConfig:
     """The config of a checkpoint's run, with the flags that override it."""
     run_folder = checkpoint.parent.parent
-    file = checkpoint / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME
     output_dir = parser.parse_arg("output_dir", arguments)
     if output_dir is not None and Path(output_dir).resolve() != run_folder.resolve():
         raise ValueError(
             f"--output_dir={output_dir}, but the run that is resumed is {run_folder}, and stays there."
         )
-    saved = _read_saved(file)
-    for name in CHOICES:
-        given, own = parser.get_type_arg(name, arguments), saved[name]["type"]
-        if given not in (None, own):
-            raise ValueError(f"--{name}.type={given}, but the run that is resumed has {own} and keeps it.")
-    config = load(file, _without_policy_path(arguments, saved["policy"].get("pretrained_path"), resume))
+    path = parser.parse_arg("policy.path", arguments)
+    for flag in ("policy.path", f"policy.{PINNED}"):
+        arguments = parser.filter_arg(flag, arguments)
+    config = load(checkpoint / PRETRAINED_MODEL_DIR, arguments)
+    began_with = None if config.policy is None else config.policy.pretrained_path
+    if path is not None and follow_last(Path(path.partition("@")[0])) != Path(began_with or ""):
+        raise ValueError(
+            f"--policy.path={path}, but the run that is resumed began with {began_with} and keeps it."
+        )
     root, is_given = config.record.root, parser.parse_arg("record.root", arguments) is not None
     if root is not None and not (is_given or root.resolve().is_relative_to(run_folder.resolve())):
         raise ValueError(f"The run records to {root}, out of its folder: give --record.root={root} to allow it.")
@@ -117,29 +129,32 @@ def _resumed(checkpoint: Path, arguments: list[str], resume: str) -> CronosTrain
     return config
 
 
-def _read_saved(file: Path) -> dict[str, Any]:
-    """What a run's train_config.json says."""
-    if not file.is_file():
-        raise FileNotFoundError(f"{file.parents[1]} is no checkpoint of a run: it has no {file.name}.")
-    try:
-        saved = json.loads(file.read_text())
-        if all(saved[name]["type"] for name in CHOICES):
-            return saved
-    except (ValueError, KeyError, TypeError):
-        pass
-    raise ValueError(f"{file} is damaged, or cronos-train did not write it.")
+def check_resumed(config: CronosTrainConfig, saved: dict[str, Any]) -> None:
+    """Check that `config` changes nothing that the run of a checkpoint, `saved`, must keep.
+
+    Raises:
+        ValueError: a fixed flag or the benchmark has changed, or the run is beyond the end that is asked for.
+    """
+    given, own = (flatten_dict(tree, sep=".") for tree in (config.to_dict(), saved["config"]))
+    # What follows from other flags comes after them.
+    for name in sorted(
+        given.keys() | own.keys(), key=lambda name: ("features" in name, ".type" not in name, name)
+    ):
+        if "features" in name and not given.get(name):
+            # A config made in Python leaves them to the environment.
+            continue
+        if _is_in(name, FIXED) and not _is_in(name, FREE) and given.get(name) != own.get(name):
+            raise ValueError(
+                f"--{name}={given.get(name)}, but the run that is resumed has {own.get(name)} and keeps it: leave "
+                "the flag out, or begin a new run with this one's checkpoint as --policy.path."
+            )
+    now, was = describe_environment(config.env)["benchmark"], saved["benchmark"]
+    # The source names a release; the fingerprint says what it is.
+    if (now and now["fingerprint"]) != (was and was["fingerprint"]):
+        raise ValueError(f"the run began with the benchmark {was}, which now is {now}.")
+    if config.total_steps < (done := saved["interaction_steps"]):
+        raise ValueError(f"--steps={config.steps}, but the run has done {done} steps: give {done} or more.")
 
 
-def _without_policy_path(arguments: list[str], began_with: str | None, resume: str) -> list[str]:
-    """The flags without that of the policy that the run began with, which `--resume=auto` is given again."""
-    path = parser.parse_arg("policy.path", arguments)
-    if path is None:
-        return arguments
-    name = path if not Path(path).is_dir() else str(follow_last(Path(path)))
-    if resume != AUTO or name.partition("@")[0] != str(began_with):
-        raise ValueError(
-            f"--policy.path={path}, but the run that is resumed began with {began_with} and keeps it."
-        )
-    for flag in ("policy.path", f"policy.{PINNED}"):
-        arguments = parser.filter_arg(flag, arguments)
-    return arguments
+def _is_in(flag: str, names: tuple[str, ...]) -> bool:
+    return any(flag == name or flag.startswith(f"{name}.") for name in names)

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from lerobot.envs.utils import parse_camera_names
@@ -16,7 +16,9 @@ from cronos_lerobot.data.origin import flags_of
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.writer import LateCamera, RecordingError
 from cronos_lerobot.protocol.loop_state import Step
-from cronos_lerobot.training.config import CronosTrainConfig
+
+if TYPE_CHECKING:
+    from cronos_lerobot.training.run import Run
 
 MADE_WITH = ("env", "num_envs", "seed", "protocol", "algorithm", "policy")
 """Parts of the run's config that its datasets repeat."""
@@ -53,79 +55,61 @@ class FilmedEnv:
 
 
 class StreamObserver:
-    """Records the streams of a run, or nothing at all.
+    """Records the streams of a run, in its first process, or nothing at all.
 
     When writing fails (a full disk, say) that recording ends where it was last flushed, and the run goes on.
 
     Args:
-        recorders: write the datasets, by name; the name FILM takes the filmed streams. None records nothing.
-        camera: what the filmed camera is called.
-        stopped: why recordings have ended early, by name.
+        run: whose streams they are.
+        state: of `state_dict` in the checkpoint that the run resumes from; None begins the datasets.
         report: called with the name and the reason when a recording ends early.
+
+    Raises:
+        ValueError: a recording is of another run, or shorter than the checkpoint left it.
+        OSError: it cannot be written, or another process has it.
     """
 
-    def __init__(
-        self,
-        recorders: dict[str, StreamRecorder] | None,
-        camera: str = "",
-        stopped: dict[str, str] | None = None,
-        report: Callable[[dict[str, str]], None] | None = None,
-    ) -> None:
-        self._recorders = recorders or {}
-        self._camera = camera
-        self._stopped = dict(stopped or {})
+    def __init__(self, run: Run, state: dict[str, Any] | None, report: Callable[[dict[str, str]], None]) -> None:
+        record, state = run.config.record, state or {}
+        self._recorders: dict[str, StreamRecorder] = {}
+        self._stopped = dict(state.get("stopped", {}))
         self._report = report
-        for name, reason in self._stopped.items():
-            logging.warning(f"The recording {name!r} ended before the checkpoint and is not resumed: {reason}")
-
-    @classmethod
-    def open(
-        cls,
-        config: CronosTrainConfig,
-        env: Any,
-        state: dict[str, Any] | None,
-        report: Callable[[dict[str, str]], None] | None = None,
-        describes: tuple[str, ...] = (),
-    ) -> Self:
-        """Begin the datasets of a run, or continue them from a checkpoint's `state`.
-
-        `describes` names what the agent says of its actions, see `LearningAgent`.
-        """
-        record, state = config.record, state or {}
-        if record.repo_id is None:
-            return cls(None)
-        assert config.output_dir is not None
-        root = record.root_in(Path(config.output_dir))
-        num_recorded = record.count(config.num_envs)
-        stopped = state.get("stopped", {})
-        recorders = {}
-        common: dict[str, Any] = {
-            "segment_length": config.protocol.task_switch_interval,
-            "describes": describes,
-            "flush_interval_s": record.flush_interval_s,
-            "flags": flags_of(config, only=MADE_WITH),
+        if record.repo_id is None or not run.ranks.is_main:
+            return
+        root = Path(record.root or Path(run.config.output_dir or "") / "streams")
+        datasets: dict[str, tuple[str, dict[str, Any]]] = {
+            "streams": ("", {"streams": record.count(run.config.num_envs)})
         }
-        camera = ""
-        if "streams" not in stopped:
-            recorders["streams"] = StreamRecorder.open(
-                env, record.repo_id, root, streams=num_recorded, state=state.get("streams"), **common
-            )
-        if record.filmed_streams and FILM not in stopped:
-            assert isinstance(config.env, CronosEnvConfig)
-            camera = parse_camera_names(config.env.camera_name)[0]
-            height, width = config.env.render_size
-            num_positions = env.positions(np.arange(1)).shape[1]
-            suffix = record.film_suffix(config.env.render_size)
-            recorders[FILM] = StreamRecorder.open(
-                env,
+        if record.filmed_streams:
+            datasets[FILM] = self._film(run)
+        for name, (suffix, options) in datasets.items():
+            if name in self._stopped:
+                logging.warning(
+                    f"The recording {name!r} ended before the checkpoint and is not resumed: {self._stopped[name]}"
+                )
+                continue
+            self._recorders[name] = StreamRecorder.open(
+                run.env,
                 record.repo_id + suffix,
                 root.with_name(root.name + suffix),
-                streams=record.filmed_streams,
-                cameras={camera: LateCamera(height, width, num_positions, env.render_positions)},
-                state=state.get(FILM),
-                **common,
+                segment_length=run.config.protocol.task_switch_interval,
+                describes=run.agent.describes,
+                state=state.get(name),
+                flags=flags_of(run.config, only=MADE_WITH),
+                flush_interval_s=record.flush_interval_s,
+                **options,
             )
-        return cls(recorders, camera, stopped, report)
+
+    def _film(self, run: Run) -> tuple[str, dict[str, Any]]:
+        """What the filmed dataset's name ends with, and how it is recorded."""
+        env = run.config.env
+        assert isinstance(env, CronosEnvConfig)
+        height, width = env.render_size
+        self._camera = parse_camera_names(env.camera_name)[0]
+        num_positions = run.env.positions(np.arange(1)).shape[1]
+        camera = LateCamera(height, width, num_positions, run.env.render_positions)
+        options = {"streams": run.config.record.filmed_streams, "cameras": {self._camera: camera}}
+        return f"_{width}x{height}", options
 
     def on_step(self, step: Step) -> None:
         """Record one control step of the streams."""
@@ -160,6 +144,5 @@ class StreamObserver:
             reason = f"{error}; {recorder.writer.num_episodes} segments are safe"
             self._stopped[name] = reason
             logging.warning(f"RECORDING STOPPED, the training goes on without it: {reason}")
-            if self._report is not None:
-                self._report({"recording": name, "reason": reason})
+            self._report({"recording": name, "reason": reason})
             return None

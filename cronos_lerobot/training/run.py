@@ -71,7 +71,7 @@ class Run:
         self._drawn_alike = sorted(self.generators.state_dict()["numpy"])
         # Every named generator exists before a checkpoint is loaded into them.
         self.agent = self._make_agent(policy)
-        self.env = parts.env if self.ranks.count == 1 else ShardedEnv(parts.env, self.ranks)
+        self.env: Any = parts.env if self.ranks.count == 1 else ShardedEnv(parts.env, self.ranks)
         context = RunContext(self.env, self.agent, self.task_set.tasks, config.protocol, config.total_steps)
         bind_task_order(self.task_order, context)
         self.resets.bind(context)

@@ -65,30 +65,23 @@ def clear_unfinished(folder: Path) -> None:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read the manifest of the run in `folder`; without one there are no `starts`.
+    """The manifest of the run in `folder`; without one there are no `starts`.
 
     Raises:
-        ValueError: the file is damaged.
+        ValueError: it is of something else.
     """
     path = folder / MANIFEST
     if not path.is_file():
         return {"starts": []}
-    try:
-        manifest = json.loads(path.read_text())
-        return manifest | {"starts": list(manifest["starts"])}
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+    manifest = json.loads(path.read_text())
+    if not (isinstance(manifest, dict) and isinstance(manifest.get("starts"), list)):
+        raise ValueError(f"{path} is not of a run of cronos-train.")
+    return manifest
 
 
 def note_start(config: CronosTrainConfig, num_processes: int = 1, interaction_steps: int = 0) -> None:
-    """Append a start to the manifest: a change of machine or version is then on record.
-
-    Args:
-        config: of the run.
-        num_processes: that train together.
-        interaction_steps: that the run resumes from.
-    """
-    manifest = read_manifest(Path(config.output_dir or ""))
+    """Append a start, after `interaction_steps`, to the manifest: a change of machine or version is on record."""
+    manifest, weights = read_manifest(Path(config.output_dir or "")), config.weights_path
     instructions = torch.backends.cpu.get_cpu_capability()
     start = {
         "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
@@ -106,11 +99,16 @@ def note_start(config: CronosTrainConfig, num_processes: int = 1, interaction_st
         "num_processes": num_processes,
         "renderer": os.environ.get("MUJOCO_GL"),
         "policy_device": config.policy.device if config.policy else None,
-        "policy_fingerprint": _policy_fingerprint(config),
+        # Of a folder: two machines may have made other clones of it.
+        "policy_fingerprint": files_fingerprint(Path(weights)) if weights and Path(weights).is_dir() else None,
         "config": config.to_dict(),
     } | describe_environment(config.env)
-    if manifest["starts"]:
-        _warn_of_other_instructions(manifest["starts"][-1]["machine"].get("cpu_capability"), instructions)
+    was = manifest["starts"][-1]["machine"].get("cpu_capability") if manifest["starts"] else None
+    if was not in (None, instructions):
+        logging.warning(
+            f"This run computed with {was} and resumes with {instructions}, whose last bits differ: it becomes "
+            "another run, as with another seed. docs/experiments.md has the variables that hold a command to AVX2."
+        )
     _write(config, {"starts": [*manifest["starts"], start]})
 
 
@@ -142,17 +140,3 @@ def describe_environment(env: Any) -> dict[str, Any]:
 def _write(config: CronosTrainConfig, manifest: dict[str, Any]) -> None:
     with written_whole(Path(config.output_dir or "") / MANIFEST) as file:
         file.write(json.dumps(manifest, indent=2))
-
-
-def _warn_of_other_instructions(was: str | None, now: str) -> None:
-    if was and was != now:
-        logging.warning(
-            f"This run computed with {was} and resumes with {now}, whose last bits differ: it becomes another "
-            "run, as with another seed. docs/experiments.md has the variables that hold a command to AVX2."
-        )
-
-
-def _policy_fingerprint(config: CronosTrainConfig) -> str | None:
-    """Of the policy in a folder that this start begins with: two machines may have made other clones of it."""
-    path = config.weights_path
-    return files_fingerprint(Path(path)) if path is not None and Path(path).is_dir() else None

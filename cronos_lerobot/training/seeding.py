@@ -33,7 +33,7 @@ class NamedGenerators:
         """Return the torch generator `name`."""
         if name not in self._torch:
             generator = torch.Generator(device=self.device)
-            generator.manual_seed(int(self._sequence(name).generate_state(1, np.uint64)[0] >> 1))
+            generator.manual_seed(self._torch_seed(name))
             self._torch[name] = generator
         return self._torch[name]
 
@@ -65,7 +65,10 @@ class NamedGenerators:
             if len(saved) == len(generator.get_state()):
                 generator.set_state(saved)
             else:
-                generator.manual_seed(int(self._sequence(name, step).generate_state(1, np.uint64)[0] >> 1))
+                generator.manual_seed(self._torch_seed(name, step))
+
+    def _torch_seed(self, name: str, *entropy: int) -> int:
+        return int(self._sequence(name, *entropy).generate_state(1, np.uint64)[0] >> 1)
 
     def _sequence(self, name: str, *entropy: int) -> np.random.SeedSequence:
         return np.random.SeedSequence([self.seed, zlib.crc32(name.encode()), *entropy])

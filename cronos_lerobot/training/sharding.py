@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ class ShardedEnv:
 
     Args:
         env: the streams of this process.
-        processes: that share out the streams; each has as many.
+        ranks: that share out the streams; each has as many.
 
     Attributes:
         timer: that of `env`; it is told the time spent in waiting for the others ("wait").
@@ -47,6 +48,7 @@ class ShardedEnv:
         self.benchmark = env.benchmark
         self.metadata = env.metadata
         self.single_observation_space = env.single_observation_space
+        self.observe, self.observe_under = env.observe, env.observe_under
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict]:
         """Act on the streams of this process; the reward (N,) and the info's flags (N,) are of all."""
@@ -57,14 +59,6 @@ class ShardedEnv:
         flags = {name: table[:, i] > 0 for i, name in enumerate(names, start=1)}
         own = {name: info[name] for name in ("executed_action",) if name in info}
         return observation, table[:, 0], never, never.copy(), flags | own
-
-    def observe(self) -> dict[str, Any]:
-        """The observation now, of the streams of this process."""
-        return self._env.observe()
-
-    def observe_under(self, tasks: Sequence[Any]) -> list[dict[str, Any]]:
-        """The observations under each of `tasks`, of the streams of this process."""
-        return self._env.observe_under(tasks)
 
     def find_complete(self, tasks: Sequence[Any]) -> np.ndarray:
         """Whether each of `tasks` is complete in each stream, (N, len(tasks)) bool."""
@@ -79,22 +73,15 @@ class ShardedEnv:
 
     def scene_reset(self, ids: np.ndarray, configurations: np.ndarray, split: str = "train") -> None:
         """Put every body of the streams `ids` at configurations (k,) of a split, and the arm home."""
-        own = self._own(ids)
-        if len(own):
-            configurations = np.asarray(configurations)[np.isin(ids, own)]
-            self._env.scene_reset(own - self.mine.start, configurations, split)
+        self._on_own(partial(self._env.scene_reset, split=split), ids, configurations)
 
     def place_bodies(self, ids: np.ndarray, poses: np.ndarray) -> None:
         """Put every body of the streams `ids` at `poses` (k, bodies, 7), and the arm home."""
-        own = self._own(ids)
-        if len(own):
-            self._env.place_bodies(own - self.mine.start, np.asarray(poses)[np.isin(ids, own)])
+        self._on_own(self._env.place_bodies, ids, poses)
 
     def end_effector_reset(self, ids: np.ndarray) -> None:
         """Put the arm of the streams `ids` home."""
-        own = self._own(ids)
-        if len(own):
-            self._env.end_effector_reset(own - self.mine.start)
+        self._on_own(self._env.end_effector_reset, ids)
 
     def unsuitable_bodies(self) -> np.ndarray:
         """Bodies that no task can reach any more, (N, bodies) bool."""
@@ -110,16 +97,7 @@ class ShardedEnv:
             rng.bit_generator.state = self._ranks.broadcast(rng.bit_generator.state, source=owner)
 
     def positions(self, ids: np.ndarray) -> np.ndarray:
-        """Generalised positions (k, nq) of the streams `ids`, all of this process.
-
-        Raises:
-            ValueError: one of them is another process's.
-        """
-        if len(self._own(ids)) < len(ids):
-            raise ValueError(
-                f"A process films its own streams, {self.mine.start} to {self.mine.stop - 1}, "
-                f"got {np.asarray(ids).tolist()}."
-            )
+        """Generalised positions (k, nq) of the streams `ids`, all of this process."""
         return self._env.positions(np.asarray(ids) - self.mine.start)
 
     def render_positions(self, qpos: np.ndarray) -> np.ndarray:
@@ -138,6 +116,12 @@ class ShardedEnv:
         ids = np.asarray(ids, np.int64)
         return ids[(ids >= self.mine.start) & (ids < self.mine.stop)]
 
+    def _on_own(self, act: Callable[..., None], ids: np.ndarray, *values: np.ndarray) -> None:
+        """Act on this process's streams of `ids`, with their rows of `values`."""
+        own = self._own(ids)
+        if len(own):
+            act(own - self.mine.start, *(np.asarray(value)[np.isin(ids, own)] for value in values))
+
     def _concatenate(self, array: np.ndarray) -> np.ndarray:
         with self.timer("wait"):
             return self._ranks.concatenate(array)
@@ -149,17 +133,18 @@ def whole_step(step: Step, ranks: Ranks, num_recorded: int) -> Step:
     Those are the first `num_recorded` of all N. If they are the first process's own, no observations are sent: the
     step has that process's only. Films are always its own.
     """
-    own = len(step.action.action)
-    own_arrays = {name: array for name in OWN if (array := getattr(step.action, name)) is not None}
-    action = replace(step.action, **{name: ranks.collect(array) for name, array in own_arrays.items()})
-    if num_recorded <= own:
-        return replace(step, action=action)
-    seen = {name: value for name, value in step.observation.items() if name != FILM}
-    observation = step.observation | _map_arrays(seen, ranks.collect)
-    return replace(step, observation=observation, action=action)
+    if ranks.count == 1:
+        return step
+    sent = {"action": {name: array for name in OWN if (array := getattr(step.action, name)) is not None}}
+    if num_recorded > len(step.action.action):
+        sent["observation"] = {name: value for name, value in step.observation.items() if name != FILM}
+    whole = _join(ranks.gather_to_main(sent))
+    observation = step.observation | whole.get("observation", {})
+    return replace(step, observation=observation, action=replace(step.action, **whole["action"]))
 
 
-def _map_arrays(tree: Any, convert: Callable[[np.ndarray], np.ndarray]) -> Any:
-    if isinstance(tree, dict):
-        return {name: _map_arrays(value, convert) for name, value in tree.items()}
-    return convert(tree)
+def _join(trees: list[Any]) -> Any:
+    """Concatenate the arrays of dicts of the same keys."""
+    if isinstance(trees[0], dict):
+        return {name: _join([tree[name] for tree in trees]) for name in trees[0]}
+    return np.concatenate(trees)

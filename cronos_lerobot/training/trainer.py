@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,12 +25,11 @@ class Schedule:
 
     Args:
         every: interaction steps; 0 is never.
+        last: interaction steps at the last time.
     """
 
-    def __init__(self, every: int) -> None:
-        self.every = every
-        self.last = 0
-        """Interaction steps at the last time."""
+    def __init__(self, every: int, last: int = 0) -> None:
+        self.every, self.last = every, last
 
     def due(self, n: int) -> bool:
         """Whether it is due after `n` interaction steps."""
@@ -44,49 +44,38 @@ class Trainer:
         state: of the config's checkpoint, see `read_state`; None starts the run.
 
     Raises:
-        ValueError: the checkpoint does not fit the run.
+        ValueError: the checkpoint does not fit the run, a file of the run is shorter than the checkpoint left it,
+            or a recording is of another run.
+        OSError: a file cannot be written, or another process has the recording.
     """
 
     def __init__(self, run: Run, state: dict[str, Any] | None = None) -> None:
         self.run, self.config, self.loop = run, run.config, run.loop
-        instructions = [task.instruction for task in run.task_set.all]
-        self.statistics = RolloutStatistics(instructions, len(run.task_set.tasks))
-        self._smoothed = SmoothedSuccess(self.config.protocol, len(run.task_set.tasks))
-        self._saves, self._evaluations = Schedule(self.config.save_freq), Schedule(self.config.eval_freq)
-        self._evaluated_interventions = 0
+        observers = {} if state is None else restore(run, state)
+        num_tasks = len(run.task_set.tasks)
+        self.statistics = RolloutStatistics([task.instruction for task in run.task_set.all], num_tasks)
+        if "statistics" in observers:
+            self.statistics.load_state_dict(observers["statistics"])
+        self._smoothed = SmoothedSuccess(self.config.protocol, num_tasks)
+        evaluated = observers.get("evaluated", {"steps": 0, "interventions": 0})
+        self._evaluations = Schedule(self.config.eval_freq, evaluated["steps"])
+        self._evaluated_interventions = evaluated["interventions"]
+        self._saves = Schedule(self.config.save_freq, self.loop.n)
         self._update: dict[str, Any] | None = None
         """Metrics of the latest update, until they are logged."""
-        record = self.config.record
-        self._num_recorded = record.count(self.config.num_envs) if record.repo_id is not None else 0
-        self._eval_env: Any = None
-        self._observers: dict[str, Any] = {}
-        self.logger: RunLogger | SilentLogger = SilentLogger()
-        self.recorder = StreamObserver(None)
-        if state is not None:
-            self._restore(state)
-
-    def open(self) -> None:
-        """Begin what the run writes, or continue it from the checkpoint: metrics, recordings, manifest.
-
-        Raises:
-            ValueError: a file of the run is shorter than its checkpoint left it, or a recording is of another run.
-            OSError: a file cannot be written, or another process has the recording.
-        """
-        run, states = self.run, self._observers
-        if not run.ranks.is_main:
-            return
         # First what may be refused: the logger cuts the metrics to where the checkpoint left them.
-        self.recorder = StreamObserver.open(
-            self.config, run.env, states.get("recorder"), lambda why: self.logger.log("recording", why),
-            run.agent.describes,
-        )  # fmt: skip
-        self.logger = RunLogger(self.config, self.loop, states.get("logger", {}).get("offset"))
-        if self.config.checkpoint_path is not None:
-            point_last_at(self.config.checkpoint_path)
-        note_start(self.config, run.ranks.count, self.loop.n)
+        self.recorder = StreamObserver(
+            run, observers.get("recorder"), lambda why: self.logger.log("recording", why)
+        )
+        self.logger: RunLogger | SilentLogger = SilentLogger()
+        if run.ranks.is_main:
+            self.logger = RunLogger(self.config, self.loop, observers.get("logger"))
+            if self.config.checkpoint_path is not None:
+                point_last_at(self.config.checkpoint_path)
+            note_start(self.config, run.ranks.count, self.loop.n)
 
     def train(self, stop: StopRequest | None = None) -> bool:
-        """Run to the last step or the end of the budget; call `open` before.
+        """Run to the last step or the end of the budget.
 
         Args:
             stop: once it has a signal, the run ends after the update that it is in, with a checkpoint.
@@ -121,14 +110,6 @@ class Trainer:
             self.recorder.close()
             self.logger.close()
 
-    def _restore(self, state: dict[str, Any]) -> None:
-        assert self.config.checkpoint_path is not None
-        self._observers = restore(self.run, self.config.checkpoint_path, state)
-        self._saves.last = self.loop.n
-        self._evaluations.last = self._observers["evaluated"]["steps"]
-        self._evaluated_interventions = self._observers["evaluated"]["interventions"]
-        self.statistics.load_state_dict(self._observers["statistics"])
-
     def _end_update(self, env_state: dict[str, np.ndarray], stop: StopRequest) -> bool:
         """Log an update, save and evaluate if it is time; returns whether the run was told to stop."""
         self.run.check_processes()
@@ -150,7 +131,7 @@ class Trainer:
         The evaluation comes after the checkpoint: a run that resumes from it, with more steps or a larger budget,
         is as one that never ended, and has no evaluation here unless it was due.
         """
-        if self.run.ranks.is_main and self.loop.n < self.config.total_steps:
+        if self.loop.n < self.config.total_steps:
             logging.warning(
                 f"The run ends after {self.loop.n:,} of {self.config.total_steps:,} steps: its "
                 f"{self.loop.b:,} interventions reach --protocol.reset_budget={self.config.protocol.reset_budget}."
@@ -192,8 +173,9 @@ class Trainer:
         if isinstance(event, Step):
             self.run.agent.end_step(event.success)
             with self.run.stopwatch("record"):
-                if self._num_recorded:
-                    self.recorder.on_step(whole_step(event, self.run.ranks, self._num_recorded))
+                if (record := self.config.record).repo_id is not None:
+                    num_recorded = record.count(self.config.num_envs)
+                    self.recorder.on_step(whole_step(event, self.run.ranks, num_recorded))
         elif isinstance(event, Update):
             self._update = event.metrics
         elif isinstance(event, SegmentEnd):
@@ -213,15 +195,18 @@ class Trainer:
         if self.loop.updates % self.config.log_freq == 0:
             self.logger.progress(rates | {"steps_per_s": steps_per_s})
 
+    @cached_property
+    def _eval_env(self) -> Any:
+        options, run = self.config.eval, self.run
+        num_episodes = -(-len(run.task_set.tasks) * options.n_episodes // run.ranks.count)
+        return run.make_eval_env(min(options.batch_size, num_episodes))
+
     def _evaluate(self) -> None:
         reached = self._reached()
         self._evaluations.last, self._evaluated_interventions = self.loop.n, self.loop.b
         if not self.config.evaluates:
             return
         options, run = self.config.eval, self.run
-        if self._eval_env is None:
-            num_episodes = -(-len(run.task_set.tasks) * options.n_episodes // run.ranks.count)
-            self._eval_env = run.make_eval_env(min(options.batch_size, num_episodes))
         result = evaluate_independent(
             self._eval_env,
             run.agent.acting,

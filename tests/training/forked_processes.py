@@ -1,82 +1,108 @@
 """Processes that train together without importing LeRobot again, and streams that are the same in any process."""
 
 import faulthandler
-import multiprocessing
 import os
-import queue
 import socket
+import sys
 import tempfile
 import traceback
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import cloudpickle
-import faster  # noqa: F401
-import lerobot_policy_pocketvla  # noqa: F401  (a server that another test has started may not have it)
 import numpy as np
 import pytest
 import torch
 from dummies import DummyEnv, DummyPolicy
+from forked_commands import ForkedPopen
 from runs import DIVERGES, KilledError
 
 from cronos_lerobot.ranks import join_ranks
 
-SERVER = multiprocessing.get_context("forkserver")
-"""Forks a process that has imported LeRobot and done nothing else: no child inherits the threads and locks of the
-tests before, with which it may wait for ever, nor does any import LeRobot anew."""
-SERVER.set_forkserver_preload(
-    ["lerobot.datasets", "lerobot_policy_pocketvla", "cronos_lerobot.training.factory", "pytest"]
-)
-
 PATIENCE_S = 120
+SERVE = "import sys, forked_processes; forked_processes.serve(sys.argv[1])"
+
+
+class Together:
+    """Processes as `accelerate launch` starts them, which stay for more work until one of them fails."""
+
+    def __init__(self, count):
+        self.folder = tempfile.TemporaryDirectory()
+        self.log = Path(self.folder.name) / "log"
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            port = free.getsockname()[1]
+        env = os.environ | {
+            "WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count), "MASTER_ADDR": "127.0.0.1",
+            "MASTER_PORT": str(port), "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+        }  # fmt: skip
+        address = f"{self.folder.name}/socket"
+        command = [sys.executable, "-c", SERVE, address]
+        with socket.socket(socket.AF_UNIX) as server, self.log.open("wb") as log:
+            server.bind(address)
+            server.listen()
+            server.settimeout(PATIENCE_S)
+            for rank in range(count):
+                ForkedPopen(command, stdout=log, env=env | {"RANK": str(rank), "LOCAL_RANK": str(rank)})
+            ends = [Connection(self._accept(server)) for _ in range(count)]
+        self.ends = [end for _, end in sorted((end.recv(), end) for end in ends)]
+
+    def _accept(self, server):
+        try:
+            return server.accept()[0].detach()
+        except TimeoutError:
+            pytest.fail(self.log.read_text())
+
+    def ask(self, work):
+        """Their answers: a result and the traceback of an error, of which one is None."""
+        try:
+            for end in self.ends:
+                end.send_bytes(work)
+            return [end.recv() for end in self.ends]
+        except (EOFError, ConnectionError):
+            pytest.fail(f"no answer:\n{self.log.read_text()}")
+
+    def leave(self):
+        """They end once they look for more work, or wait for each other in vain."""
+        for end in self.ends:
+            end.close()
+
+
+POOL = {}
 
 
 def together(function, *args, count=2):
-    """Run `function(processes, *args)` in `count` processes as `accelerate launch` starts them; their results."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    results = SERVER.Queue()
-    work = cloudpickle.dumps((function, args))
-    with tempfile.TemporaryDirectory() as stacks:
-        children = [
-            SERVER.Process(target=_child, args=(rank, count, port, results, work, f"{stacks}/{rank}"))
-            for rank in range(count)
-        ]
-        for child in children:
-            child.start()
-        try:
-            answers = dict(results.get(timeout=PATIENCE_S) for _ in children)
-            for child in children:
-                child.join(timeout=60)
-        except queue.Empty:
-            pytest.fail(
-                "\n".join([f"no answer in {PATIENCE_S} s", *[p.read_text() for p in Path(stacks).iterdir()]])
-            )
-        finally:
-            for child in children:
-                child.kill()
-    for rank, (_, error) in sorted(answers.items()):
-        assert error is None, f"process {rank}:\n{error}"
-    return [answers[rank][0] for rank in range(count)]
+    """Run `function(ranks, *args)` in each of `count` processes that train together; their results."""
+    pool = POOL.pop(count, None) or Together(count)
+    answers = pool.ask(cloudpickle.dumps((function, args)))
+    errors = [f"process {rank}:\n{error}" for rank, (_, error) in enumerate(answers) if error is not None]
+    if errors:
+        # They may be at different places.
+        pool.leave()
+        pytest.fail("\n".join(errors))
+    POOL[count] = pool
+    return [result for result, _ in answers]
 
 
-def _child(rank, count, port, results, work, stacks):
+def serve(address):
+    """Work for the process at the other end of a socket until it closes it."""
     torch.set_num_threads(1)
-    os.environ |= {
-        "RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count),
-        "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "OMP_NUM_THREADS": "1",
-    }  # fmt: skip
-    with open(stacks, "w") as file:
-        faulthandler.dump_traceback_later(PATIENCE_S - 10, file=file)
+    connected = socket.socket(socket.AF_UNIX)
+    connected.connect(address)
+    end = Connection(connected.detach())
+    ranks = join_ranks("cpu")
+    end.send(ranks.rank)
+    while True:
         try:
-            function, args = cloudpickle.loads(work)
-            joined = join_ranks("cpu")
-            answer = function(joined, *args), None
-            joined.leave()
+            function, args = cloudpickle.loads(end.recv_bytes())
+        except EOFError:
+            os._exit(0)
+        faulthandler.dump_traceback_later(PATIENCE_S, exit=True)
+        try:
+            answer = function(ranks, *args), None
         except BaseException:
             answer = None, traceback.format_exc()
         faulthandler.cancel_dump_traceback_later()
-    results.put((rank, answer))
+        end.send(answer)
 
 
 class WanderingEnv(DummyEnv):

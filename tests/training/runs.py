@@ -49,15 +49,13 @@ def resumed(folder, checkpoint="last", **options):
 
 
 def make_trainer(cfg, env=None, policy=None, ranks=None):
-    """A trainer that has opened its files; a policy of another seed must come from the checkpoint."""
+    """A trainer; a policy of another seed must come from the checkpoint."""
     set_seed(cfg.seed)
     policy = policy or DummyPolicy(seed=8 if cfg.checkpoint_path else 0)
     parts = Parts(env or DummyEnv(STREAMS, diverge_at=DIVERGES), DummyEnv, policy, *identity_processors())
     if ranks is not None:
         parts.ranks = ranks
-    trainer = Trainer(Run(cfg, parts), read_state(cfg.checkpoint_path) if cfg.checkpoint_path else None)
-    trainer.open()
-    return trainer
+    return Trainer(Run(cfg, parts), read_state(cfg.checkpoint_path) if cfg.checkpoint_path else None)
 
 
 def train(cfg, **options):

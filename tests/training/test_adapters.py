@@ -13,9 +13,9 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from peft import get_peft_model_state_dict
-from runs import assert_same_run, metrics, weights
+from runs import metrics
 from safetensors.torch import load_file
-from test_cronos_train import OBSERVATIONS, cronos_train
+from test_cronos_train import OBSERVATIONS, cronos_train, moved, train_and_resume
 from test_imitation import ACT
 from tiny_checkpoints import save_policy
 from tiny_smolvla import pretend_num2words, save_tiny_smolvlm
@@ -83,46 +83,36 @@ def paid_for_moving(monkeypatch):
     monkeypatch.setattr(CronosVectorEnv, "step_streams", step)
 
 
-def test_act_learns_in_chunks_saves_resumes_and_is_a_lerobot_policy(tmp_path, monkeypatch):
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    cronos_train(monkeypatch, *FLAGS, "--steps=160", f"--output_dir={whole}")
-    cronos_train(monkeypatch, *FLAGS, "--steps=80", f"--output_dir={broken}")
-    before = weights(broken)
-    last = broken / "checkpoints/last/pretrained_model"
-    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=160")
-    assert_same_run(whole, broken)
-    assert any(not torch.equal(tensor, before[name]) for name, tensor in weights(whole).items())
-    updates = [line["agent"] for line in metrics(whole, "update")]
+def learns(monkeypatch, run, *flags):
+    """A policy that PPO trains for two updates; the names that moved in the second, and its checkpoint."""
+    first, last = train_and_resume(monkeypatch, run, *flags)
+    updates = [line["agent"] for line in metrics(run, "update")]
     assert len(updates) == 2
     assert all(update["policy_grad_norm"] > 0 for update in updates)
+    return moved(first, last), last
+
+
+def test_act_learns_in_chunks_saves_resumes_and_is_a_lerobot_policy(tmp_path, monkeypatch):
+    names, last = learns(monkeypatch, tmp_path / "run", *FLAGS, "--steps=160")
+    assert names
 
     from lerobot.policies.act.modeling_act import ACTPolicy
 
-    policy = ACTPolicy.from_pretrained(whole / "checkpoints/last/pretrained_model")
+    policy = ACTPolicy.from_pretrained(last)
     assert not [name for name in policy.state_dict() if "critic" in name or "log_std" in name]
-    assert actions_alone(whole / "checkpoints/last/pretrained_model") == actions_here(policy)
+    assert actions_alone(last) == actions_here(policy)
 
 
 @pytest.mark.usefixtures("paid_for_moving")
 def test_diffusion_learns_by_its_chain_saves_resumes_and_is_a_lerobot_policy(tmp_path, monkeypatch):
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
     with pytest.raises(SystemExit, match=r"--policy\.noise_scheduler_type=DDIM"):
         cronos_train(monkeypatch, *DIFFUSION, "--steps=80", f"--output_dir={tmp_path / 'ddpm'}")
-    flags = (*DIFFUSION, "--policy.noise_scheduler_type=DDIM")
-    cronos_train(monkeypatch, *flags, "--steps=160", f"--output_dir={whole}")
-    cronos_train(monkeypatch, *flags, "--steps=80", f"--output_dir={broken}")
-    before = weights(broken)
-    last = broken / "checkpoints/last/pretrained_model"
-    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=160")
-    assert_same_run(whole, broken)
-    assert all(not torch.equal(tensor, before[name]) for name, tensor in weights(whole).items())
-    updates = [line["agent"] for line in metrics(whole, "update")]
-    assert len(updates) == 2
-    assert all(update["policy_grad_norm"] > 0 for update in updates)
+    flags = (*DIFFUSION, "--policy.noise_scheduler_type=DDIM", "--steps=160")
+    names, last = learns(monkeypatch, tmp_path / "run", *flags)
+    assert names == load_file(last / "model.safetensors").keys()
 
     from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 
-    last = whole / "checkpoints/last/pretrained_model"
     assert actions_alone(last) == actions_here(DiffusionPolicy.from_pretrained(last))
 
 
@@ -164,23 +154,14 @@ def test_smolvla_learns_from_pixels_saves_resumes_and_is_a_lerobot_policy(clone,
         *VLA_FLAGS,
         "--algorithm.critic_observation=environment_state",
         "--algorithm.noise_steps=2",
+        "--steps=40",
     )
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    cronos_train(monkeypatch, *flags, "--steps=40", f"--output_dir={whole}")
-    cronos_train(monkeypatch, *flags, "--steps=20", f"--output_dir={broken}")
-    before = weights(broken)
-    last = broken / "checkpoints/last/pretrained_model"
-    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=40")
-    assert_same_run(whole, broken)
-    moved = {name for name, tensor in weights(whole).items() if not torch.equal(tensor, before[name])}
-    assert [name for name in moved if "lm_expert" in name]
-    assert not [name for name in moved if ".vlm." in name]
-    updates = [line["agent"] for line in metrics(whole, "update")]
-    assert len(updates) == 2
-    assert all(update["policy_grad_norm"] > 0 for update in updates)
+    names, last = learns(monkeypatch, tmp_path / "run", *flags)
+    assert [name for name in names if "lm_expert" in name]
+    assert not [name for name in names if ".vlm." in name]
 
     command = [
-        sys.executable, "-c", EVALUATE, f"--policy.path={whole / 'checkpoints/last/pretrained_model'}",
+        sys.executable, "-c", EVALUATE, f"--policy.path={last}",
         "--policy.device=cpu", "--env.type=cronos", *OBSERVATIONS["pixels"], "--env.render_size=[32, 32]",
         "--env.task=put the ketchup bottle on the cloth", "--eval.n_episodes=1", "--eval.batch_size=1",
         f"--output_dir={tmp_path / 'out'}",
@@ -194,29 +175,27 @@ def test_smolvla_learns_from_pixels_saves_resumes_and_is_a_lerobot_policy(clone,
 
 @pytest.mark.usefixtures("paid_for_moving")
 def test_lora_learns_saves_resumes_and_is_a_lerobot_policy(clone, tmp_path, monkeypatch):
-    flags = (f"--policy.path={clone}", *VLA_FLAGS, "--peft.r=2")
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    model = "checkpoints/last/pretrained_model"
-    cronos_train(monkeypatch, *flags, "--steps=40", f"--output_dir={whole}")
-    cronos_train(monkeypatch, *flags, "--steps=20", f"--output_dir={broken}")
-    before = load_file(broken / model / "adapter_model.safetensors")
-    resume = ("--resume=true", f"--config_path={broken / model}/train_config.json", "--steps=40")
+    run, file = tmp_path / "run", "adapter_model.safetensors"
+    flags = (f"--policy.path={clone}", *VLA_FLAGS, "--peft.r=2", "--steps=40")
+
+    def assert_same_adapters(run, again):
+        model = "checkpoints/last/pretrained_model"
+        assert metrics(run) == metrics(again)
+        assert not moved(run / model, again / model, file)
+
+    first, last = train_and_resume(monkeypatch, run, *flags, same=assert_same_adapters)
+    assert moved(first, last, file)
+    assert not (last / "model.safetensors").exists()
+    resume = ("--resume=true", f"--output_dir={run}", "--steps=60")
     with pytest.raises(SystemExit, match=r"--peft\.r=4"):
         cronos_train(monkeypatch, *resume, "--peft.r=4")
-    cronos_train(monkeypatch, *resume)
-    after = [load_file(run / model / "adapter_model.safetensors") for run in (whole, broken)]
-    assert metrics(whole) == metrics(broken)
-    assert all(torch.equal(after[0][name], after[1][name]) for name in before)
-    assert any(not torch.equal(before[name], after[0][name]) for name in before)
-    assert not (whole / model / "model.safetensors").exists()
     # The run's config is that of a run which begins without them.
-    new = (f"--config_path={whole / model}/train_config.json", "--steps=20", f"--output_dir={tmp_path / 'new'}")
+    new = (f"--config_path={last}/train_config.json", "--steps=20", f"--output_dir={tmp_path / 'new'}")
     cronos_train(monkeypatch, *new)
-    begun = load_file(tmp_path / "new" / model / "adapter_model.safetensors")
-    assert all(torch.equal(begun[name], tensor) for name, tensor in before.items())
+    assert not moved(first, tmp_path / "new/checkpoints/last/pretrained_model", file)
 
-    config = PreTrainedConfig.from_pretrained(whole / model)
-    config.pretrained_path = whole / model
+    config = PreTrainedConfig.from_pretrained(last)
+    config.pretrained_path = last
     policy = make_policy(config, env_cfg=CronosEnvConfig(observation_height=64, observation_width=64))
     trained = get_peft_model_state_dict(policy)
-    assert all(torch.equal(trained[name], tensor) for name, tensor in after[0].items())
+    assert all(torch.equal(trained[name], tensor) for name, tensor in load_file(last / file).items())

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from draccus.utils import ParsingError
 from dummies import DummyPolicyConfig
 from lerobot.policies import make_policy
 from lerobot.policies.act.configuration_act import ACTConfig
@@ -12,9 +13,14 @@ from test_cronos_train import OBSERVATIONS, SMALL
 from cronos_lerobot.agents.imitation.config import ImitationConfig
 from cronos_lerobot.agents.ppo.config import PaperPPOConfig, PPOConfig
 from cronos_lerobot.protocol.config import ProtocolConfig
-from cronos_lerobot.training.config import CronosTrainConfig, PeriodicEvaluationConfig, check, complete
+from cronos_lerobot.training.config import (
+    CronosTrainConfig,
+    PeriodicEvaluationConfig,
+    RecordConfig,
+    check,
+    complete,
+)
 from cronos_lerobot.training.reading import load, read_config
-from cronos_lerobot.training.record_config import RecordConfig
 
 
 def test_flags_of_the_protocol_and_the_algorithm():
@@ -69,6 +75,10 @@ WRONG = {
     "--eval_at_interventions": {"eval_at_interventions": [5, 0]},
     "--resume": {"resume": "maybe"},
     "--env.split": {"env": CronosEnvConfig(split="held_out")},
+    "--save_checkpoint": {
+        "policy": DummyPolicyConfig(push_to_hub=True, repo_id="me/rl"),
+        "save_checkpoint": False,
+    },
     "--policy.use_amp": {"policy": DummyPolicyConfig(use_amp=True)},
     "--protocol.num_configurations": {"protocol": ProtocolConfig(num_configurations=65)},
     "--protocol.reward=level": {
@@ -181,11 +191,10 @@ def test_resuming_something_else_is_refused(tmp_path, base):
     file = saved(run, record={"root": str(elsewhere)}, policy={"pretrained_path": str(base)})
     resume = ["--resume=true", f"--config_path={file}", f"--record.root={elsewhere}"]
     auto = ["--resume=auto", f"--output_dir={run}", f"--record.root={elsewhere}"]
-    for flag in ("--policy.type=act", "--algorithm.type=ppo_paper", f"--output_dir={elsewhere}"):
-        with pytest.raises(ValueError, match=flag):
-            read_config([*resume, flag])
-    with pytest.raises(ValueError, match=r"--policy\.path"):
-        read_config([*resume, f"--policy.path={base}"])
+    with pytest.raises(ParsingError, match="policy"):
+        read_config([*resume, "--policy.type=act"])
+    with pytest.raises(ValueError, match="--output_dir"):
+        read_config([*resume, f"--output_dir={elsewhere}"])
     # The same command begins a run and resumes it.
     assert read_config([*auto, f"--policy.path={base}"]).policy.type == "pocketvla"
     with pytest.raises(ValueError, match=r"--policy\.path=/other"):

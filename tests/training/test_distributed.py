@@ -1,12 +1,13 @@
 """Two processes that train together, against one process with all of their streams."""
 
+import io
 import json
 import os
 import random
 import re
 import signal
 import sys
-from pathlib import Path
+from contextlib import redirect_stdout
 from unittest.mock import patch
 
 import numpy as np
@@ -24,10 +25,10 @@ from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.task_orders import TASK_ORDERS
 from cronos_lerobot.ranks import Ranks
+from cronos_lerobot.scripts import train as train_script
 from cronos_lerobot.stopwatch import Stopwatch
-from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.config import CronosTrainConfig, RecordConfig
 from cronos_lerobot.training.factory import make_env
-from cronos_lerobot.training.record_config import RecordConfig
 from cronos_lerobot.training.sharding import ShardedEnv
 from cronos_lerobot.training.stopping import StopRequest
 
@@ -215,20 +216,6 @@ def test_a_task_order_that_decides_by_itself_is_stopped(tmp_path, monkeypatch):
     together(train_alone, settings(tmp_path / "run", 16, task_order="alone"))
 
 
-def test_a_process_films_its_own_streams():
-    def film(ranks):
-        env = DummyEnv(2)
-        env.timer = Stopwatch()
-        env.positions = lambda ids: [f"local {i}" for i in ids]
-        sharded = ShardedEnv(env, ranks)
-        own = sharded.positions(np.arange(2) + 2 * ranks.rank)
-        with pytest.raises(ValueError, match=r"\[1, 2\]"):
-            sharded.positions(np.array([1, 2]))
-        return own
-
-    assert together(film) == [["local 0", "local 1"]] * 2
-
-
 def test_help_is_known_in_all_processes_and_actions_where_they_were_executed():
     class Helped(DummyEnv):
         def step(self, actions):
@@ -255,7 +242,7 @@ def test_exchange_keeps_types_and_order():
             ranks.concatenate(mine).tolist(),
             ranks.concatenate(mine > 10, axis=1).tolist(),
             ranks.broadcast({"rank": ranks.rank}, source=1),
-            ranks.collect(mine).tolist(),
+            np.concatenate(ranks.gather_to_main(mine)).tolist(),
         )
 
     rows, flags = [[0, 1], [2, 3], [10, 11], [12, 13]], [[False, False, False, True], [False, False, True, True]]
@@ -281,17 +268,25 @@ def test_processes_share_the_cores_of_their_node(num_threads, local_processes, e
     env.close()
 
 
-def test_accelerate_launch(tmp_path, monkeypatch):
-    """The command of docs/distributed.md on two CPU processes; what it leaves goes on in one."""
+def command(ranks, flags):
+    """`cronos-train` in this process; what it prints."""
+    with (
+        patch.object(sys, "argv", ["cronos-train", *flags]),
+        patch.object(train_script, "join_ranks", lambda device: ranks),
+        patch.object(ranks, "leave"),
+        redirect_stdout(io.StringIO()) as said,
+    ):
+        train_script.main()
+    return said.getvalue()
+
+
+def test_the_command_in_two_processes(tmp_path, monkeypatch):
+    """What it leaves goes on in one."""
     folder = tmp_path / "run"
     flags = [*SMALL, *OBSERVATIONS["state"], "--num_envs=4", "--steps=64", f"--output_dir={folder}"]
-    launch = [
-        sys.executable, "-m", "accelerate.commands.launch", "--multi_gpu", "--num_processes=2", "--num_machines=1",
-        "--main_process_port=0", "--mixed_precision=no", "--dynamo_backend=no",
-    ]  # fmt: skip
-    result = run_forked([*launch, Path(sys.executable).with_name("cronos-train"), *flags])
-    assert result.returncode == 0, result.stderr[-3000:]
-    assert re.findall(r"^(\d+)/64 steps", result.stdout, re.MULTILINE) == ["32", "64"]
+    first, second = together(command, flags)
+    assert re.findall(r"^(\d+)/64 steps", first, re.MULTILINE) == ["32", "64"]
+    assert second == ""
     updates = metrics(folder)
     assert [line["interaction_steps"] for line in updates] == [32, 64]
     # Sixteen steps of four streams, T = 8.
@@ -300,7 +295,23 @@ def test_accelerate_launch(tmp_path, monkeypatch):
     (start,) = json.loads((folder / "manifest.json").read_text())["starts"]
     assert start["num_processes"] == 2
     before = weights(folder)
-    last = folder / "checkpoints/last/pretrained_model/train_config.json"
-    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}", "--steps=96")
+    cronos_train(monkeypatch, "--resume=true", f"--output_dir={folder}", "--steps=96")
     assert [line["interaction_steps"] for line in metrics(folder)] == [32, 64, 96]
     assert any(not torch.equal(tensor, before[name]) for name, tensor in weights(folder).items())
+
+
+def test_accelerate_launch_says_what_the_processes_join_by():
+    """The command of docs/distributed.md, with `env` in place of `cronos-train`: it says what `Together` does."""
+    launch = [
+        sys.executable, "-m", "accelerate.commands.launch", "--multi_gpu", "--num_processes=2", "--num_machines=1",
+        "--main_process_port=0", "--mixed_precision=no", "--dynamo_backend=no", "--no_python", "env",
+    ]  # fmt: skip
+    done = run_forked(launch)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+    def said(name):
+        return sorted(re.findall(rf"^{name}=(.*)$", done.stdout, re.MULTILINE))
+
+    assert said("RANK") == said("LOCAL_RANK") == ["0", "1"]
+    assert said("WORLD_SIZE") == said("LOCAL_WORLD_SIZE") == ["2", "2"]
+    assert len(set(said("MASTER_PORT"))) == len(set(said("MASTER_ADDR"))) == 1

@@ -13,7 +13,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.optim import AdamWConfig, MultiAdamConfig
 from lerobot_env_cronos import CronosEnvConfig
 from runs import STEPS_PER_UPDATE, KilledError, MortalEnv, assert_same_run, config, make_trainer, metrics, weights
-from test_cronos_train import cronos_train
+from test_cronos_train import moved, train_and_resume
 
 from cronos_lerobot.agents.imitation.agent import ImitationAgent, copy_trained
 from cronos_lerobot.agents.imitation.config import ImitationConfig
@@ -76,9 +76,20 @@ def train(cfg, env_class=DummyEnv, ranks=None):
     return trainer
 
 
+def train_and_resume_dummies(folder, **options):
+    """A run that is killed and resumed is the unbroken one, which is returned."""
+    unbroken, broken = folder / "unbroken", folder / "broken"
+    trainer = train(settings(unbroken, **options))
+    assert train(settings(broken, **options), MortalEnv) is None
+    torch.manual_seed(999)
+    train(settings(broken, resumes=True, **options))
+    assert_same_run(unbroken, broken)
+    return trainer
+
+
 def test_a_resumed_run_equals_the_unbroken_one_and_learns(tmp_path):
-    unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
-    trainer = train(settings(unbroken))
+    trainer = train_and_resume_dummies(tmp_path)
+    unbroken = tmp_path / "unbroken"
     updates = metrics(unbroken, "update")
     kept = [line["agent"]["segments"] for line in updates]
     assert kept == sorted(kept)
@@ -94,22 +105,17 @@ def test_a_resumed_run_equals_the_unbroken_one_and_learns(tmp_path):
     assert steps == [5.0 * (segments >= 3) for segments in kept]
     assert steps[0] == 0
     assert {len(segment) for segment in trainer.run.agent.memory.segments} <= {2, 3, 4}
-    assert train(settings(broken), MortalEnv) is None
-    torch.manual_seed(999)
-    train(settings(broken, resumes=True))
-    assert_same_run(unbroken, broken)
     assert not torch.equal(weights(unbroken)["actor.weight"], ClonedPolicy().actor.weight)
     assert torch.equal(weights(unbroken)["critic.weight"], ClonedPolicy().critic.weight)
 
 
 @pytest.mark.parametrize("weighting", ["return", "advantage"])
 def test_a_weighted_run_keeps_what_failed_and_resumes(tmp_path, weighting):
-    unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
     algorithm = ImitationConfig(
         steps_per_update=2, batch_size=8, warmup_segments=1, tail_steps=1, weighting=weighting
     )
-    trainer = train(settings(unbroken, algorithm=algorithm))
-    updates = metrics(unbroken, "update")
+    trainer = train_and_resume_dummies(tmp_path, algorithm=algorithm)
+    updates = metrics(tmp_path / "unbroken", "update")
     rollouts = [line["rollout"] for line in updates]
     memory = trainer.run.agent.memory
     won = sum(segment.success for segment in memory.segments)
@@ -120,10 +126,6 @@ def test_a_weighted_run_keeps_what_failed_and_resumes(tmp_path, weighting):
     assert 1 <= last["failed_segments"] <= failed
     assert 0 < last["effective_share"] < 1
     assert last["optimizer_steps"] == 2
-    assert train(settings(broken, algorithm=algorithm), MortalEnv) is None
-    torch.manual_seed(999)
-    train(settings(broken, resumes=True, algorithm=algorithm))
-    assert_same_run(unbroken, broken)
 
 
 def test_the_policy_may_be_an_average_of_what_is_trained_and_resumes(tmp_path, monkeypatch):
@@ -232,27 +234,20 @@ ACT = (
 
 
 def test_act_trains_saves_resumes_and_is_a_lerobot_policy(tmp_path, monkeypatch):
-    """With demonstrations: a policy from scratch has no success in 320 steps."""
+    """With demonstrations: a policy from scratch has no success in 160 steps."""
     env = CronosEnvConfig(**OBSERVATIONS)
     record_demos(
         RecordDemosConfig(env=env, dataset=DemoDatasetConfig("me/demos", tmp_path / "demos", 2), num_envs=2)
     )
     flags = (*ACT, f"--algorithm.demos.root={tmp_path / 'demos'}")
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    cronos_train(monkeypatch, *flags, "--steps=320", f"--output_dir={whole}")
-    cronos_train(monkeypatch, *flags, "--steps=160", f"--output_dir={broken}")
-    before = weights(broken)
-    last = broken / "checkpoints/last/pretrained_model"
-    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=320")
-    assert_same_run(whole, broken)
-    assert any(not torch.equal(tensor, before[name]) for name, tensor in weights(whole).items())
-    (agent,) = {json.dumps(sorted(line["agent"])) for line in metrics(whole)}
+    first, folder = train_and_resume(monkeypatch, tmp_path / "run", *flags, "--steps=160")
+    assert moved(first, folder)
+    (agent,) = {json.dumps(sorted(line["agent"])) for line in metrics(tmp_path / "run")}
     assert json.loads(agent) == ["frames", "grad_norm", "loss", "optimizer_steps", "segments"]
 
     from lerobot.policies.act.modeling_act import ACTPolicy
     from lerobot.policies.factory import make_pre_post_processors
 
-    folder = whole / "checkpoints/last/pretrained_model"
     policy = ACTPolicy.from_pretrained(folder)
     preprocessor, postprocessor = make_pre_post_processors(policy.config, str(folder))
     shapes = {name: feature.shape for name, feature in policy.config.input_features.items()}

@@ -1,8 +1,10 @@
 """Task orders and reset strategies that remember something of their own: it is in the checkpoint."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from runs import STEPS_PER_UPDATE, assert_same_run, config, train
+from runs import STEPS_PER_UPDATE, assert_same_run, config, resumed, train
 
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.interventions import Intervention
@@ -55,43 +57,31 @@ def registered(monkeypatch):
     monkeypatch.setitem(EXTRA_RESETS, "every_third", EveryThirdSwitch)
 
 
-def own(folder, steps=4 * STEPS_PER_UPDATE):
-    protocol = ProtocolConfig(
-        task_switch_interval=4, update_interval=8, scene_reset_interval=None, task_order="counting",
-        extra_resets=("every_third",),
-    )  # fmt: skip
-    return config(folder, steps, protocol=protocol)
-
-
-def resume(folder, steps=4 * STEPS_PER_UPDATE):
-    resumed = own(folder, steps)
-    resumed.checkpoint_path = (folder / "checkpoints/last").resolve()
-    return resumed
+PROTOCOL = ProtocolConfig(4, 8, None, task_order="counting", extra_resets=["every_third"])
 
 
 def test_a_resumed_run_goes_on_with_what_they_kept(tmp_path):
     unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
-    whole = train(own(unbroken))
+    whole = train(config(unbroken, protocol=PROTOCOL))
     # Eight switches, at which stream i has been counted i + 1 further; and two divergences.
     asked = sum(turn * (stream + 1) % 3 == 0 for turn in range(1, 9) for stream in range(4))
     assert whole.loop.b == asked + 2
-    train(own(broken, 2 * STEPS_PER_UPDATE))
-    train(resume(broken))
+    train(config(broken, 2 * STEPS_PER_UPDATE, protocol=PROTOCOL))
+    train(resumed(broken, protocol=PROTOCOL))
     assert_same_run(unbroken, broken)
 
 
 def test_what_a_checkpoint_cannot_hold_is_refused_before_the_run_begins(tmp_path, monkeypatch):
     monkeypatch.setattr(CountingOrder, "state_dict", lambda self: {"streams": [{"seen": object()}]})
     with pytest.raises(ValueError, match="CountingOrder"):
-        train(own(tmp_path))
+        train(config(tmp_path, protocol=PROTOCOL))
     assert not (tmp_path / "checkpoints").exists()
 
 
 def test_a_run_may_go_on_with_others(tmp_path, caplog):
-    train(own(tmp_path, 2 * STEPS_PER_UPDATE))
-    other = resume(tmp_path)
-    other.protocol.task_order = "heuristic"
-    assert train(other).loop.n == 4 * STEPS_PER_UPDATE
+    train(config(tmp_path, 2 * STEPS_PER_UPDATE, protocol=PROTOCOL))
+    trainer = train(resumed(tmp_path, protocol=replace(PROTOCOL, task_order="heuristic")))
+    assert trainer.loop.n == 4 * STEPS_PER_UPDATE
     assert "has the state of CountingOrder, which this run does not have" in caplog.text
 
 

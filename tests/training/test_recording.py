@@ -17,7 +17,7 @@ from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.data.writer import LateCamera, RecordingError, SegmentWriter
 from cronos_lerobot.protocol.loop_state import Step
-from cronos_lerobot.training.record_config import RecordConfig
+from cronos_lerobot.training.config import RecordConfig
 from cronos_lerobot.training.recording import FILM, FilmedEnv
 
 

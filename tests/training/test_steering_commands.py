@@ -10,7 +10,7 @@ from runs import assert_same_run, metrics
 from safetensors import safe_open
 from safetensors.torch import load_file
 from test_adapters import DIFFUSION, FLAGS, SMOLVLA, VLA_FLAGS
-from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
+from test_cronos_train import OBSERVATIONS, SMALL, cronos_train, train_and_resume
 from test_steering_runs import assert_same_actor
 from tiny_checkpoints import save_policy
 from tiny_smolvla import pretend_num2words, save_tiny_smolvlm
@@ -26,23 +26,22 @@ STEERED = (
 )  # fmt: skip
 
 
+def assert_same_steering(run, again):
+    assert_same_run(run, again)
+    assert_same_actor(run, again)
+
+
 def test_smolvla_is_steered_saved_resumed_and_evaluated(tmp_path, monkeypatch, caplog):
     pretend_num2words()
     save_tiny_smolvlm(tmp_path / "vlm")
     pixels = {"observation_height": 64, "observation_width": 64}
     clone = save_policy(tmp_path / "clone", "smolvla", pixels, vlm_model_name=str(tmp_path / "vlm"), **SMOLVLA)
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    flags = (f"--policy.path={clone}", *STEERED)
-    cronos_train(monkeypatch, *flags, "--steps=40", f"--output_dir={whole}")
-    cronos_train(monkeypatch, *flags, "--steps=20", f"--output_dir={broken}")
-    last = broken / "checkpoints/last/pretrained_model"
-    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=40")
-    assert_same_run(whole, broken)
-    assert_same_actor(whole, broken)
+    run = tmp_path / "run"
+    flags = (f"--policy.path={clone}", *STEERED, "--steps=40")
+    _, folder = train_and_resume(monkeypatch, run, *flags, same=assert_same_steering)
     # Two streams decide twice in an update of ten steps.
-    updates = [line["agent"] for line in metrics(whole, "update")]
+    updates = [line["agent"] for line in metrics(run, "update")]
     assert [(line["decisions"], line["optimizer_steps"]) for line in updates] == [(4, 4), (8, 4)]
-    folder = whole / "checkpoints/last/pretrained_model"
     frozen = load_file(clone / "model.safetensors")
     for name, tensor in load_file(folder / "model.safetensors").items():
         assert torch.equal(tensor, frozen[name]), name
@@ -111,15 +110,10 @@ def test_a_diffusion_that_looks_back_is_steered(tmp_path, monkeypatch):
         "--algorithm.batch_size=8",
     ]
     flags += ["--algorithm.warmup_decisions=8", "--algorithm.observation=policy", "--algorithm.hidden_width=16"]
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    cronos_train(monkeypatch, *flags, "--steps=160", f"--output_dir={whole}")
-    cronos_train(monkeypatch, *flags, "--steps=80", f"--output_dir={broken}")
-    last = broken / "checkpoints/last/pretrained_model"
-    cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", "--steps=160")
-    assert_same_run(whole, broken)
-    assert_same_actor(whole, broken)
+    run = tmp_path / "run"
+    train_and_resume(monkeypatch, run, *flags, "--steps=160", same=assert_same_steering)
     # Four streams decide every five steps: 16 times in an update.
-    assert [line["agent"]["decisions"] for line in metrics(whole, "update")] == [16, 32]
+    assert [line["agent"]["decisions"] for line in metrics(run, "update")] == [16, 32]
 
 
 def policy_config(folder):

@@ -28,7 +28,7 @@ from runs import (
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cronos_lerobot.training.checkpoint import list_checkpoints
-from cronos_lerobot.training.record_config import RecordConfig
+from cronos_lerobot.training.config import RecordConfig
 from cronos_lerobot.training.run_folder import note_start
 from cronos_lerobot.training.stopping import SIGNALS, StopRequest
 from cronos_lerobot.training.trainer import Schedule
@@ -41,14 +41,8 @@ def test_something_recurs_after_each_multiple():
             times.append(n)
             schedule.last = n
     assert times == [128, 256, 320]
+    assert not Schedule(100, last=320).due(399)
     assert not Schedule(0).due(10**9)
-
-
-def test_same_seed_same_run_other_seed_other_run(tmp_path):
-    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        train(config(tmp_path / name, seed=seed, steps=2 * STEPS_PER_UPDATE))
-    assert_same_run(tmp_path / "a", tmp_path / "b")
-    assert metrics(tmp_path / "a") != metrics(tmp_path / "c")
 
 
 def test_a_run_does_not_depend_on_saving_evaluating_and_recording(tmp_path):
@@ -101,11 +95,9 @@ def test_tensorboard_has_every_point_once_after_a_resume(tmp_path):
 class SignallingEnv(DummyEnv):
     """Has the process told to stop in the middle of a segment."""
 
-    number = signal.SIGTERM
-
     def step(self, actions):
         if self.t == 21:
-            signal.raise_signal(self.number)
+            signal.raise_signal(signal.SIGTERM)
         return super().step(actions)
 
 
@@ -139,14 +131,6 @@ def test_every_signal_that_ends_a_process_is_noted(number):
             assert signal.getsignal(number) == handler
         finally:
             signal.signal(number, before)
-
-
-def test_a_dropped_connection_leaves_a_checkpoint(tmp_path):
-    env = SignallingEnv(STREAMS)
-    env.number = signal.SIGHUP
-    with StopRequest() as stop:
-        assert not make_trainer(config(tmp_path, save_freq=0), env=env).train(stop)
-    assert (tmp_path / "checkpoints/last").resolve().name == f"{3 * STEPS_PER_UPDATE:06d}"
 
 
 PIPED = """
