@@ -13,7 +13,7 @@ from lerobot_env_cronos import CronosEnvConfig
 from runs import metrics, weights
 from safetensors.torch import load_file
 from test_adapters import DIFFUSION, FLAGS, SMOLVLA, VLA_FLAGS
-from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
+from test_cronos_train import OBSERVATIONS, SMALL, cronos_train, train_and_resume
 from test_flow_head import TINY, TRAIN
 from test_pi0_commands import PIXELS, SIZES
 from test_steering_commands import STEERED
@@ -77,32 +77,28 @@ def test_it_trains_saves_resumes_and_is_evaluated(kind, tmp_path, monkeypatch):
     flags = [flag.replace("device=cpu", "device=cuda") for flag in flags if not flag.startswith("--save_freq")]
     if make is not None:
         flags.append(f"--policy.path={make(tmp_path)}")
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    with tiny_gemma():
-        for folder, until in ((whole, steps), (broken, steps // 2)):
-            cronos_train(
-                monkeypatch, *flags, f"--save_freq={steps // 2}", f"--steps={until}", f"--output_dir={folder}"
-            )
-        last = broken / "checkpoints/last/pretrained_model"
-        cronos_train(monkeypatch, "--resume=true", f"--config_path={last}/train_config.json", f"--steps={steps}")
-    counted = ("kind", "interaction_steps", "interventions", "interventions_by_kind", "updates")
-    runs = [[{name: line[name] for name in counted} for line in metrics(run)] for run in (whole, broken)]
-    assert runs[0] == runs[1]
-    assert runs[0]
-    files = [run / "checkpoints/last/pretrained_model" for run in (whole, broken)]
-    states = [read_state(folder.parent) for folder in files]
-    # That of a generator counts what it has drawn.
-    assert states[0]["generators"] == states[1]["generators"]
-    assert states[0]["generators"]["torch"]
-    steps_taken = [steps_of(state["optimizer"]) for state in states]
-    assert steps_taken[0] == steps_taken[1] != {}
     names = {"smolvla with lora": "adapter_model.safetensors", "smolvla steered": STEERING}
-    first, second = (load_file(folder / names.get(kind, "model.safetensors")) for folder in files)
-    for tensor in first:
-        torch.testing.assert_close(first[tensor], second[tensor], rtol=1e-2, atol=1e-3, msg=tensor)
+
+    def assert_alike(run, again):
+        counted = ("kind", "interaction_steps", "interventions", "interventions_by_kind", "updates")
+        one, other = ([{name: line[name] for name in counted} for line in metrics(one)] for one in (run, again))
+        assert one == other != []
+        states = [read_state(one / "checkpoints/last") for one in (run, again)]
+        # That of a generator counts what it has drawn.
+        assert states[0]["generators"] == states[1]["generators"]
+        assert states[0]["generators"]["torch"]
+        steps_taken = [steps_of(state["optimizer"]) for state in states]
+        assert steps_taken[0] == steps_taken[1] != {}
+        file = f"checkpoints/last/pretrained_model/{names.get(kind, 'model.safetensors')}"
+        first, second = load_file(run / file), load_file(again / file)
+        for tensor in first:
+            torch.testing.assert_close(first[tensor], second[tensor], rtol=1e-2, atol=1e-3, msg=tensor)
+
+    flags += [f"--save_freq={steps // 2}", f"--steps={steps}"]
     with tiny_gemma():
+        _, last = train_and_resume(monkeypatch, tmp_path / "run", *flags, same=assert_alike)
         monkeypatch.setattr(sys, "argv", [
-            "cronos-eval", f"--policy.path={files[0]}", "--policy.device=cuda", "--eval.n_episodes=1",
+            "cronos-eval", f"--policy.path={last}", "--policy.device=cuda", "--eval.n_episodes=1",
             "--eval.videos=0", "--eval.suites=[independent]", "--eval.splits=[train]",
             f"--output_dir={tmp_path / 'evaluation'}",
             *(flag for flag in flags if flag.startswith("--env.task_observation")),

@@ -6,12 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 from forked_commands import run_forked
 from runs import metrics
-from safetensors.torch import load_file
 from test_adapters import VLA_FLAGS, paid_for_moving  # noqa: F401
-from test_cronos_train import OBSERVATIONS, cronos_train
+from test_cronos_train import OBSERVATIONS, cronos_train, moved
 from tiny_checkpoints import save_policy
 from tiny_pi0 import save_tiny_tokenizer, tiny_gemma, tokenizer_from, use_tokenizer
 
@@ -41,15 +39,14 @@ def test_it_learns_from_pixels_and_is_a_lerobot_policy(kind, tmp_path, monkeypat
     updates = [line["agent"] for line in metrics(run, "update")]
     assert len(updates) == 2
     assert all(update["policy_grad_norm"] > 0 for update in updates)
-    files = [run / f"checkpoints/{name}/pretrained_model/model.safetensors" for name in ("000020", "last")]
-    before, after = map(load_file, files)
-    moved = {name for name, tensor in after.items() if not torch.equal(tensor, before[name])}
-    assert [name for name in moved if "gemma_expert" in name]
-    assert [name for name in moved if "vision_tower" in name]
+    first, last = (run / f"checkpoints/{name}/pretrained_model" for name in ("000020", "last"))
+    names = moved(first, last)
+    assert [name for name in names if "gemma_expert" in name]
+    assert [name for name in names if "vision_tower" in name]
 
     path = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
     command = [
-        sys.executable, "-c", EVALUATE, f"--policy.path={files[-1].parent}", "--policy.device=cpu",
+        sys.executable, "-c", EVALUATE, f"--policy.path={last}", "--policy.device=cpu",
         "--env.type=cronos", *OBSERVATIONS["pixels"], "--env.render_size=[32, 32]",
         "--env.task=put the ketchup bottle on the cloth", "--eval.n_episodes=1", "--eval.batch_size=1",
         f"--output_dir={tmp_path / 'out'}",
