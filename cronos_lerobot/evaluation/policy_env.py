@@ -90,7 +90,7 @@ def trained_scene(path: Path | None) -> dict[str, str]:
         ValueError: its config is damaged, or its scene is not registered here.
     """
     env, origin = _training(path)
-    scene = env.get("scene") or (origin and origin.scene)
+    scene = env.get("scene") or (origin.scene if origin else None)
     if not scene:
         return {}
     try:

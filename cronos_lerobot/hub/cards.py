@@ -13,13 +13,13 @@ from typing import Any
 import draccus
 import jinja2
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
+from lerobot.utils.utils import flatten_dict
 from lerobot_env_cronos import CronosEnvConfig
 from markupsafe import Markup
 
 from cronos_lerobot.hub.stage import clean
 from cronos_lerobot.provenance import package_versions
 from cronos_lerobot.training.config import CronosTrainConfig
-from cronos_lerobot.training.resume import flatten
 
 PACKAGED = Path(__file__).parent / "cards"
 CHECKOUT = Path(__file__).parents[2] / "datasets_cards"
@@ -87,12 +87,13 @@ def changed_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
     """The flags of `cronos-train` among `SHOWN` that differ from their defaults.
 
     Args:
-        flags: by name, such as `protocol.scene_reset_interval`.
+        flags: nested as in `train_config.json`, or by name, such as `protocol.scene_reset_interval`.
     """
+    flags = flatten_dict(dict(flags), sep=".")
     algorithm, known = flags.get("algorithm.type"), RLAlgorithmConfig.get_known_choices()
     choice = {"algorithm": known[algorithm]()} if isinstance(algorithm, str) and algorithm in known else {}
     config = draccus.encode(CronosTrainConfig(env=CronosEnvConfig(), **choice))
-    defaults = flatten(json.loads(json.dumps(config)))
+    defaults = flatten_dict(json.loads(json.dumps(config)), sep=".")
     return {
         name: value if isinstance(value, str) else json.dumps(value)
         for name, value in flags.items()

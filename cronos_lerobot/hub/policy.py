@@ -29,7 +29,6 @@ from cronos_lerobot.hub.results import describe_setting, differences
 from cronos_lerobot.hub.stage import read_json, readable, stage, write_text
 from cronos_lerobot.protocol.interventions import COUNTED_INTERVENTIONS
 from cronos_lerobot.report.runs import TrainingRun
-from cronos_lerobot.training.resume import flatten
 
 FILES = (
     "config.json", TRAIN_CONFIG_NAME, "model.safetensors", "model.safetensors.index.json",
@@ -126,7 +125,7 @@ def _about(
         "is_steered": (model / STEERING).is_file(),
         "is_reset_free": is_reset_free,
         "evaluate": {name: [name, f"--policy.path={config.repo_id}", *flags] for name in EVALUATE},
-        "flags": (changed_flags(flatten(trained)) if is_reset_free else {}) | (run.changed if run else {}),
+        "flags": (changed_flags(trained) if is_reset_free else {}) | (run.changed if run else {}),
         "run": run,
         "counted": [kind.name.lower() for kind in COUNTED_INTERVENTIONS],
     }

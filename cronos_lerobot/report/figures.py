@@ -220,8 +220,10 @@ def _draw_parts(ax: Axes, parts: Sequence[dict[str, Any]], i: int, number: int, 
     width = 0.8 / number
     x = 1 + np.arange(len(y)) + (i - (number - 1) / 2) * width
     color, _, hatch = style_of(i)
-    look = {"color": color, "hatch": hatch, "edgecolor": "white", "ecolor": INK}
-    ax.bar(x, y, 0.92 * width, yerr=np.abs(ends - y[:, None]).T, label=_label(label), **look)
+    errors = np.abs(ends - y[:, None]).T
+    bars = ax.bar(x, y, 0.92 * width, yerr=errors, label=_label(label), color=color, ecolor=INK)
+    for bar in bars:
+        bar.set(hatch=hatch, edgecolor="white")
 
 
 def _subplots(height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Figure, list[Axes]]:

@@ -337,9 +337,15 @@ def _read_eval_info(path: Path, tasks: Sequence[str]) -> Loaded:
         # Episode i of every task has the same seed, which is unknown.
         episodes = [(0, number, i, int(flag)) for number, flags in entries for i, flag in enumerate(flags)]
         table = np.array(episodes, int).reshape(-1, 4)
-        cells = {"source": LEROBOT_EVAL, "split": split, "suite": suite, "policy": path.parent.name}
+        cells: dict[str, Any] = {"source": LEROBOT_EVAL, "split": split, "suite": suite}
         cells |= _flags_rate(table[:, 3], table[:, 2]) | {"fingerprint": str(path), "path": str(path)}
-        cells |= {"episodes": table, "setting": dict.fromkeys(SETTING), "trained_in": "", "steps": np.nan}
+        cells |= {
+            "policy": path.parent.name,
+            "episodes": table,
+            "setting": dict.fromkeys(SETTING),
+            "trained_in": "",
+            "steps": np.nan,
+        }
         parts = [{"part": title} | _flags_rate(flags) for title, (_, flags) in zip(titles, entries, strict=True)]
         rows.append(cells | {"parts": parts})
         for title, (number, flags) in zip(titles, entries, strict=True):

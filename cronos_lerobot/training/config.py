@@ -23,7 +23,7 @@ from lerobot_env_cronos.scene.scenes import CONTROL_HZ
 
 from cronos_lerobot.agents import builtin  # noqa: F401  (registers the agents)
 from cronos_lerobot.agents.ppo.config import PPOConfig
-from cronos_lerobot.agents.registry import AGENTS
+from cronos_lerobot.agents.registry import AGENTS, AgentConfig
 from cronos_lerobot.data.video import MAX_FILE_DURATION_S, check_video_size
 from cronos_lerobot.data.writer import FLUSH_INTERVAL_S
 from cronos_lerobot.protocol.config import ProtocolConfig
@@ -259,6 +259,7 @@ def check(config: CronosTrainConfig) -> None:
     for name in config.protocol.extra_resets:
         EXTRA_RESETS.check(name)
     AGENTS.check(config.algorithm.type)
+    assert isinstance(config.algorithm, AgentConfig)
     config.algorithm.check_reward(config.protocol.reward)
     if not config.checkpoint_path:
         config.algorithm.check_start()

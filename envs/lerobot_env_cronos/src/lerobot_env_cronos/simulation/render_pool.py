@@ -7,6 +7,7 @@ two threads of a process ask. Two processes on two cores draw twice as much.
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import subprocess
 import sys
@@ -88,7 +89,7 @@ class RenderPool:
 
     def _read(self, process: subprocess.Popen, into: np.ndarray) -> None:
         """Read bytes until the array `into` is full."""
-        assert process.stdout is not None
+        assert isinstance(process.stdout, io.BufferedReader)
         if process.stdout.readinto(into.data) < into.nbytes:
             self._errors.seek(0)
             said = self._errors.read().decode(errors="replace").strip().splitlines()
