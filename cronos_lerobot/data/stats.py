@@ -4,7 +4,7 @@
   costs more than encoding the video. Sorting numbers and exact 256-bin histograms of images give the same.
 - Quantiles of a dataset are those of all its frames. LeRobot 0.6.1 averages the quantiles of its episodes. Of
   images this remains so: both look at a sample of the frames.
-- Standard deviations of a dataset have a floor, `STD_FLOORS`.
+- Standard deviations of a dataset have a floor, `STD_FLOOR`.
 """
 
 from __future__ import annotations
@@ -27,16 +27,13 @@ from PIL import Image
 
 Stats = dict[str, dict[str, np.ndarray]]
 
-STD_FLOORS = {(".x", ".y", ".z"): 0.02, (".pos",): 1.0, ("",): 0.1}
-"""Least standard deviation of a dimension of a vector observation, by how its name ends: 2 cm of a position, 1
-degree or percent of a joint, 0.1 of what lies in [-1, 1] (rotation matrices, gripper opening, one-hot tasks).
+STD_FLOOR = 1e-3
+"""Least standard deviation of a dimension of an action or of a vector observation [m, rad, 1].
 
-A body that stands on the table in every demonstration has a height with a deviation of 1e-5 m. Divided by that,
-a body that tips over in a stream is thousands of deviations away. With the floors, what can happen stays within
-about 20. Dimensions that vary by more than their floor are as they are."""
-ACTION_STD_FLOOR = 1e-3
-"""Least standard deviation of a dimension of `action` [m, rad, 1]: below it there is only rounding. It is small
-because policies scale their exploration by it."""
+A body that stands on the table in every demonstration has a height with a deviation of 1e-5 m. Divided by that, it
+is hundreds of deviations away as soon as it rests on another body. Below the floor there is only rounding. It is
+small because the small deviations of the proprioception tell where the hand touches something, and because
+policies scale their exploration by those of the actions."""
 
 
 def episode_stats(frames: Mapping[str, np.ndarray], features: Mapping[str, Mapping[str, Any]]) -> Stats:
@@ -168,8 +165,8 @@ class DatasetStats:
         for key, place in self._places.items():
             stats[key] = {name: value[place].copy() for name, value in numbers.items()}
             stats[key]["count"] = np.array([moments.count])
-            if (floor := _std_floor(key, self._features[key])) is not None:
-                stats[key]["std"] = np.maximum(stats[key]["std"], floor)
+            if _is_read_by_policies(key, self._features[key]):
+                stats[key]["std"] = np.maximum(stats[key]["std"], STD_FLOOR)
         return stats
 
     def _add_block(self, block: np.ndarray) -> None:
@@ -201,14 +198,9 @@ def _weighted_quantiles(values: np.ndarray, weights: np.ndarray) -> dict[str, np
     return found
 
 
-def _std_floor(key: str, feature: Mapping[str, Any]) -> np.ndarray | float | None:
-    """Least standard deviation of each dimension of a feature; None where no policy reads it."""
-    if key == ACTION:
-        return ACTION_STD_FLOOR
-    if not key.startswith(OBS_STR) or feature["dtype"] in ("image", "video"):
-        return None
-    names = feature["names"] or [""] * feature["shape"][0]
-    return np.array([next(v for ends, v in STD_FLOORS.items() if name.endswith(ends)) for name in names])
+def _is_read_by_policies(key: str, feature: Mapping[str, Any]) -> bool:
+    """Whether a policy may divide a feature by its standard deviation."""
+    return key == ACTION or (key.startswith(OBS_STR) and feature["dtype"] not in ("image", "video"))
 
 
 def _histogram(image: np.ndarray) -> np.ndarray:

@@ -107,7 +107,7 @@ def test_standard_deviations_have_a_floor_where_policies_read_them():
     stats = DatasetStats(FEATURES)
     stats.add_rows(table(still))
     found = stats.stats()
-    # A metre, 2 cm of a position, 0.1 of a rotation, one degree of a joint; half a metre of spread is as it is.
-    np.testing.assert_allclose(found["observation.state"]["std"], [0.25, 0.02, 0.1, 1])
+    # Half a metre to and fro stays as it is; what stands still has a millimetre, or a thousandth.
+    np.testing.assert_allclose(found["observation.state"]["std"], [0.25, 0.001, 0.001, 0.001])
     np.testing.assert_allclose(found["action"]["std"], [0.001, 0.001])
     assert found["next.success"]["std"] == 0
