@@ -26,7 +26,8 @@ def collect(runs: Sequence[Run]) -> pd.DataFrame:
         found = load_evaluations([run.folder])
         evaluated = found["source"] != TRAIN
         # Their folders have the steps; the base policy's own are those of its cloning.
-        found.loc[evaluated, "steps"] = [int(Path(path).parents[1].name) for path in found[evaluated]["path"]]
+        if evaluated.any():
+            found.loc[evaluated, "steps"] = [int(Path(path).parents[1].name) for path in found[evaluated]["path"]]
         found.loc[found["steps"] == 0, "interventions"] = 0
         own = {"row": run.row.name, "seed": run.seed, "finished": (run.folder / "train/.done").is_file()}
         tables.append(found.assign(**own))

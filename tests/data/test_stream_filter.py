@@ -186,7 +186,6 @@ def test_command(source, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["chek"], "chek"),
         (["check"], "--dataset.repo_id"),
         (["check", "--dataset.repo_id=me/s", "--dataset.root=nowhere"], "--dataset.root=nowhere"),
         (["filter", "--frames_after_success=-1"], "--frames_after_success"),
