@@ -1,6 +1,7 @@
 """Imports point one way: cronos_lerobot -> lerobot_env_cronos; policy packages stand alone; rooms have floors."""
 
 import ast
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -77,6 +78,23 @@ def test_no_room_imports_from_a_floor_above(package):
     assert len(imports) > 20
     upwards = {(path, target) for path, room, target in imports if floor[target] > floor[room]}
     assert not upwards
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_files_import_each_other(package):
+    """Not even in functions, or for types: a circle of files is one file in several pieces."""
+    folder = PACKAGES[package]
+    graph = {}
+    for path in sorted(folder.rglob("*.py")):
+        if path.name == "__init__.py":
+            continue
+        module = ".".join((package, *path.relative_to(folder).with_suffix("").parts))
+        nodes = [
+            n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.ImportFrom) and n.level == 0
+        ]
+        graph[module] = {n.module for n in nodes}
+    assert len(graph) > 3
+    TopologicalSorter(graph).prepare()
 
 
 def test_distribution_names_are_what_lerobot_discovers():

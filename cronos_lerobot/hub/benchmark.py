@@ -10,9 +10,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import yaml
 from lerobot_env_cronos import Benchmark, gymnasium_id, load_benchmark
-from lerobot_env_cronos.benchmark.benchmark import SUITES, benchmark_scene, draw_benchmark
+from lerobot_env_cronos.benchmark.benchmark import SUITES, draw_benchmark
 from lerobot_env_cronos.benchmark.configurations import SPLITS
 from lerobot_env_cronos.benchmark.files import CONFIGS, CONFIGURATIONS, make_tables
+from lerobot_env_cronos.benchmark.load import benchmark_scene
 from lerobot_env_cronos.config import DEFAULT_SCENE
 from lerobot_env_cronos.scene.scenes import BODIES, STEPS_PER_TASK
 from lerobot_env_cronos.simulation.gl import RenderingError

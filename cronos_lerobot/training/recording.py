@@ -16,14 +16,13 @@ from cronos_lerobot.data.origin import flags_of
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.writer import LateCamera, RecordingError
 from cronos_lerobot.protocol.loop_state import Step
+from cronos_lerobot.training.sharding import FILM
 
 if TYPE_CHECKING:
     from cronos_lerobot.training.run import Run
 
 MADE_WITH = ("env", "num_envs", "seed", "protocol", "algorithm", "policy")
 """Parts of the run's config that its datasets repeat."""
-FILM = "film"
-"""Key of the filmed streams' states in an observation, from which the writer draws; policies never see it."""
 
 
 class FilmedEnv:

@@ -17,8 +17,9 @@ import numpy as np
 
 from cronos_lerobot.protocol.loop_state import Step
 from cronos_lerobot.ranks import Ranks
-from cronos_lerobot.training.recording import FILM
 
+FILM = "film"
+"""Key of the filmed streams' states in an observation, from which the writer draws; policies never see it."""
 INFO = ("is_success", "is_grasped", "diverged", "intervened")
 OWN = ("action", "log_prob", "value")
 """Arrays of an ActionSample that have a row for each stream of this process."""

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from lerobot_env_cronos.autoreset import CronosGymVectorEnv as CronosGymVectorEnv
     from lerobot_env_cronos.benchmark.benchmark import Benchmark as Benchmark
     from lerobot_env_cronos.benchmark.benchmark import EpisodeGroup as EpisodeGroup
-    from lerobot_env_cronos.benchmark.benchmark import load_benchmark as load_benchmark
     from lerobot_env_cronos.benchmark.benchmark import packaged_benchmark as packaged_benchmark
     from lerobot_env_cronos.benchmark.files import write_benchmark as write_benchmark
+    from lerobot_env_cronos.benchmark.load import load_benchmark as load_benchmark
     from lerobot_env_cronos.benchmark.orderings import load_orderings as load_orderings
     from lerobot_env_cronos.benchmark.registry import register_scene as register_scene
     from lerobot_env_cronos.benchmark.version import check_environment_id as check_environment_id
@@ -40,7 +40,8 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "autoreset": "CronosGymVectorEnv",
-    "benchmark.benchmark": "Benchmark EpisodeGroup load_benchmark packaged_benchmark",
+    "benchmark.benchmark": "Benchmark EpisodeGroup packaged_benchmark",
+    "benchmark.load": "load_benchmark",
     "benchmark.files": "write_benchmark",
     "benchmark.orderings": "load_orderings",
     "benchmark.registry": "register_scene",

@@ -11,9 +11,10 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig, HubEnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from lerobot_env_cronos.benchmark.benchmark import SUITES, EpisodeGroup, benchmark_scene, load_benchmark
+from lerobot_env_cronos.benchmark.benchmark import SUITES, EpisodeGroup
 from lerobot_env_cronos.benchmark.configurations import SPLITS
 from lerobot_env_cronos.benchmark.files import check_tag, fetch_benchmark
+from lerobot_env_cronos.benchmark.load import benchmark_scene, load_benchmark
 from lerobot_env_cronos.episodic import EpisodicVectorEnv, IndependentVectorEnv, LazyVectorEnv
 from lerobot_env_cronos.scene.scenes import CONTROL_HZ, get_scene
 from lerobot_env_cronos.sequential import ADVANCES, SequentialVectorEnv

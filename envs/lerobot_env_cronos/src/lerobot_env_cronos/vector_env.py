@@ -11,8 +11,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from lerobot_env_cronos.benchmark.benchmark import load_benchmark
 from lerobot_env_cronos.benchmark.configurations import check_split
+from lerobot_env_cronos.benchmark.load import load_benchmark
 from lerobot_env_cronos.scene.scenes import CONTROL_HZ, Task, get_scene
 from lerobot_env_cronos.simulation.observations import ObservationBuilder
 from lerobot_env_cronos.simulation.simulation import (
