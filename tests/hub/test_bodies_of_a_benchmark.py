@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from hub_repositories import Repository
 from lerobot_env_cronos import SCENES, Body, Scene, gymnasium_id, load_benchmark
-from lerobot_env_cronos.benchmark import benchmark as benchmark_module
+from lerobot_env_cronos.benchmark import load as load_module
 from lerobot_env_cronos.benchmark.benchmark import draw_benchmark
 from lerobot_env_cronos.benchmark.files import BODIES_KEY, BenchmarkError, write_benchmark
 from lerobot_env_cronos.config import CronosHubEnvConfig
@@ -26,7 +26,7 @@ def published(here, monkeypatch, tmp_path):
     """A benchmark as `cronos-publish benchmark` writes it: its files, and its repositories with their tag."""
     monkeypatch.setitem(SCENES, SCENE.name, SCENE)
     monkeypatch.setitem(BODIES, ERASER.name, ERASER)
-    benchmark_module._load.cache_clear()
+    load_module._load.cache_clear()
     benchmark = draw_benchmark(SCENE.name, seed=1, num_configurations=2, num_orderings=1)
     (tmp_path / "files").mkdir()
     config = BenchmarkConfig(repo_id=NAME, pictures=False)
@@ -44,7 +44,7 @@ def push(hub, folder, fingerprint):
 def make_heavier(monkeypatch):
     """The eraser, as in another process, where nothing has been read yet."""
     monkeypatch.setitem(BODIES, ERASER.name, replace(ERASER, density=700))
-    benchmark_module._load.cache_clear()
+    load_module._load.cache_clear()
 
 
 def test_files_that_are_published_say_their_bodies(published, monkeypatch):
