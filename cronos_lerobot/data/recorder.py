@@ -28,7 +28,7 @@ from cronos_lerobot.data.schema import (
     TOTAL_INTERVENTIONS,
     TRUNCATED,
     VALUE,
-    feature_names,
+    describe_observation,
     frame_format,
     stream_features,
     with_cameras,
@@ -127,7 +127,7 @@ class StreamRecorder:
         writer = SegmentWriter(
             repo_id,
             root,
-            stream_features(space, describes=describes, **feature_names(env)),
+            stream_features(space, describes=describes, **describe_observation(env, space)),
             int(env.metadata["render_fps"]),
             resume=None if state is None else state["num_episodes"],
             origin=origin_of(env, STREAMS, flags or {}),

@@ -14,6 +14,8 @@ import gymnasium
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, OBS_IMAGES, REWARD
 from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos.scene.cameras import camera_projection
+from lerobot_env_cronos.scene.scenes import BODIES
 from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS, agent_pos_names, environment_state_names
 from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 
@@ -80,6 +82,8 @@ def demonstration_features(
     video: bool = True,
     state_names: Sequence[str] | None = None,
     environment_state_names: Sequence[str] | None = None,
+    keypoints: Mapping[str, Sequence] | None = None,
+    projections: Mapping[str, Sequence] | None = None,
 ) -> Features:
     """Features of a demonstration dataset.
 
@@ -89,6 +93,8 @@ def demonstration_features(
         video: store the pixels as mp4 (small); if False as PNG in the data files (exact, fast to read).
         state_names: one name per dimension of `agent_pos`; numbered when None.
         environment_state_names: the same for `environment_state`.
+        keypoints: points in the frame of each body [m], as `Body.keypoints`.
+        projections: (3, 4) of each camera, as `camera_projection`.
 
     Returns:
         LeRobot's feature dictionary: the observation, `action`, `next.reward`, `next.success`, `next.done`,
@@ -102,9 +108,14 @@ def demonstration_features(
     for key, space in cast(gymnasium.spaces.Dict, observation_space).items():
         if key == "pixels":
             for camera, box in cast(gymnasium.spaces.Dict, space).items():
-                features[f"{OBS_IMAGES}.{camera}"] = _camera_feature(box.shape or (), video)
+                feature = _camera_feature(box.shape or (), video)
+                features[f"{OBS_IMAGES}.{camera}"] = feature
+                if projections:
+                    feature["projection"] = projections[camera]
         elif key in VECTOR_KEYS:
-            features[VECTOR_KEYS[key]] = _vector_feature(key, space.shape or (), names[key])
+            feature = features[VECTOR_KEYS[key]] = _vector_feature(key, space.shape or (), names[key])
+            if key == "environment_state" and keypoints:
+                feature["keypoints"] = keypoints
         else:
             raise ValueError(f"unknown observation {key!r}; valid: 'pixels', {sorted(VECTOR_KEYS)}")
     features[ACTION] = _vector_feature(ACTION, (len(ACTION_NAMES),), ACTION_NAMES)
@@ -150,14 +161,28 @@ def with_cameras(space: gymnasium.Space, cameras: Mapping[str, tuple[int, int]])
     return gymnasium.spaces.Dict(spaces | {"pixels": gymnasium.spaces.Dict(boxes)})
 
 
-def feature_names(env: CronosVectorEnv) -> dict[str, Sequence[str]]:
-    """The names of `env`'s state dimensions, as keyword arguments of `demonstration_features`."""
-    space = cast(gymnasium.spaces.Dict, env.single_observation_space)
+def describe_observation(env: CronosVectorEnv, space: gymnasium.Space | None = None) -> dict[str, Any]:
+    """What the numbers and pictures of `env` are of, as keyword arguments of `demonstration_features`.
+
+    Args:
+        env: of the scene.
+        space: what is recorded, if that is not what `env` shows.
+    """
+    space = cast(gymnasium.spaces.Dict, space or env.single_observation_space)
     size = (space["agent_pos"].shape or (0,))[0]
     names = (agent_pos_names(env.scene, option) for option in TASK_OBSERVATIONS)
     return {
         "state_names": next(n for n in names if len(n) == size),
         "environment_state_names": environment_state_names(env.scene),
+        "keypoints": {
+            name.replace(" ", "_"): [list(point) for point in BODIES[name].keypoints]
+            for name in env.scene.bodies
+            if name in BODIES
+        },
+        "projections": {
+            camera: camera_projection(camera, *(box.shape or ())[:2]).tolist()
+            for camera, box in cast(gymnasium.spaces.Dict, space.get("pixels", {})).items()
+        },
     }
 
 

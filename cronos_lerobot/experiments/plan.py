@@ -20,7 +20,7 @@ from cronos_lerobot.experiments.scales import (
 )
 
 POLICY = Path("checkpoints", "last", "pretrained_model")
-PIXEL_FLAGS = ("--policy.freeze_encoder=true", "--algorithm.policy_lr=1e-4")
+PIXEL_FLAGS = ("--algorithm.policy_lr=1e-4",)
 """Of `cronos-train` with PPO and PocketVLA."""
 
 
@@ -133,7 +133,7 @@ def base_commands(run: Run) -> list[Command]:
         f"--output_dir={clone}",
     )
     if obs_type == PIXELS:
-        # PNG images and one worker that decodes them; the critic sees the privileged state.
+        # PNG images, and one worker that decodes them. The privileged state teaches encoder and critic.
         record += ("--env.privileged_state=true", "--dataset.video=false", "--num_envs=64")
         train += ("--policy.observation=image", "--policy.critic_observation=environment_state")
         train += ("--num_workers=1", "--dataloader_multiprocessing_context=fork")

@@ -27,7 +27,7 @@ from cronos_lerobot.command_line import parse_command_line
 from cronos_lerobot.data.demo_starts import check_starts
 from cronos_lerobot.data.demos import DemoCollector, DemoConfig, ExpertError, tasks_of
 from cronos_lerobot.data.origin import DEMONSTRATIONS, flags_of, origin_of
-from cronos_lerobot.data.schema import demonstration_features, feature_names
+from cronos_lerobot.data.schema import demonstration_features, describe_observation
 from cronos_lerobot.data.writer import RecordingError, SegmentWriter
 from cronos_lerobot.dataset_metadata import check_path
 from cronos_lerobot.evaluation.actors import load_actor
@@ -163,7 +163,9 @@ def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv, source: Path | Non
     assert root is not None
     # Before anything is deleted: what cannot be recorded raises here.
     check_path(root)
-    features = demonstration_features(env.single_observation_space, video=cfg.dataset.video, **feature_names(env))
+    features = demonstration_features(
+        env.single_observation_space, video=cfg.dataset.video, **describe_observation(env)
+    )
     if root.exists() and not cfg.resume:
         if not cfg.dataset.overwrite:
             raise FileExistsError(f"{root} exists: --resume=true adds to it, --dataset.overwrite=true replaces it")

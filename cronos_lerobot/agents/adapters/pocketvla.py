@@ -14,7 +14,7 @@ from cronos_lerobot.agents.base import Batch
 
 @register_adapter("pocketvla")
 class PocketVLAFlowAdapter(FlowAdapter):
-    """The policy has `flow_context`, `flow_velocity` and `flow_values`. Values are its own, and saved with it.
+    """The policy has `flow_context` and `flow_velocity`. Values are its own, and saved with it.
 
     Raises:
         ValueError: the policy has another head.
@@ -37,15 +37,15 @@ class PocketVLAFlowAdapter(FlowAdapter):
         return self.policy.flow_velocity(context, x, time)
 
     def values(self, batch: Batch, context: Tensor, features: Tensor) -> Tensor:
-        """The policy's own; its config says what their loss trains."""
-        return self.policy.flow_values(batch, context)
+        """The policy's own."""
+        return self.policy.predict_values(batch)
 
     def predict_values(self, batch: Batch) -> Tensor:
         """See `TrainablePolicy`."""
         return self.policy.predict_values(batch)
 
     @property
-    def value_inputs(self) -> Callable[[Batch], Batch] | None:  # ty: ignore[incompatible-property-override]
+    def value_inputs(self) -> Callable[[Batch], Batch]:  # ty: ignore[incompatible-property-override]
         """See `TrainablePolicy`."""
         return self.policy.value_inputs
 

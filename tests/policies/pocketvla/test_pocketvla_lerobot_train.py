@@ -32,7 +32,7 @@ def test_a_checkpoint_acts_in_physical_units_and_keeps_the_meaning_of_its_bins(d
         done = lerobot_train(dataset_root, tmp_path / output, *flags)
         assert done.returncode == 0, done.stderr[-4000:]
     policy = PocketVLAPolicy.from_pretrained(second)
-    assert policy.uses_images
+    assert policy.encoder is not None
     preprocessor, postprocessor = make_pre_post_processors(policy.config, pretrained_path=str(second))
     low = [-0.0287273, -0.0417035, -0.0260939, -0.0809211, -0.092887, -0.2071828, 0.0]
     high = [0.0283097, 0.0408553, 0.0401616, 0.0819205, 0.0779285, 0.2038257, 1.0]

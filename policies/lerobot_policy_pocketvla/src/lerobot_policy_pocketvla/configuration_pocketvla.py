@@ -5,8 +5,11 @@ from typing import Any, Literal, get_args
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from lerobot_policy_pocketvla.action_bounds import BRIDGE_ORIG_BOUNDS
+from lerobot_policy_pocketvla.bodies import BODY_WIDTH, bodies_named
+from lerobot_policy_pocketvla.pose_encoder import View
 from lerobot_policy_pocketvla.precision import Precision
 
 Observation = Literal["auto", "image", "environment_state"]
@@ -39,14 +42,17 @@ class PocketVLAConfig(PreTrainedConfig):
     critic_observation: CriticObservation = "actor"
     """What the value network sees: `actor` (as the actor does) or `environment_state` (a privileged critic,
     asymmetric actor-critic). It is used in training only."""
-    value_detach: bool = True
-    """With an image actor and `critic_observation=actor`, the value head reads the actor's features; True
-    keeps the value loss from changing them."""
-
-    freeze_encoder: bool = False
-    """With an image actor: reinforcement learning leaves the image encoder and the instruction's embedding as
-    they were cloned. What they say of an observation is then computed once, while acting, and kept for the
-    update, which trains the trunk and the head many times faster. Cloning always trains everything."""
+    bodies: list[str] = field(default_factory=list)
+    """Bodies that the privileged state describes, in its order; taken from the dataset."""
+    hand: list[int] = field(default_factory=list)
+    """Where `observation.state` has the hand's position; taken from the dataset."""
+    view: View | None = None
+    """With an image actor: where the camera sees the bodies, by which cloning teaches the encoder; taken from
+    the dataset, null if that does not say."""
+    freeze_encoder: bool = True
+    """With an image actor: reinforcement learning leaves the encoder as it was cloned. What it says of a picture
+    is then computed once, while acting, and an update costs what it costs from the privileged state. Cloning
+    always trains everything."""
 
     head: Head = "gaussian"
     """`gaussian`: a mean and one sigma per dimension generate the bins' logits, the gripper has a sign.
@@ -95,16 +101,14 @@ class PocketVLAConfig(PreTrainedConfig):
     """Number of the trunk's layers."""
     value_width: int = 256
     """Width of the value head's hidden layer."""
-    keypoints: int = 64
-    """Number of spatial-softmax keypoints of the image encoder."""
-    random_shift_px: int = 4
-    """Largest random shift of the image in behaviour cloning (pixels); never applied elsewhere. 0: none."""
     dtype: Precision = "auto"
     """Format of the convolutions: `auto` is bfloat16 where the hardware multiplies it and oneDNN may use it,
     float32 elsewhere. All else, action probabilities included, is float32."""
 
     optimizer_lr: float = 1e-3
     """Peak learning rate of behaviour cloning."""
+    optimizer_encoder_lr: float = 3e-3
+    """Peak learning rate of the picture encoder."""
     optimizer_sigma_lr: float = 1e-2
     """Peak learning rate of the raw sigmas, which have far to go and see every sample."""
     optimizer_weight_decay: float = 1e-4
@@ -208,7 +212,9 @@ class PocketVLAConfig(PreTrainedConfig):
 
     @property
     def environment_state_width(self) -> int:
-        """Width of the environment state, 0 without it."""
+        """Width of the environment state as the policy reads it, 0 without it."""
+        if self.bodies:
+            return BODY_WIDTH * len(self.bodies)
         return self.env_state_feature.shape[0] if self.env_state_feature else 0
 
     @property
@@ -242,6 +248,27 @@ class PocketVLAConfig(PreTrainedConfig):
                 f"{self.action_dim}; use action_bounds='dataset'"
             )
         return low, high
+
+    def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
+        """Take from a dataset what its states and pictures show; LeRobot calls this before training.
+
+        A policy that has weights keeps what these were trained on.
+        """
+        if self.pretrained_path:
+            return
+        state, privileged = features.get(OBS_STATE, {}), features.get(OBS_ENV_STATE, {})
+        names = list(state.get("names") or [])
+        hand = [f"ee.{axis}" for axis in "xyz"]
+        self.bodies = bodies_named(privileged.get("names"))
+        if not self.bodies or not set(hand) <= set(names):
+            self.bodies = []
+            return
+        self.hand = [names.index(name) for name in hand]
+        # The policy's own step scales them; see bodies.py.
+        self.normalization_mapping["ENV"] = NormalizationMode.IDENTITY
+        keypoints = privileged.get("keypoints")
+        if self.actor_observation == "image" and keypoints and "projection" in features[self.camera[0]]:
+            self.view = View(features[self.camera[0]]["projection"], [keypoints[body] for body in self.bodies])
 
     def validate_features(self) -> None:
         """Check the features once they are known; LeRobot's policies call this when they are built.

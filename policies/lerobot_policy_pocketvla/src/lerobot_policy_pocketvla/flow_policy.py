@@ -80,8 +80,8 @@ class PocketVLAFlowPolicy(PocketVLAPolicy, heads=("flow",)):
     """Predicts a velocity v = noise - actions on the way x = t noise + (1 - t) actions, as LeRobot's SmolVLA does.
 
     A chunk of H actions is decided on at once, and n of them are played. It says of no chunk how likely it was;
-    a trainer that makes a stochastic chain of the integration finds what it needs in `flow_context`,
-    `flow_velocity` and `flow_values`.
+    a trainer that makes a stochastic chain of the integration finds what it needs in `flow_context` and
+    `flow_velocity`.
     """
 
     head: FlowHead
@@ -112,7 +112,8 @@ class PocketVLAFlowPolicy(PocketVLAPolicy, heads=("flow",)):
             time: see there.
 
         Returns:
-            The loss, a scalar or (B,), the mean of each sample's actions that are not padding; nothing to log.
+            The loss, a scalar or (B,), the mean of each sample's actions that are not padding, and numbers for the
+            log.
         """
         actions = batch[ACTION].float().clamp(-1.0, 1.0)
         draws = self.config.flow_draws if noise is None else 1
@@ -122,7 +123,7 @@ class PocketVLAFlowPolicy(PocketVLAPolicy, heads=("flow",)):
             time = sample_time_beta(len(repeated), actions.device, alpha=1.5, beta=1.0, scale=0.999, offset=0.001)
         t = time[:, None, None]
         with self._full_precision():
-            features = self._features(batch, self.config.random_shift_px if self.training else 0)
+            features, taught, metrics = self._cloning_features(batch)
             velocity = self.head(features.repeat(draws, 1), t * noise + (1 - t) * repeated, time)
         errors = (velocity - (noise - repeated)).square().mean(-1).unflatten(0, (draws, -1)).mean(0)
         valid = torch.ones_like(errors)
@@ -130,8 +131,8 @@ class PocketVLAFlowPolicy(PocketVLAPolicy, heads=("flow",)):
             valid = 1.0 - batch["action_is_pad"].to(errors.dtype)
         errors = errors * valid
         if reduction == "none":
-            return errors.sum(1) / valid.sum(1).clamp(min=1.0), {}
-        return errors.sum() / valid.sum().clamp(min=1.0), {}
+            return errors.sum(1) / valid.sum(1).clamp(min=1.0) + taught, metrics
+        return errors.sum() / valid.sum().clamp(min=1.0) + taught.mean(), metrics
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: Batch, noise: Tensor | None = None, **_: Any) -> Tensor:
@@ -174,8 +175,3 @@ class PocketVLAFlowPolicy(PocketVLAPolicy, heads=("flow",)):
         """Velocities (B, H, D) of chunks x (B, H, D) at times (B,), 1 noise to 0 actions, differentiable."""
         with self._full_precision():
             return self.head(context, x, time)
-
-    def flow_values(self, batch: Batch, context: Tensor) -> Tensor:
-        """`predict_values` of a batch whose `flow_context` is at hand."""
-        with self._full_precision():
-            return self._values(batch, context)

@@ -12,8 +12,9 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE, OBS_STR
 from torch import Tensor, nn
 
 from lerobot_policy_pocketvla.configuration_pocketvla import PocketVLAConfig
-from lerobot_policy_pocketvla.images import check_image_size, random_shift
-from lerobot_policy_pocketvla.networks import ImageNetwork, StateNetwork, ValueHead
+from lerobot_policy_pocketvla.images import check_image_size
+from lerobot_policy_pocketvla.networks import StateNetwork, ValueHead
+from lerobot_policy_pocketvla.pose_encoder import PoseEncoder
 from lerobot_policy_pocketvla.precision import use_bfloat16
 
 Batch = Mapping[str, Any]
@@ -22,13 +23,13 @@ Batch = Mapping[str, Any]
 
 
 ENCODING = f"{OBS_STR}.encoding"
-"""Key of a cached encoding in a batch, see `PocketVLAPolicy.encode_observation`."""
-FEATURES = f"{OBS_STR}.features"
-"""Key of the actor's cached features in a batch, see `PocketVLAPolicy.value_inputs`."""
+"""Key of what the picture encoder said, see `PocketVLAPolicy.encode_observation`."""
 
 
 class PocketVLAPolicy(PreTrainedPolicy):
-    """Actor and critic; see `PocketVLAConfig` for what each of them sees.
+    """Actor and critic, two networks alike; see `PocketVLAConfig` for what each of them sees.
+
+    From pictures, an encoder says where the bodies are, and the actor reads that as it would read the truth.
 
     `PocketVLAPolicy(config)` is the subclass for the config's head: what a policy can do depends on it.
 
@@ -61,18 +62,17 @@ class PocketVLAPolicy(PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         self.config: PocketVLAConfig = config
-        self.uses_images = config.actor_observation == "image"
+        self.encoder = self._build_encoder() if config.actor_observation == "image" else None
         sizes = (config.hidden_width, config.hidden_depth, config.task_width, config.vocabulary_size)
-        if self.uses_images:
-            bfloat16 = use_bfloat16(config.dtype, config.device or "cpu")
-            self.actor: nn.Module = ImageNetwork(config.state_width, *sizes, config.keypoints, bfloat16)
-        else:
-            self.actor = StateNetwork(config.state_width + config.environment_state_width, *sizes)
+        seen = self.encoder.width if self.encoder else config.environment_state_width
+        self.actor = StateNetwork(config.state_width + seen, *sizes)
         self.head = self._build_head()
-        # A critic that sees a vector has a network of its own; one that sees the image reads the actor's.
-        self.critic: nn.Module | None = None
-        if config.critic_observation == "environment_state" or not self.uses_images:
-            self.critic = StateNetwork(config.state_width + config.environment_state_width, *sizes)
+        # What each of them sees besides the proprioception.
+        self.actor_key = ENCODING if self.encoder else OBS_ENV_STATE
+        privileged = config.critic_observation == "environment_state"
+        self.critic_key = OBS_ENV_STATE if privileged else self.actor_key
+        judged = config.environment_state_width if privileged else seen
+        self.critic = StateNetwork(config.state_width + judged, *sizes)
         self.value_head = ValueHead(config.hidden_width, config.value_width)
         self.to(config.device)
 
@@ -80,10 +80,20 @@ class PocketVLAPolicy(PreTrainedPolicy):
     def _build_head(self) -> nn.Module:
         """The layers from the actor's features (B, hidden_width) on."""
 
+    def _build_encoder(self) -> PoseEncoder:
+        config = self.config
+        return PoseEncoder(
+            config.state_width,
+            config.hand,
+            config.view,
+            config.camera[1][1:],
+            use_bfloat16(config.dtype, config.device or "cpu"),
+        )
+
     # What the networks are fed.
 
-    def _vector(self, batch: Batch, with_environment: bool) -> Tensor:
-        keys = [OBS_STATE] * bool(self.config.state_width) + [OBS_ENV_STATE] * with_environment
+    def _vector(self, batch: Batch, environment: str | None) -> Tensor:
+        keys = [OBS_STATE] * bool(self.config.state_width) + ([environment] if environment else [])
         if not keys:
             return torch.zeros(len(self._texts(batch)), 0, device=self.value_head.out.weight.device)
         return torch.cat([batch[key] for key in keys], dim=-1)
@@ -93,27 +103,44 @@ class PocketVLAPolicy(PreTrainedPolicy):
         texts = batch["task"]
         return [texts] if isinstance(texts, str) else list(texts)
 
-    def _features(self, batch: Batch, shift_px: int = 0) -> Tensor:
+    def _features(self, batch: Batch) -> Tensor:
         """Actor features, (B, hidden_width)."""
-        if not self.uses_images:
-            return self.actor(self._vector(batch, with_environment=True), self._texts(batch))
-        encoding = batch[ENCODING] if ENCODING in batch else self._encode(batch, shift_px)
-        return self.actor(encoding, self._vector(batch, with_environment=False), self._texts(batch))
+        batch = self._with_encoding(batch)
+        return self.actor(self._vector(batch, self.actor_key), self._texts(batch))
 
-    def _encode(self, batch: Batch, shift_px: int = 0) -> Tensor:
-        """What the image encoder says of the batch's images, (B, encoder.width)."""
-        assert isinstance(self.actor, ImageNetwork)
+    def _cloning_features(self, batch: Batch) -> tuple[Tensor, Tensor, dict[str, float]]:
+        """Actor features (B, hidden_width), what the encoder is taught (B,), and numbers for the log.
+
+        Where the data says where the bodies are, the encoder is taught that alone, and the actor learns to act on
+        what the encoder says. Else the actor's loss trains both.
+        """
+        if self.encoder is None or not self.encoder.num_bodies or OBS_ENV_STATE not in batch or ENCODING in batch:
+            features = self._features(batch)
+            return features, features.new_zeros(len(features)), {}
+        found, losses, distances = self.encoder.teach(
+            self._pictures(batch), self._vector(batch, None), batch[OBS_ENV_STATE]
+        )
+        features = self._features({**batch, ENCODING: found.detach()})
+        return features, losses, {"pose_error_mm": 1000 * float(distances.mean())}
+
+    def _with_encoding(self, batch: Batch) -> Batch:
+        """The batch with what the encoder says of its pictures, if the policy sees any."""
+        if self.encoder is None or ENCODING in batch:
+            return batch
+        found = self.encoder(self._pictures(batch), self._vector(batch, None))
+        return {key: value for key, value in batch.items() if key != self.config.camera[0]} | {ENCODING: found}
+
+    def _pictures(self, batch: Batch) -> Tensor:
         key, shape = self.config.camera
         check_image_size(batch[key], shape, key)
-        return self.actor.encode(random_shift(batch[key], shift_px), self._texts(batch))
+        return batch[key]
 
-    def _values(self, batch: Batch, features: Tensor | None) -> Tensor:
-        """Values (B,); `features` are the actor's, if they are at hand."""
-        if self.critic is not None:
-            return self.value_head(self.critic(self._vector(batch, with_environment=True), self._texts(batch)))
-        if features is None:
-            features = batch[FEATURES] if FEATURES in batch else self._features(batch)
-        return self.value_head(features.detach() if self.config.value_detach else features)
+    def _values(self, batch: Batch) -> Tensor:
+        """Values (B,). The value loss never trains the encoder."""
+        if self.critic_key == ENCODING:
+            batch = self._with_encoding(batch)
+            batch = {**batch, ENCODING: batch[ENCODING].detach()}
+        return self.value_head(self.critic(self._vector(batch, self.critic_key), self._texts(batch)))
 
     def _full_precision(self) -> torch.autocast:
         """Switch off a caller's autocast: only the convolutions may run in bfloat16."""
@@ -122,7 +149,7 @@ class PocketVLAPolicy(PreTrainedPolicy):
     # LeRobot's policy interface.
 
     def get_optim_params(self) -> list[dict[str, Any]]:  # ty: ignore[incompatible-method-override]
-        """Parameter groups for behaviour cloning: the actor's, weight decay on its matrices only.
+        """Parameter groups for behaviour cloning: encoder and actor, weight decay on matrices only.
 
         The fused step: the other one takes MKL's root, whose last bits depend on the processor.
         """
@@ -137,6 +164,8 @@ class PocketVLAPolicy(PreTrainedPolicy):
         groups = [{"params": matrices}, {"params": others, "weight_decay": 0.0}]
         if sigmas:
             groups.append({"params": sigmas, "weight_decay": 0.0, "lr": self.config.optimizer_sigma_lr})
+        if self.encoder:
+            groups.append({"params": list(self.encoder.parameters()), "lr": self.config.optimizer_encoder_lr})
         return [group | {"fused": True} for group in groups]
 
     # What an actor-critic trainer needs (structurally; nothing is imported from it).
@@ -144,42 +173,29 @@ class PocketVLAPolicy(PreTrainedPolicy):
     @property
     def encode_observation(self) -> Callable[[Batch], Batch] | None:
         """With `freeze_encoder`, the function that puts encodings in place of a batch's images; else None."""
-        return self._with_encoding if self.uses_images and self.config.freeze_encoder else None
+        return self._encoded if self.encoder and self.config.freeze_encoder else None
 
     @torch.no_grad()
-    def _with_encoding(self, batch: Batch) -> Batch:
+    def _encoded(self, batch: Batch) -> Batch:
         with self._full_precision():
-            kept = {key: value for key, value in batch.items() if key != self.config.camera[0]}
-            return kept | {ENCODING: self._encode(batch)}
-
-    @property
-    def value_inputs(self) -> Callable[[Batch], Batch] | None:
-        """The function that makes of a batch what the value's own parameters begin with: the inputs of a critic
-        of its own, or the actor's features; None if the value loss trains the actor, too."""
-        if self.critic is not None:
-            return self._critic_inputs
-        return self._actor_features if self.config.value_detach else None
-
-    def _critic_inputs(self, batch: Batch) -> Batch:
-        return {key: value for key, value in batch.items() if key in ("task", OBS_STATE, OBS_ENV_STATE)}
+            return self._with_encoding(batch)
 
     @torch.no_grad()
-    def _actor_features(self, batch: Batch) -> Batch:
+    def value_inputs(self, batch: Batch) -> Batch:
+        """What the critic, which is a network of its own, sees of a batch."""
         with self._full_precision():
-            return {FEATURES: self._features(batch)}
+            batch = self._with_encoding(batch) if self.critic_key == ENCODING else batch
+        return {key: value for key, value in batch.items() if key in ("task", OBS_STATE, self.critic_key)}
 
     def predict_values(self, batch: Batch) -> Tensor:
         """Values of the observations, (B,), differentiable."""
         with self._full_precision():
-            return self._values(batch, None)
+            return self._values(batch)
 
     def rl_parameter_groups(self) -> list[dict[str, Any]]:
         """Two disjoint groups, `policy` and `value`; they hold every parameter but those of a frozen encoder."""
-        value = list(self.value_head.parameters())
-        if self.critic is not None:
-            value += list(self.critic.parameters())
-        actor = self.actor
-        if self.config.freeze_encoder and isinstance(actor, ImageNetwork):
-            actor = actor.trunk
-        policy = [*actor.parameters(), *self.head.parameters()]
+        policy = [*self.actor.parameters(), *self.head.parameters()]
+        if self.encoder and not self.config.freeze_encoder:
+            policy += self.encoder.parameters()
+        value = [*self.critic.parameters(), *self.value_head.parameters()]
         return [{"name": "policy", "params": policy}, {"name": "value", "params": value}]

@@ -1,4 +1,4 @@
-"""The networks: text encoder, image encoder, and the trunk that the task modulates."""
+"""The networks behind the picture encoder: text encoder, the trunk that the task modulates, value head."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from lerobot_policy_pocketvla.images import spatial_softmax, to_signed_unit_range
 from lerobot_policy_pocketvla.tokenizer import token_ids
 
 STATE_LIMIT = 10.0
@@ -74,12 +73,10 @@ class Film(nn.Module):
         nn.init.zeros_(self.project.bias)
 
     def forward(self, x: Tensor, task: TaskEmbedding) -> Tensor:
-        """Scale and shift x, (B, features) or (B, features, H, W), by the task."""
+        """Scale and shift x (B, features) by the task."""
         scale, shift = self.project(task.unique).to(x.dtype).chunk(2, dim=-1)
         # What depends on the task alone is done once for each task, not for each of B rows.
         factor, shift = task.spread(1.0 + scale), task.spread(shift)
-        if x.ndim == 4:
-            factor, shift = factor[..., None, None], shift[..., None, None]
         return torch.addcmul(shift, x, factor)
 
 
@@ -110,48 +107,8 @@ class FilmMLP(nn.Module):
         return x
 
 
-class ImageEncoder(nn.Module):
-    """Three convolutions, modulated by the task, read out as keypoints and as a coarse pooled map.
-
-    The stem (8 x 8, stride 4) decides the speed on a CPU; a finer one costs five times as much.
-
-    Args:
-        task_width: width of the task embedding.
-        keypoints: number of spatial-softmax keypoints.
-        bfloat16: run the convolutions in bfloat16; all that follows them is float32.
-    """
-
-    POOLED_CHANNELS = 16
-    POOLED_SIZE = 4
-
-    def __init__(self, task_width: int, keypoints: int, bfloat16: bool) -> None:
-        """Build the layers."""
-        super().__init__()
-        self.use_bfloat16 = bfloat16
-        self.conv1 = nn.Conv2d(3, 32, 8, stride=4, padding=2)
-        self.conv2 = nn.Conv2d(32, 64, 3, stride=2, padding=1)
-        self.conv3 = nn.Conv2d(64, 64, 3, padding=1)
-        self.film2 = Film(task_width, 64)
-        self.film3 = Film(task_width, 64)
-        self.to_keypoints = nn.Conv2d(64, keypoints, 1)
-        self.to_pooled = nn.Conv2d(64, self.POOLED_CHANNELS, 1)
-        self.width = 2 * keypoints + self.POOLED_CHANNELS * self.POOLED_SIZE**2
-
-    def forward(self, images: Tensor, task: TaskEmbedding) -> Tensor:
-        """Images (B, 3, H, W), uint8 or in [0, 1], under their tasks to (B, width)."""
-        dtype = torch.bfloat16 if self.use_bfloat16 else torch.float32
-        x = to_signed_unit_range(images, dtype).contiguous(memory_format=torch.channels_last)
-        with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=self.use_bfloat16):
-            x = F.relu(self.conv1(x))
-            x = F.relu(self.film2(self.conv2(x), task))
-            x = F.relu(self.film3(self.conv3(x), task))
-            maps, pooled = self.to_keypoints(x), self.to_pooled(x)
-        pooled = F.adaptive_avg_pool2d(pooled.float(), self.POOLED_SIZE)
-        return torch.cat((spatial_softmax(maps), pooled.flatten(1)), dim=-1)
-
-
 class StateNetwork(nn.Module):
-    """Text encoder and trunk on vector observations; an actor's body or a critic of its own."""
+    """Text encoder and trunk on vector observations: an actor's body, or a critic's."""
 
     def __init__(self, inputs: int, width: int, depth: int, task_width: int, vocabulary_size: int) -> None:
         """Build the layers."""
@@ -162,35 +119,6 @@ class StateNetwork(nn.Module):
     def forward(self, state: Tensor, texts: list[str]) -> Tensor:
         """Normalised states (B, inputs) and B instructions to features (B, width)."""
         return self.trunk(state.float().clamp(-STATE_LIMIT, STATE_LIMIT), self.text(texts))
-
-
-class ImageNetwork(nn.Module):
-    """Text encoder, image encoder and trunk on an image and the proprioception."""
-
-    def __init__(
-        self,
-        inputs: int,
-        width: int,
-        depth: int,
-        task_width: int,
-        vocabulary_size: int,
-        keypoints: int,
-        bfloat16: bool,
-    ) -> None:
-        """Build the layers."""
-        super().__init__()
-        self.text = TextEncoder(vocabulary_size, task_width)
-        self.encoder = ImageEncoder(task_width, keypoints, bfloat16)
-        self.trunk = FilmMLP(self.encoder.width + inputs, width, depth, task_width)
-
-    def encode(self, images: Tensor, texts: list[str]) -> Tensor:
-        """Images (B, 3, H, W) under B instructions to encodings (B, encoder.width), float32."""
-        return self.encoder(images, self.text(texts))
-
-    def forward(self, encoding: Tensor, state: Tensor, texts: list[str]) -> Tensor:
-        """Encodings, normalised proprioception (B, inputs), B instructions to features (B, width)."""
-        state = state.float().clamp(-STATE_LIMIT, STATE_LIMIT)
-        return self.trunk(torch.cat((encoding, state), dim=-1), self.text(texts))
 
 
 class ValueHead(nn.Module):

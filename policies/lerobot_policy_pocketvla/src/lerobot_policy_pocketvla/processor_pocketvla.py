@@ -11,6 +11,7 @@ from lerobot.processor import (
 )
 
 from lerobot_policy_pocketvla.action_bounds import ActionBoundsProcessorStep
+from lerobot_policy_pocketvla.bodies import BodiesProcessorStep
 from lerobot_policy_pocketvla.configuration_pocketvla import PocketVLAConfig
 
 EPS = 1e-3
@@ -32,7 +33,8 @@ def make_pocketvla_pre_post_processors(
         dataset_stats: LeRobot's statistics per feature.
 
     Returns:
-        The preprocessor (states to zero mean and unit deviation, actions from `action_bounds` to [-1, 1],
+        The preprocessor (bodies as `describe_bodies` says, other states to zero mean and unit
+        deviation, actions from `action_bounds` to [-1, 1],
         images as they are) and the postprocessor (actions back to physical units, on the CPU).
     """
     steps = make_default_policy_processor_steps(config, dataset_stats, normalizer_device=config.device)
@@ -43,6 +45,7 @@ def make_pocketvla_pre_post_processors(
             steps.rename_observations,
             steps.add_batch_dim,
             steps.to_device,
+            *([BodiesProcessorStep()] if config.bodies else []),
             steps.normalize,
             ActionBoundsProcessorStep(low, high),
         ],

@@ -50,17 +50,17 @@ class PocketVLATokenPolicy(PocketVLAPolicy, heads=("gaussian", "categorical")):
             The loss, a scalar or (B,), in nats summed over the action's dimensions, and numbers for the log.
         """
         with self._full_precision():
-            shift_px = self.config.random_shift_px if self.training else 0
-            distribution = BinDistribution(self.head(self._features(batch, shift_px)))
+            features, taught, metrics = self._cloning_features(batch)
+            distribution = BinDistribution(self.head(features))
         target = batch[ACTION].reshape(-1, self.config.action_dim)
         tokens = self._target_tokens(target)
         losses = -distribution.log_prob(tokens)
         valid = torch.ones_like(losses)
         if "action_is_pad" in batch:
             valid = 1.0 - batch["action_is_pad"].reshape(-1).to(losses.dtype)
-        losses = losses * valid
+        losses = losses * valid + taught
         loss = losses if reduction == "none" else losses.sum() / valid.sum().clamp(min=1.0)
-        return loss, self._metrics(distribution, target, valid)
+        return loss, self._metrics(distribution, target, valid) | metrics
 
     def _target_tokens(self, actions: Tensor) -> Tensor:
         tokens = actions_to_tokens(actions, self.config.num_bins)
@@ -131,14 +131,14 @@ class PocketVLATokenPolicy(PocketVLAPolicy, heads=("gaussian", "categorical")):
             the dimensions, at this temperature; `value` (B,). Temperature 0 is greedy, its `log_prob` is 0.
         """
         with self._full_precision():
-            features = self._features(batch)
-            distribution = BinDistribution(self.head(features))
+            batch = self._with_encoding(batch)
+            distribution = BinDistribution(self.head(self._features(batch)))
             tokens = distribution.sample(temperature, generator, uniform)
             return {
                 "actions": tokens_to_actions(tokens, self.config.num_bins).unsqueeze(1),
                 "trace": tokens,
                 "log_prob": distribution.log_prob(tokens, temperature),
-                "value": self._values(batch, features),
+                "value": self._values(batch),
             }
 
     def evaluate_actions(self, batch: Batch, tokens: Tensor, *, temperature: float = 1.0) -> dict[str, Tensor]:
@@ -149,6 +149,6 @@ class PocketVLATokenPolicy(PocketVLAPolicy, heads=("gaussian", "categorical")):
             `value` (B,).
         """
         with self._full_precision():
-            features = self._features(batch)
-            log_prob, entropy = self.head.evaluate(features, tokens, temperature)
-            return {"log_prob": log_prob, "entropy": entropy, "value": self._values(batch, features)}
+            batch = self._with_encoding(batch)
+            log_prob, entropy = self.head.evaluate(self._features(batch), tokens, temperature)
+            return {"log_prob": log_prob, "entropy": entropy, "value": self._values(batch)}

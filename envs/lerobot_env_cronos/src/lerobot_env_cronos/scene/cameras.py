@@ -38,16 +38,27 @@ def _rotation(xyaxes: list[float]) -> np.ndarray:
     return np.stack([x, y, np.cross(x, y)], axis=1)
 
 
+def camera_projection(name: str, height: int, width: int) -> np.ndarray:
+    """The matrix (3, 4) of a camera's picture of `height` x `width` pixels.
+
+    Times a point (x, y, z, 1) in the base frame [m] it is (u w, v w, w), w the depth [m]. u to the right and v
+    downwards lie in [-1, 1] inside the picture.
+    """
+    camera = CAMERAS[name]
+    rotation, zoom = _rotation(camera["xyaxes"]), 1 / np.tan(np.deg2rad(camera["fovy"]) / 2)
+    # A camera looks along its -z axis, and its y axis points up.
+    scale = np.diag([zoom * height / width, -zoom, -1.0])
+    return scale @ np.concatenate([rotation.T, -(rotation.T @ camera["pos"])[:, None]], axis=1)
+
+
 def is_in_view(points: np.ndarray, camera: str = "front") -> np.ndarray:
     """Whether points (..., 3) in the base frame [m] lie inside a square picture of `camera`: (...,) bool.
 
     The front view decides whether a body is seen, whatever the observation.
     """
-    view = CAMERAS[camera]
-    x, y, z = np.moveaxis((points - np.array(view["pos"])) @ _rotation(view["xyaxes"]), -1, 0)
-    # A camera looks along its -z axis.
-    limit = -z * np.tan(np.deg2rad(view["fovy"]) / 2)
-    return (z < 0) & (np.abs(x) <= limit) & (np.abs(y) <= limit)
+    projection = camera_projection(camera, 1, 1)
+    x, y, depth = np.moveaxis(points @ projection[:, :3].T + projection[:, 3], -1, 0)
+    return (depth > 0) & (np.abs(x) <= depth) & (np.abs(y) <= depth)
 
 
 def is_spawn_area_in_view(scene: Scene, body: Body) -> bool:

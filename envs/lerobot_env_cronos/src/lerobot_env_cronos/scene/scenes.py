@@ -14,6 +14,11 @@ CONTROL_HZ = 5
 STEPS_PER_TASK = 80
 """K, the task-switch interval and the window of an evaluation episode [control steps] (paper, Section 4)."""
 
+LONG = 1.5
+"""Length over width from which on a body has two ends."""
+END_SHARE = 0.8
+"""Where an end is, as a share of the way from the centre to the end of the bounding box."""
+
 
 @dataclass(frozen=True)
 class Body:
@@ -29,6 +34,17 @@ class Body:
     density: float
     shape: str
     colour: tuple[float, float, float] | None = None
+
+    @property
+    def keypoints(self) -> tuple[tuple[float, float, float], ...]:
+        """Points in the body's frame that tell its pose [m]: its centre, and both ends if it is long."""
+        width, length = sorted(self.size[:2])
+        if length < LONG * width:
+            return ((0.0, 0.0, 0.0),)
+        end = [0.0, 0.0, 0.0]
+        end[self.size.index(length)] = END_SHARE * length / 2
+        x, y, z = end
+        return ((0.0, 0.0, 0.0), (x, y, z), (-x, -y, -z))
 
 
 @dataclass(frozen=True)

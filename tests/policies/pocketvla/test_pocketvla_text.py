@@ -1,7 +1,6 @@
-"""Instructions as text, and images as tensors."""
+"""Instructions as text."""
 
 import torch
-from lerobot_policy_pocketvla.images import random_shift, spatial_softmax, to_signed_unit_range
 from lerobot_policy_pocketvla.networks import TextEncoder
 from lerobot_policy_pocketvla.tokenizer import token_ids, words_of
 
@@ -40,35 +39,3 @@ def test_a_text_is_encoded_alike_alone_and_beside_longer_ones():
     alone = encoder(["put it"]).unique[0]
     beside = encoder(["put the very long named thing on the table over there", "put it"]).unique[1]
     torch.testing.assert_close(alone, beside)
-
-
-def test_bytes_and_floats_give_the_same_image():
-    images = torch.arange(256, dtype=torch.uint8).repeat(3, 1)[None, :, None, :]
-    from_bytes = to_signed_unit_range(images, torch.float32)
-    from_floats = to_signed_unit_range(images.float() / 255, torch.float32)
-    torch.testing.assert_close(from_bytes, from_floats, atol=1e-6, rtol=0)
-    assert from_bytes.min().item() == -1.0
-    assert from_bytes.max().item() == 1.0
-    half = to_signed_unit_range(images, torch.bfloat16).float()
-    torch.testing.assert_close(half, from_bytes, atol=2**-9, rtol=0)
-
-
-def test_spatial_softmax_finds_a_peak():
-    maps = torch.zeros(1, 2, 5, 9)
-    maps[0, 0, 0, 8] = 100.0  # top right
-    maps[0, 1, 2, 4] = 100.0  # centre
-    torch.testing.assert_close(spatial_softmax(maps), torch.tensor([[1.0, 0.0, -1.0, 0.0]]), atol=1e-5, rtol=0)
-
-
-def test_random_shift_moves_whole_images_by_at_most_the_limit():
-    image = torch.zeros(1, 3, 16, 16, dtype=torch.uint8)
-    image[:, :, 8, 8] = 200
-    shifted = random_shift(image.expand(64, 3, 16, 16), 2, torch.Generator().manual_seed(0))
-    assert shifted.shape == (64, 3, 16, 16)
-    where = (shifted[:, 0] == 200).nonzero()
-    assert len(where) == 64
-    assert torch.equal(shifted[:, 0], shifted[:, 2])
-    offsets = {tuple(row) for row in (where[:, 1:] - 8).tolist()}
-    assert max(abs(o) for pair in offsets for o in pair) == 2
-    assert len(offsets) > 10
-    assert random_shift(image, 0) is image
