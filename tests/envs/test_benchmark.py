@@ -127,6 +127,16 @@ def test_a_bad_row_is_named(file, row, values, message, mine, tmp_path):
         read_benchmark(tmp_path, "me/mine@abc")
 
 
+@pytest.mark.parametrize(("file", "key"), [("independent/train", "task"), ("sequential/held_out", "ordering")])
+def test_numbers_that_do_not_begin_with_0_are_refused(file, key, mine, tmp_path):
+    """They would be taken for places in a list, and each task would get another's results."""
+    write_benchmark(mine[0], tmp_path)
+    for row, values in enumerate(pq.read_table(tmp_path / f"{file}.parquet").to_pylist()):
+        change(tmp_path, file, row, **{key: values[key] + 1})
+    with pytest.raises(BenchmarkError, match=file):
+        read_benchmark(tmp_path, "it")
+
+
 HOSTILE = {
     # Files of kilobytes that hold gigabytes.
     "rows": lambda table: repeat_row(table, 1_000_000),

@@ -357,6 +357,9 @@ def _read_groups(table: _Table, scene: Scene, suite: str, num_configurations: in
 
 
 def _check_tasks(table: _Table, tasks: dict[int, tuple[Task, ...]], suite: str) -> None:
+    # Results take a number for the place among the tasks.
+    if sorted(tasks) != list(range(len(tasks))):
+        raise table.fail(None, f"tasks or orderings must be numbered from 0, got {_short(sorted(tasks))}")
     if len(lengths := {len(chain) for chain in tasks.values()}) > 1 or 0 in lengths:
         raise table.fail(None, f"chains must be of one length, at least 1, got {sorted(lengths)}")
     if suite == "independent" and len(set(tasks.values())) < len(tasks):
