@@ -24,8 +24,10 @@ class DummyTask:
         return f"go to {self.goal}"
 
 
-TASKS = (DummyTask(1.0, "a"), DummyTask(-1.0, "a"), DummyTask(2.0, "b"), DummyTask(-2.0, "b"))
-RESET_TASKS = (DummyTask(0.0, "a"), DummyTask(0.5, "b"))
+BODIES = ("toy bear", "ketchup bottle", "yellow plate")
+BEAR, BOTTLE, _ = BODIES
+TASKS = (DummyTask(1.0, BEAR), DummyTask(-1.0, BEAR), DummyTask(2.0, BOTTLE), DummyTask(-2.0, BOTTLE))
+RESET_TASKS = (DummyTask(0.0, BEAR), DummyTask(0.5, BOTTLE))
 EPISODES = tuple(EpisodeGroup(i, (task,), tuple(range(64))) for i, task in enumerate(TASKS))
 
 
@@ -41,9 +43,7 @@ class DummyEnv:
 
     def __init__(self, num_envs: int, diverge_at: set[tuple[int, int]] | None = None):
         self.num_envs = num_envs
-        self.scene = SimpleNamespace(
-            name="dummies", tasks=TASKS, reset_tasks=RESET_TASKS, bodies=("a", "b", "plate")
-        )
+        self.scene = SimpleNamespace(name="dummies", tasks=TASKS, reset_tasks=RESET_TASKS, bodies=BODIES)
         self.lost: set[tuple[int, int]] = set()
         self.tasks = [TASKS[0]] * num_envs
         self.x = np.zeros(num_envs)

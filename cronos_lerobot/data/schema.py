@@ -175,9 +175,7 @@ def describe_observation(env: CronosVectorEnv, space: gymnasium.Space | None = N
         "state_names": next(n for n in names if len(n) == size),
         "environment_state_names": environment_state_names(env.scene),
         "keypoints": {
-            name.replace(" ", "_"): [list(point) for point in BODIES[name].keypoints]
-            for name in env.scene.bodies
-            if name in BODIES
+            name.replace(" ", "_"): [list(point) for point in BODIES[name].keypoints] for name in env.scene.bodies
         },
         "projections": {
             camera: camera_projection(camera, *(box.shape or ())[:2]).tolist()

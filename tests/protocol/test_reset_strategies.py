@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from dummies import RESET_TASKS, TASKS, DummyEnv
+from dummies import BODIES, RESET_TASKS, TASKS, DummyEnv
 from test_rf_mtrl import FastEnv, protocol, run
 
 from cronos_lerobot.protocol.config import ProtocolConfig
@@ -19,7 +19,7 @@ from cronos_lerobot.protocol.task_orders import TASK_ORDERS, register_task_order
 BOTH = [0, 1]
 SEGMENT = ["set_task", "observe", "act", "step", "store", "act", "step", "store"]
 EER, SCENE = ("end_effector_reset", BOTH), ("scene_reset", BOTH)
-PUT_BACK = ("put_back", 1, "b")
+PUT_BACK = ("put_back", 1, "ketchup bottle")
 
 # K = 2, U = 4, two streams, six segments of 4 interaction steps; T stands for the paper's, in segments:
 # T = 80 is 1 segment, 320 is 2 and 1280 is 4. The curriculum's first half is 12 of 24 steps.
@@ -59,7 +59,7 @@ TABLE_1 = {
 def test_tape_of_every_row_of_table_1(row):
     options, after_segment = TABLE_1[row]
     env = DummyEnv(2)
-    env.lost = {(1, 1)}  # body "b" of stream 1 is out of the workspace from the start
+    env.lost = {(1, 1)}  # the bottle of stream 1 is out of the workspace from the start
     env, _, loop, _ = run(protocol(**options), steps=24, env=env)
     expected = [SCENE]  # the first placement
     for number, resets in enumerate(after_segment, start=1):
@@ -118,7 +118,7 @@ def test_one_heuristic_reset_for_a_stream_however_many_bodies():
     env.lost = {(0, 0), (0, 1), (0, 2)}
     env, _, loop, events = run(protocol(heuristic_reset=True, scene_reset_interval=None), steps=8, env=env)
     assert [call for call in env.calls if call[0] == "put_back"] == [
-        ("put_back", 0, b) for b in ("a", "b", "plate")
+        ("put_back", 0, body) for body in BODIES
     ]
     assert loop.stream_interventions.tolist() == [1, 0]
     third = [event for event in events if isinstance(event, Step)][2]

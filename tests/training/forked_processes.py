@@ -106,7 +106,7 @@ def serve(address):
 
 
 class WanderingEnv(DummyEnv):
-    """Part of a world of streams, in which body "a" is lost beyond 1.4 and put back at a random place."""
+    """Part of a world of streams, in which the bear is lost beyond 1.4 and put back at a random place."""
 
     def __init__(self, num_envs, first=0, dies_at=None):
         diverge_at = {(t, i - first) for t, i in DIVERGES if first <= i < first + num_envs}
