@@ -36,8 +36,7 @@ SCALES = {
 """Flags that depend on the scale."""
 CLONE = "--policy.type=pocketvla --policy.device=cpu --policy.push_to_hub=false"
 CLONE_RUN = "--log_freq=40 --num_workers=0 --wandb.enable=false --seed=1"
-RESETS = "--protocol.scene_reset_interval=320 --protocol.reset_phase=staggered"
-RESETS += " --protocol.end_effector_reset=true"
+RESETS = "--protocol.scene_reset_interval=320 --protocol.reset_phase=staggered --protocol.end_effector_reset=true"
 RECORD = "--record.repo_id=local/cronos_demo_streams --record.streams=1"
 
 

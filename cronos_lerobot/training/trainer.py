@@ -63,6 +63,8 @@ class Trainer:
         self._saves = Schedule(self.config.save_freq, self.loop.n)
         self._update: dict[str, Any] | None = None
         """Metrics of the latest update, until they are logged."""
+        record = self.config.record
+        self._num_recorded = record.count(self.config.num_envs) if record.repo_id is not None else 0
         # First what may be refused: the logger cuts the metrics to where the checkpoint left them.
         self.recorder = StreamObserver(
             run, observers.get("recorder"), lambda why: self.logger.log("recording", why)
@@ -173,9 +175,8 @@ class Trainer:
         if isinstance(event, Step):
             self.run.agent.end_step(event.success)
             with self.run.stopwatch("record"):
-                if (record := self.config.record).repo_id is not None:
-                    num_recorded = record.count(self.config.num_envs)
-                    self.recorder.on_step(whole_step(event, self.run.ranks, num_recorded))
+                if self._num_recorded:
+                    self.recorder.on_step(whole_step(event, self.run.ranks, self._num_recorded))
         elif isinstance(event, Update):
             self._update = event.metrics
         elif isinstance(event, SegmentEnd):
