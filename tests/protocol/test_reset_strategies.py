@@ -117,9 +117,7 @@ def test_one_heuristic_reset_for_a_stream_however_many_bodies():
     env = DummyEnv(2)
     env.lost = {(0, 0), (0, 1), (0, 2)}
     env, _, loop, events = run(protocol(heuristic_reset=True, scene_reset_interval=None), steps=8, env=env)
-    assert [call for call in env.calls if call[0] == "put_back"] == [
-        ("put_back", 0, body) for body in BODIES
-    ]
+    assert [call for call in env.calls if call[0] == "put_back"] == [("put_back", 0, body) for body in BODIES]
     assert loop.stream_interventions.tolist() == [1, 0]
     third = [event for event in events if isinstance(event, Step)][2]
     assert third.preceded_by.tolist() == [Intervention.HEURISTIC_RESET, Intervention.END_EFFECTOR_RESET]

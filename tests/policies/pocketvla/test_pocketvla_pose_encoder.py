@@ -118,6 +118,24 @@ def test_cloning_teaches_the_encoder_the_poses_alone():
     torch.testing.assert_close(loss, actor_alone + taught.mean(), atol=1e-3, rtol=1e-3)
 
 
+def test_padding_teaches_nothing():
+    policy = PocketVLAPolicy(labelled_config(dtype="float32")).eval()
+    batch = labelled_batch(4)
+    half = {key: value[:2] for key, value in batch.items()}
+    padded = policy.forward(batch | {"action_is_pad": torch.tensor([False, False, True, True])})[0]
+    torch.testing.assert_close(padded, policy.forward(half)[0])
+
+
+@pytest.mark.parametrize("head", ["gaussian", "flow"])
+def test_without_labels_the_actors_loss_leaves_the_poses_alone(head):
+    policy = PocketVLAPolicy(labelled_config(head=head))
+    batch = labelled_batch(4) | ({"action": torch.zeros(4, 4, 7)} if head == "flow" else {})
+    del batch["observation.environment_state"]
+    policy.forward(batch)[0].backward()
+    assert all(parameter.grad is None for parameter in policy.encoder.parameters())
+    assert any(parameter.grad is not None for parameter in policy.actor.parameters())
+
+
 def test_places_are_learnt_from_pictures():
     torch.manual_seed(0)
     policy = PocketVLAPolicy(labelled_config(dtype="float32"))

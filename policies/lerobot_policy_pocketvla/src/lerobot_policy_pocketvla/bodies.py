@@ -19,7 +19,7 @@ BODY_PARTS = (
 hand [m]."""
 BODY_WIDTH = len(BODY_PARTS) + 2
 """Numbers for each body after `BodiesProcessorStep`."""
-POSITION, ROTATION, FROM_HAND = slice(0, 3), slice(3, 9), slice(9, 12)
+POSITION, ROTATION, FROM_HAND, DOUBLED_YAW = slice(0, 3), slice(3, 9), slice(9, 12), slice(12, 14)
 """Where they are among them."""
 POSITION_UNIT_M = 0.1
 """Length that 1 stands for in what the policy reads."""
@@ -46,13 +46,13 @@ def describe_bodies(state: Tensor) -> Tensor:
             parts[..., POSITION] / POSITION_UNIT_M,
             rotation,
             parts[..., FROM_HAND] / POSITION_UNIT_M,
-            doubled_yaw(rotation),
+            _doubled_yaw(rotation),
         ),
         dim=-1,
     ).flatten(-2)
 
 
-def doubled_yaw(rotation: Tensor) -> Tensor:
+def _doubled_yaw(rotation: Tensor) -> Tensor:
     """Cosine and sine of twice the yaw (..., 2) of rotations (..., 6), their first two columns."""
     x, y = rotation[..., 0], rotation[..., 1]
     # A body that stands on end has no yaw: both are 0.

@@ -112,7 +112,8 @@ class PocketVLAConfig(PreTrainedConfig):
     optimizer_sigma_lr: float = 1e-2
     """Peak learning rate of the raw sigmas, which have far to go and see every sample."""
     optimizer_weight_decay: float = 1e-4
-    """AdamW's weight decay of the weight matrices; biases, norms, embeddings and sigmas have none."""
+    """AdamW's weight decay of the encoder and the actor's matrices; its biases, norms, embeddings and sigmas have
+    none."""
     optimizer_grad_clip_norm: float = 10.0
     """Largest gradient norm in behaviour cloning."""
     scheduler_warmup_steps: int = 1000
@@ -259,10 +260,10 @@ class PocketVLAConfig(PreTrainedConfig):
         state, privileged = features.get(OBS_STATE, {}), features.get(OBS_ENV_STATE, {})
         names = list(state.get("names") or [])
         hand = [f"ee.{axis}" for axis in "xyz"]
-        self.bodies = bodies_named(privileged.get("names"))
-        if not self.bodies or not set(hand) <= set(names):
-            self.bodies = []
+        bodies = bodies_named(privileged.get("names"))
+        if not bodies or not set(hand) <= set(names):
             return
+        self.bodies = bodies
         self.hand = [names.index(name) for name in hand]
         # The policy's own step scales them; see bodies.py.
         self.normalization_mapping["ENV"] = NormalizationMode.IDENTITY

@@ -12,7 +12,6 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE, OBS_STR
 from torch import Tensor, nn
 
 from lerobot_policy_pocketvla.configuration_pocketvla import PocketVLAConfig
-from lerobot_policy_pocketvla.images import check_image_size
 from lerobot_policy_pocketvla.networks import StateNetwork, ValueHead
 from lerobot_policy_pocketvla.pose_encoder import PoseEncoder
 from lerobot_policy_pocketvla.precision import use_bfloat16
@@ -111,17 +110,18 @@ class PocketVLAPolicy(PreTrainedPolicy):
     def _cloning_features(self, batch: Batch) -> tuple[Tensor, Tensor, dict[str, float]]:
         """Actor features (B, hidden_width), what the encoder is taught (B,), and numbers for the log.
 
-        Where the data says where the bodies are, the encoder is taught that alone, and the actor learns to act on
-        what the encoder says. Else the actor's loss trains both.
+        An encoder that says where the bodies are is taught that alone, by batches that hold the truth, and the
+        actor learns to act on what it says. The actor's loss trains any other encoder.
         """
-        if self.encoder is None or not self.encoder.num_bodies or OBS_ENV_STATE not in batch or ENCODING in batch:
-            features = self._features(batch)
-            return features, features.new_zeros(len(features)), {}
-        found, losses, distances = self.encoder.teach(
-            self._pictures(batch), self._vector(batch, None), batch[OBS_ENV_STATE]
-        )
-        features = self._features({**batch, ENCODING: found.detach()})
-        return features, losses, {"pose_error_mm": 1000 * float(distances.mean())}
+        encoder = self.encoder if self.encoder and self.encoder.num_bodies else None
+        if encoder and OBS_ENV_STATE in batch and ENCODING not in batch:
+            found, losses, distances = encoder.teach(
+                self._pictures(batch), self._vector(batch, None), batch[OBS_ENV_STATE]
+            )
+            features = self._features({**batch, ENCODING: found.detach()})
+            return features, losses, {"pose_error_mm": 1000 * float(distances.mean())}
+        features = self._features(self._encoded(batch) if encoder else batch)
+        return features, features.new_zeros(len(features)), {}
 
     def _with_encoding(self, batch: Batch) -> Batch:
         """The batch with what the encoder says of its pictures, if the policy sees any."""
@@ -131,9 +131,15 @@ class PocketVLAPolicy(PreTrainedPolicy):
         return {key: value for key, value in batch.items() if key != self.config.camera[0]} | {ENCODING: found}
 
     def _pictures(self, batch: Batch) -> Tensor:
-        key, shape = self.config.camera
-        check_image_size(batch[key], shape, key)
-        return batch[key]
+        key, (channels, height, width) = self.config.camera
+        images = batch[key]
+        if images.ndim != 4 or images.shape[1:] != (channels, height, width):
+            raise ValueError(
+                f"{key} has shape {tuple(images.shape)}, but this policy was trained at (batch, {channels}, "
+                f"{height}, {width}), height and width last. Render or resize to {height} x {width}, or train a "
+                "policy at the other size."
+            )
+        return images
 
     def _values(self, batch: Batch) -> Tensor:
         """Values (B,). The value loss never trains the encoder."""
@@ -149,7 +155,7 @@ class PocketVLAPolicy(PreTrainedPolicy):
     # LeRobot's policy interface.
 
     def get_optim_params(self) -> list[dict[str, Any]]:  # ty: ignore[incompatible-method-override]
-        """Parameter groups for behaviour cloning: encoder and actor, weight decay on matrices only.
+        """Parameter groups for behaviour cloning: encoder and actor, of the actor only matrices decay.
 
         The fused step: the other one takes MKL's root, whose last bits depend on the processor.
         """

@@ -9,11 +9,11 @@ from torch.nn import functional as F  # noqa: N812
 
 from lerobot_policy_pocketvla.bodies import (
     BODY_WIDTH,
+    DOUBLED_YAW,
     FROM_HAND,
     POSITION,
     POSITION_UNIT_M,
     ROTATION,
-    doubled_yaw,
 )
 
 MEAN_BATCHES = 100
@@ -95,9 +95,9 @@ class PoseEncoder(nn.Module):
         self.width = HIDDEN_WIDTH
         self.hand = hand
         if view:
-            self._build_poses(view, state_width)
+            self._build_poses(view)
 
-    def _build_poses(self, view: View, state_width: int) -> None:
+    def _build_poses(self, view: View) -> None:
         self.width = BODY_WIDTH * self.num_bodies
         self.to_poses = nn.Linear(HIDDEN_WIDTH, self.num_bodies * 11)
         nn.init.zeros_(self.to_poses.bias)
@@ -142,7 +142,7 @@ class PoseEncoder(nn.Module):
         maps, features = self._look(images)
         poses = self._poses(*self._read(maps, features, state))
         truth = bodies.unflatten(-1, (self.num_bodies, BODY_WIDTH))
-        target = torch.cat((truth[..., ROTATION], doubled_yaw(truth[..., ROTATION])), dim=-1)
+        target = torch.cat((truth[..., ROTATION], truth[..., DOUBLED_YAW]), dim=-1)
         distance = (poses[..., :3] - truth[..., POSITION]) * (POSITION_UNIT_M / RESIDUAL_M)
         turned = poses[..., 3:] - target
         hand = self.to_hand(state[:, self.hand]) - (truth[:, 0, POSITION] - truth[:, 0, FROM_HAND])

@@ -33,9 +33,9 @@ def make_pocketvla_pre_post_processors(
         dataset_stats: LeRobot's statistics per feature.
 
     Returns:
-        The preprocessor (bodies as `describe_bodies` says, other states to zero mean and unit
-        deviation, actions from `action_bounds` to [-1, 1],
-        images as they are) and the postprocessor (actions back to physical units, on the CPU).
+        The preprocessor (bodies as `describe_bodies` says, other states to zero mean and unit deviation, actions
+        from `action_bounds` to [-1, 1], images as they are) and the postprocessor (actions back to physical units,
+        on the CPU).
     """
     steps = make_default_policy_processor_steps(config, dataset_stats, normalizer_device=config.device)
     steps.normalize.eps = EPS

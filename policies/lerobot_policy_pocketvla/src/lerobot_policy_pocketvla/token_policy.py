@@ -58,7 +58,7 @@ class PocketVLATokenPolicy(PocketVLAPolicy, heads=("gaussian", "categorical")):
         valid = torch.ones_like(losses)
         if "action_is_pad" in batch:
             valid = 1.0 - batch["action_is_pad"].reshape(-1).to(losses.dtype)
-        losses = losses * valid + taught
+        losses = (losses + taught) * valid
         loss = losses if reduction == "none" else losses.sum() / valid.sum().clamp(min=1.0)
         return loss, self._metrics(distribution, target, valid) | metrics
 
