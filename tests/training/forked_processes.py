@@ -15,6 +15,7 @@ import pytest
 import torch
 from dummies import DummyEnv, DummyPolicy
 from forked_commands import ForkedPopen
+from lerobot.utils.import_utils import register_third_party_plugins
 from runs import DIVERGES, KilledError
 
 from cronos_lerobot.ranks import join_ranks
@@ -86,6 +87,7 @@ def together(function, *args, count=2):
 def serve(address):
     """Work for the process at the other end of a socket until it closes it."""
     torch.set_num_threads(1)
+    register_third_party_plugins()
     connected = socket.socket(socket.AF_UNIX)
     connected.connect(address)
     end = Connection(connected.detach())
