@@ -53,7 +53,7 @@ def test_a_process_that_used_it_ends_cleanly_and_another_draws_the_same(tmp_path
     env = CronosVectorEnv(2, renderer="filament")
     frames = np.load(path), env.observe()["pixels"]["front"]
     env.close()
-    assert frames[0].shape == (2, 128, 128, 3)
+    assert frames[0].shape == (2, 64, 64, 3)
     assert (frames[0] != frames[1]).mean() < 1e-3
 
 

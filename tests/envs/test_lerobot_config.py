@@ -42,8 +42,8 @@ def test_policy_features_match_what_the_env_observes():
     env = next(iter(cfg.create_envs(1)["independent_train"].values()))
     observation, _ = env.reset(seed=[0])
     for camera in ("front", "bridge"):
-        assert features[f"observation.images.{camera}"].shape == (3, 128, 128)
-        assert observation["pixels"][camera].shape == (1, 128, 128, 3)
+        assert features[f"observation.images.{camera}"].shape == (3, 64, 64)
+        assert observation["pixels"][camera].shape == (1, 64, 64, 3)
     assert features["observation.state"].shape == observation["agent_pos"].shape[1:]
     assert features["observation.environment_state"].shape == observation["environment_state"].shape[1:]
     env.close()

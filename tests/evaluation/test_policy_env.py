@@ -63,8 +63,8 @@ def test_whether_a_policy_reads_the_poses_beside_pictures(make, shown, reads):
 
 @pytest.fixture(scope="module")
 def of_playroom(tmp_path_factory):
-    """A policy that takes pictures of 96 x 64, trained in the playroom."""
-    size = {"scene": "playroom_2x2", "observation_height": 64, "observation_width": 96}
+    """A policy that takes pictures of 96 x 48, trained in the playroom."""
+    size = {"scene": "playroom_2x2", "observation_height": 48, "observation_width": 96}
     folder = save_policy(tmp_path_factory.mktemp("policy"), "pocketvla", size, hidden_width=16, hidden_depth=1)
     return write_train_config(folder, env={"type": "cronos", "scene": "playroom_2x2"} | FILAMENT)
 
@@ -72,9 +72,9 @@ def of_playroom(tmp_path_factory):
 @pytest.mark.parametrize(
     ("env", "flag", "scene", "height", "renderer"),
     [
-        (None, None, "playroom_2x2", 64, "filament"),
-        ({"type": "cronos", "renderer": "classic"}, None, "playroom_2x2", 64, "classic"),
-        (None, "--env.renderer=classic", "playroom_2x2", 64, "classic"),
+        (None, None, "playroom_2x2", 48, "filament"),
+        ({"type": "cronos", "renderer": "classic"}, None, "playroom_2x2", 48, "classic"),
+        (None, "--env.renderer=classic", "playroom_2x2", 48, "classic"),
         (
             {"type": "cronos", "scene": "kitchen_2x2", "observation_height": 128},
             None,
@@ -113,7 +113,7 @@ def test_an_environment_given_in_python_is_kept_and_flags_of_another_program_are
 
 def test_the_environment_of_a_checkpoint(of_playroom, tmp_path):
     env = expected_env(config_of(of_playroom))
-    assert (env.scene, env.obs_type, env.observation_height) == ("playroom_2x2", "pixels_agent_pos", 64)
+    assert (env.scene, env.obs_type, env.observation_height) == ("playroom_2x2", "pixels_agent_pos", 48)
     assert expected_env(config_of(of_playroom), "kitchen_3x3").scene == "kitchen_3x3"
     told = config_of(save_policy(tmp_path, "act", TOLD, **TINY_ACT))
     env = expected_env(told)

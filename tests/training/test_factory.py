@@ -60,10 +60,10 @@ def pictured(name, size):
 
 def test_pictures_of_another_size_are_told_and_empty_cameras_are_not_asked_for(caplog):
     env = CronosEnvConfig()
-    empty = pictured("observation.images.empty_camera_0", (3, 64, 64))
+    empty = pictured("observation.images.empty_camera_0", (3, 32, 32))
     for check in (check_observations, check_pictures):
         check(empty, env)
-        check(pictured("observation.images.front", (3, 128, 128)), env)
+        check(pictured("observation.images.front", (3, 64, 64)), env)
     assert not caplog.records
     # PocketVLA scales none.
     other = pictured("observation.images.front", (3, 64, 48))
@@ -79,21 +79,17 @@ RENAMED = {"observation.images.front": "observation.images.camera1"}
 
 def test_observations_may_have_another_name(tmp_path, monkeypatch):
     """A policy of somebody's camera1 learns from the scene's front camera, and its checkpoints know."""
-    policy = pictured("observation.images.camera1", (3, 128, 128))
+    policy = pictured("observation.images.camera1", (3, 64, 64))
     with pytest.raises(ValueError, match="--rename_map"):
         check_observations(policy, CronosEnvConfig())
     check_observations(policy, CronosEnvConfig(), RENAMED)
-    base = save_policy(
-        tmp_path / "base", "pocketvla", {"observation_height": 64, "observation_width": 64}, hidden_width=16,
-        hidden_depth=1,
-    )  # fmt: skip
+    base = save_policy(tmp_path / "base", "pocketvla", {}, hidden_width=16, hidden_depth=1)
     content = json.loads((base / "config.json").read_text())
     images = content["input_features"].pop("observation.images.front")
     content["input_features"]["observation.images.camera1"] = images
     (base / "config.json").write_text(json.dumps(content))
     flags = [flag for flag in SMALL if not flag.startswith("--policy.")]
-    size = ("--env.observation_height=64", "--env.observation_width=64")
-    start = (*flags, *size, f"--policy.path={base}", "--policy.device=cpu", f"--output_dir={tmp_path / 'run'}")
+    start = (*flags, f"--policy.path={base}", "--policy.device=cpu", f"--output_dir={tmp_path / 'run'}")
     with pytest.raises(SystemExit, match="--rename_map"):
         cronos_train(monkeypatch, *start)
     cronos_train(monkeypatch, *start, f"--rename_map={json.dumps(RENAMED)}", "--steps=16")

@@ -73,9 +73,9 @@ class CronosEnvConfig(EnvConfig):
     instructions (ACT, Diffusion); none does not."""
     privileged_state: bool = False
     """Add observation.environment_state to pixel observations, for an asymmetric critic."""
-    observation_height: int = 128
+    observation_height: int = 64
     """Height of the observed image [px]."""
-    observation_width: int = 128
+    observation_width: int = 64
     """Width of the observed image [px]."""
     camera_name: str = "front"
     """Camera(s), comma-separated: front (sees every body), bridge (the Bridge set-up's third-person view)."""

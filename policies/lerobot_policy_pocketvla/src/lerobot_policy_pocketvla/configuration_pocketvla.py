@@ -93,11 +93,11 @@ class PocketVLAConfig(PreTrainedConfig):
 
     task_width: int = 64
     """Width of the instruction's embedding."""
-    vocabulary_size: int = 4096
+    vocabulary_size: int = 1024
     """Hash buckets for words and pairs of words."""
-    hidden_width: int = 384
+    hidden_width: int = 256
     """Width of the trunk's layers."""
-    hidden_depth: int = 3
+    hidden_depth: int = 2
     """Number of the trunk's layers."""
     value_width: int = 256
     """Width of the value head's hidden layer."""
@@ -105,7 +105,7 @@ class PocketVLAConfig(PreTrainedConfig):
     """Format of the convolutions: `auto` is bfloat16 where the hardware multiplies it and oneDNN may use it,
     float32 elsewhere. All else, action probabilities included, is float32."""
 
-    optimizer_lr: float = 1e-3
+    optimizer_lr: float = 3e-3
     """Peak learning rate of behaviour cloning."""
     optimizer_encoder_lr: float = 3e-3
     """Peak learning rate of the picture encoder."""

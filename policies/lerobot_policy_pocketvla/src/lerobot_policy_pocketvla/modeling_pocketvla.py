@@ -113,6 +113,8 @@ class PocketVLAPolicy(PreTrainedPolicy):
         An encoder that says where the bodies are is taught that alone, by batches that hold the truth, and the
         actor learns to act on what it says. The actor's loss trains any other encoder.
         """
+        if self.encoder and self.training and ENCODING not in batch:
+            self.encoder.count_in(self._pictures(batch))
         encoder = self.encoder if self.encoder and self.encoder.num_bodies else None
         if encoder and OBS_ENV_STATE in batch and ENCODING not in batch:
             found, losses, distances = encoder.teach(

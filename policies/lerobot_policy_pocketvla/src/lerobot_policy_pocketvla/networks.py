@@ -62,26 +62,10 @@ class TextEncoder(nn.Module):
         return TaskEmbedding(unique, torch.tensor(rows, device=device))
 
 
-class Film(nn.Module):
-    """Feature-wise linear modulation by the task (Perez et al. 2018), the identity at the start."""
-
-    def __init__(self, task_width: int, features: int) -> None:
-        """Build the layers."""
-        super().__init__()
-        self.project = nn.Linear(task_width, 2 * features)
-        nn.init.zeros_(self.project.weight)
-        nn.init.zeros_(self.project.bias)
-
-    def forward(self, x: Tensor, task: TaskEmbedding) -> Tensor:
-        """Scale and shift x (B, features) by the task."""
-        scale, shift = self.project(task.unique).to(x.dtype).chunk(2, dim=-1)
-        # What depends on the task alone is done once for each task, not for each of B rows.
-        factor, shift = task.spread(1.0 + scale), task.spread(shift)
-        return torch.addcmul(shift, x, factor)
-
-
 class FilmMLP(nn.Module):
     """Hidden layers of one width, each normalised and modulated by the task; residual from the second on.
+
+    The task scales and shifts features (FiLM, Perez et al. 2018), at the start by 1 and 0.
 
     Args:
         inputs: width of the input.
@@ -96,13 +80,19 @@ class FilmMLP(nn.Module):
         sizes = [inputs + task_width] + [width] * (depth - 1)
         self.linears = nn.ModuleList(nn.Linear(size, width) for size in sizes)
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in sizes)
-        self.films = nn.ModuleList(Film(task_width, width) for _ in sizes)
+        self.films = nn.Linear(task_width, depth * 2 * width)
+        nn.init.zeros_(self.films.weight)
+        nn.init.zeros_(self.films.bias)
 
     def forward(self, x: Tensor, task: TaskEmbedding) -> Tensor:
         """Map x (B, inputs) under the task to (B, width)."""
         x = torch.cat((x, task.spread(task.unique)), dim=-1)
-        for layer, (linear, norm, film) in enumerate(zip(self.linears, self.norms, self.films, strict=True)):
-            hidden = F.silu(film(norm(linear(x)), task))
+        # What depends on the task alone is done once for each task, not for each of B rows.
+        films = task.spread(self.films(task.unique)).unflatten(-1, (len(self.linears), 2, -1)).unbind(1)
+        for layer, (linear, norm, film) in enumerate(zip(self.linears, self.norms, films, strict=True)):
+            scale, shift = film.unbind(1)
+            hidden = norm(linear(x))
+            hidden = F.silu(torch.addcmul(hidden + shift, hidden, scale))
             x = hidden if layer == 0 else x + hidden
         return x
 

@@ -138,7 +138,6 @@ class PoseEncoder(nn.Module):
         Returns:
             The encodings, the losses (B,), differentiable, and the errors of the positions (B, bodies) [m].
         """
-        self._count_in(images)
         maps, features = self._look(images)
         poses = self._poses(*self._read(maps, features, state))
         truth = bodies.unflatten(-1, (self.num_bodies, BODY_WIDTH))
@@ -202,9 +201,9 @@ class PoseEncoder(nn.Module):
         return -(target * supervised).sum(-1).mean(-1)
 
     @torch.no_grad()
-    def _count_in(self, images: Tensor) -> None:
-        """Let the mean picture be that of all batches up to this one."""
-        if self.training and self.mean_batches < MEAN_BATCHES:
+    def count_in(self, images: Tensor) -> None:
+        """Let the mean picture be that of the first batches up to this one."""
+        if self.mean_batches < MEAN_BATCHES:
             self.mean_batches += 1
             scale = 1.0 if images.dtype == torch.uint8 else 255.0
             self.mean_picture += (images.float().mean(0) * scale - self.mean_picture) / self.mean_batches

@@ -7,7 +7,7 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_policy_pocketvla.heads import (
-    BinDistribution,
+    Bins,
     CategoricalHead,
     GaussianHead,
     actions_to_tokens,
@@ -51,10 +51,10 @@ class PocketVLATokenPolicy(PocketVLAPolicy, heads=("gaussian", "categorical")):
         """
         with self._full_precision():
             features, taught, metrics = self._cloning_features(batch)
-            distribution = BinDistribution(self.head(features))
+            distribution: Bins = self.head(features)
         target = batch[ACTION].reshape(-1, self.config.action_dim)
         tokens = self._target_tokens(target)
-        losses = -distribution.log_prob(tokens)
+        losses = -distribution.log_prob(tokens, 1.0)
         valid = torch.ones_like(losses)
         if "action_is_pad" in batch:
             valid = 1.0 - batch["action_is_pad"].reshape(-1).to(losses.dtype)
@@ -70,7 +70,7 @@ class PocketVLATokenPolicy(PocketVLAPolicy, heads=("gaussian", "categorical")):
         return tokens
 
     @torch.no_grad()
-    def _metrics(self, distribution: BinDistribution, target: Tensor, valid: Tensor) -> dict[str, float]:
+    def _metrics(self, distribution: Bins, target: Tensor, valid: Tensor) -> dict[str, float]:
         greedy = tokens_to_actions(distribution.mode(), self.config.num_bins)
         error = (greedy - target.clamp(-1.0, 1.0)).abs().mean(-1)
         metrics = {"greedy_abs_error": float((error * valid).sum() / valid.sum().clamp(min=1.0))}
@@ -96,8 +96,23 @@ class PocketVLATokenPolicy(PocketVLAPolicy, heads=("gaussian", "categorical")):
         """
         temperature = self.config.temperature if temperature is None else temperature
         with self._full_precision():
-            tokens = BinDistribution(self.head(self._features(batch))).sample(temperature, generator)
+            tokens = self._draw(self.head(self._features(batch)), temperature, generator)
         return tokens_to_actions(tokens, self.config.num_bins)
+
+    @staticmethod
+    def _draw(
+        distribution: Bins,
+        temperature: float,
+        generator: torch.Generator | None,
+        uniform: Tensor | None = None,
+    ) -> Tensor:
+        """Bins (B, D): the likeliest at temperature 0, else at the quantiles `uniform` or at drawn ones."""
+        mode = distribution.mode()
+        if temperature == 0:
+            return mode
+        if uniform is None:
+            uniform = torch.rand(mode.shape, generator=generator, device=mode.device)
+        return distribution.sample(temperature, uniform)
 
     def predict_action_chunk(self, batch: Batch, **kwargs: Any) -> Tensor:
         """`select_action` as a chunk of one action, (B, 1, D)."""
@@ -132,12 +147,17 @@ class PocketVLATokenPolicy(PocketVLAPolicy, heads=("gaussian", "categorical")):
         """
         with self._full_precision():
             batch = self._with_encoding(batch)
-            distribution = BinDistribution(self.head(self._features(batch)))
-            tokens = distribution.sample(temperature, generator, uniform)
+            distribution: Bins = self.head(self._features(batch))
+            tokens = self._draw(distribution, temperature, generator, uniform)
+            log_prob = (
+                distribution.log_prob(tokens, temperature)
+                if temperature
+                else tokens.new_zeros(len(tokens), dtype=torch.float32)
+            )
             return {
                 "actions": tokens_to_actions(tokens, self.config.num_bins).unsqueeze(1),
                 "trace": tokens,
-                "log_prob": distribution.log_prob(tokens, temperature),
+                "log_prob": log_prob,
                 "value": self._values(batch),
             }
 
@@ -150,5 +170,9 @@ class PocketVLATokenPolicy(PocketVLAPolicy, heads=("gaussian", "categorical")):
         """
         with self._full_precision():
             batch = self._with_encoding(batch)
-            log_prob, entropy = self.head.evaluate(self._features(batch), tokens, temperature)
-            return {"log_prob": log_prob, "entropy": entropy, "value": self._values(batch)}
+            distribution: Bins = self.head(self._features(batch))
+            return {
+                "log_prob": distribution.log_prob(tokens, temperature),
+                "entropy": distribution.entropy(temperature),
+                "value": self._values(batch),
+            }
