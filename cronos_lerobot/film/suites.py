@@ -104,7 +104,6 @@ def _statuses(result: ChainResult, where: str) -> Iterator[Status]:
             position,
             len(tasks),
             succeeded=bool(trajectory.is_complete[t]),
-            interventions=0,
             outcomes=list(result.success[:position]),
             caption=f"{where}   task {position + 1}/{len(tasks)}   step {t}",
         )
@@ -137,7 +136,6 @@ def _last_segments(result: ChainResult, render: Render) -> list[np.ndarray]:
             k,
             length,
             succeeded=result.success[k],
-            interventions=0,
             outcomes=list(result.success[: k + 1]),
             caption=f"configuration {result.chain.configuration}",
             message=f"began {result.starts[k].replace('_', ' ')}",
