@@ -12,7 +12,7 @@ from cronos_lerobot.evaluation.independent import evaluate_independent
 from cronos_lerobot.protocol.loop_state import Event, SegmentEnd, Step, Update
 from cronos_lerobot.training.checkpoint import point_last_at, restore, save_checkpoint
 from cronos_lerobot.training.logging import RunLogger, SilentLogger
-from cronos_lerobot.training.recording import FilmedEnv, StreamObserver
+from cronos_lerobot.training.recording import StreamObserver
 from cronos_lerobot.training.rollout import RolloutStatistics, SmoothedSuccess
 from cronos_lerobot.training.run import Run
 from cronos_lerobot.training.run_folder import note_end, note_start
@@ -98,7 +98,7 @@ class Trainer:
             self._logged_steps = self.loop.n
             self.run.stopwatch.lap()
             env_state = None
-            for event in self.run.events(self._filmed_env()):
+            for event in self.run.events():
                 self._observe(event)
                 if isinstance(event, SegmentEnd):
                     # Reading the simulations' state wakes sleeping bodies, so it is done at every switch: the run
@@ -164,11 +164,6 @@ class Trainer:
         """Those of `eval_at_interventions` that were reached since the last evaluation."""
         wanted = self.config.eval_at_interventions
         return [count for count in wanted if self._evaluated_interventions < count <= self.loop.b]
-
-    def _filmed_env(self) -> Any:
-        record = self.config.record
-        films = record.repo_id is not None and record.filmed_streams and self.run.ranks.is_main
-        return FilmedEnv(self.run.env, record.filmed_streams) if films else self.run.env
 
     def _observe(self, event: Event) -> None:
         self.statistics.on_event(event)
