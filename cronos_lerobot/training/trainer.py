@@ -13,7 +13,7 @@ from cronos_lerobot.protocol.loop_state import Event, SegmentEnd, Step, Update
 from cronos_lerobot.training.checkpoint import point_last_at, restore, save_checkpoint
 from cronos_lerobot.training.logging import RunLogger, SilentLogger
 from cronos_lerobot.training.recording import StreamObserver
-from cronos_lerobot.training.rollout import RolloutStatistics, SmoothedSuccess
+from cronos_lerobot.training.rollout import RolloutStatistics
 from cronos_lerobot.training.run import Run
 from cronos_lerobot.training.run_folder import note_end, note_start
 from cronos_lerobot.training.sharding import whole_step
@@ -56,7 +56,6 @@ class Trainer:
         self.statistics = RolloutStatistics([task.instruction for task in run.task_set.all], num_tasks)
         if "statistics" in observers:
             self.statistics.load_state_dict(observers["statistics"])
-        self._smoothed = SmoothedSuccess(self.config.protocol, num_tasks)
         evaluated = observers.get("evaluated", {"steps": 0, "interventions": 0})
         self._evaluations = Schedule(self.config.eval_freq, evaluated["steps"])
         self._evaluated_interventions = evaluated["interventions"]
@@ -187,9 +186,9 @@ class Trainer:
         shares = {name: spent / wall for name, spent in sorted(seconds.items())}
         self.logger.log("update", record | {"time_share": shares})
         self._update = None
-        rates = self._smoothed.add(rollout, self.loop.n)
         if self.loop.updates % self.config.log_freq == 0:
-            self.logger.progress(rates | {"steps_per_s": steps_per_s})
+            rates = {name: rollout[name].rate for name in ("found_complete", "never_grasped")}
+            self.logger.progress({"success": rollout["success"], **rates, "steps_per_s": steps_per_s})
 
     @cached_property
     def _eval_env(self) -> Any:
