@@ -28,7 +28,6 @@ from lerobot_env_cronos.expert.expert import ScriptedExpert
 from cronos_lerobot.agents.base import ActionSample
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.video import fast_encoder
-from cronos_lerobot.data.writer import LateCamera
 from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import Step
 
@@ -66,29 +65,23 @@ class Recording:
     """
 
     def __init__(self, num_streams: int, height: int, width: int, steps: int) -> None:
-        self.env = CronosVectorEnv(
-            num_streams, observation_height=height, observation_width=width, render_size=(height, width)
-        )
-        self.camera = LateCamera(height, width, self.env.simulation.model.nq, self.env.render_positions)
+        self.env = CronosVectorEnv(num_streams, observation_height=height, observation_width=width)
         tasks = self.env.scene.tasks
         self.env.set_task(np.arange(num_streams), [tasks[i % len(tasks)] for i in range(num_streams)])
         expert = ScriptedExpert(self.env)
         expert.reset(np.arange(num_streams))
-        observation, self.steps, self.positions = self.env.observe(), [], []
+        observation, self.steps = self.env.observe(), []
         for _ in range(steps):
-            self.positions.append(self.env.positions(np.arange(num_streams)))
             action = expert.act().astype(np.float32)
             following, reward, *_, info = self.env.step(action)
             self.steps.append((observation, action, reward, info["is_success"]))
             observation = following
 
-    def write(self, recorder: StreamRecorder, *, drawn: bool = True) -> None:
-        """Hand all steps to a recorder, as the training loop does; if not `drawn`, states instead of pictures."""
+    def write(self, recorder: StreamRecorder) -> None:
+        """Hand all steps to a recorder, as the training loop does."""
         n = self.env.num_envs
         zeros, numbers, no = np.zeros(n, np.float32), np.zeros(n, np.int64), np.zeros(n, np.bool_)
         for t, (observation, action, reward, success) in enumerate(self.steps):
-            if not drawn:
-                observation = observation | {"pixels": dict.fromkeys(observation["pixels"], self.positions[t])}
             recorder.on_step(
                 Step(
                     t, observation, self.env.instructions, ActionSample(action, zeros, zeros),
@@ -127,14 +120,10 @@ def measure(frames: int, root: Path, write: Callable[[], None]) -> Cost:
 def compare_writers(num_streams: int, height: int, width: int, steps: int, folder: Path) -> dict[str, Cost]:
     """Write the same frames with the recorder, and with LeRobot's writer as it is and at its fastest."""
     recording = Recording(num_streams, height, width, steps)
-    frames, ours, drawn = num_streams * steps, folder / "ours", folder / "drawn"
+    frames, ours = num_streams * steps, folder / "ours"
     recorder = StreamRecorder.open(recording.env, REPO_ID, ours, segment_length=steps)
     features, fps = recorder.writer.features, int(recording.env.metadata["render_fps"])
     costs = {"StreamRecorder": measure(frames, ours, partial(recording.write, recorder))}
-    cameras = {"front": recording.camera}
-    late = StreamRecorder.open(recording.env, REPO_ID, drawn, segment_length=steps, cameras=cameras)
-    write = partial(recording.write, late, drawn=False)
-    costs["StreamRecorder, drawing too"] = measure(frames, drawn, write)
     segments = list(recording.segments(ours))
     # A longer queue: with its own, LeRobot drops frames that the encoder has no time for.
     fast = {"streaming_encoding": True, "rgb_encoder": fast_encoder(), "encoder_queue_maxsize": steps}

@@ -18,6 +18,6 @@ def test_each_command_reads_what_an_earlier_one_makes():
         "cronos-eval",
         "cronos-train",
         "cronos-eval",
-        "python",
+        "cronos-eval",
         "cronos-report",
     ]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from lerobot.utils.constants import ACTION, DONE, OBS_IMAGES, REWARD
+from lerobot.utils.constants import ACTION, DONE, REWARD
 from lerobot_env_cronos import CronosVectorEnv
 
 from cronos_lerobot.agents.processing import observation_columns
@@ -31,9 +31,8 @@ from cronos_lerobot.data.schema import (
     describe_observation,
     frame_format,
     stream_features,
-    with_cameras,
 )
-from cronos_lerobot.data.writer import LateCamera, SegmentWriter, UndrawnFrames
+from cronos_lerobot.data.writer import SegmentWriter
 from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import Step
 
@@ -59,7 +58,6 @@ class StreamRecorder:
         num_envs: int,
         segment_length: int,
         streams: int | str = "all",
-        cameras: Mapping[str, LateCamera] | None = None,
     ) -> None:
         """Record into `writer` (see `open` for the usual way to make one).
 
@@ -68,7 +66,6 @@ class StreamRecorder:
             num_envs: streams the loop runs.
             segment_length: the most steps between two task switches (K), the buffers' capacity.
             streams: how many of the streams to record, the first ones, or "all".
-            cameras: whose pictures are drawn when they are written, by name.
 
         Raises:
             ValueError: `streams` is neither "all" nor between 1 and `num_envs`.
@@ -81,7 +78,6 @@ class StreamRecorder:
         self.num_envs = num_envs
         self.num_streams = streams
         self.segment_length = segment_length
-        self._cameras = {f"{OBS_IMAGES}.{name}": camera for name, camera in (cameras or {}).items()}
         self._written: deque[dict[str, np.ndarray]] = deque()
         self._lengths = np.zeros(streams, dtype=np.int64)
         self._tasks = [""] * streams
@@ -97,7 +93,6 @@ class StreamRecorder:
         segment_length: int,
         streams: int | str = "all",
         describes: Sequence[str] = ("log_prob", "value"),
-        cameras: Mapping[str, LateCamera] | None = None,
         state: Mapping[str, Any] | None = None,
         flags: Mapping[str, Any] | None = None,
         **writer_options: Any,
@@ -111,31 +106,20 @@ class StreamRecorder:
             segment_length: the most steps between two task switches (K).
             streams: how many of the streams to record, or "all".
             describes: what the agent says of its actions, some of "log_prob" and "value".
-            cameras: pictures to record instead of the observation's, by name; `on_step` then takes, under
-                `pixels` and this name, the states (n, nq) to draw from.
             state: of `state_dict()`. Everything that was written after it is dropped from the dataset.
             flags: what the streams are made with, for `meta/cronos.json`.
             writer_options: passed on to `SegmentWriter`, which also says what is raised.
         """
-        space = env.single_observation_space
-        if cameras:
-            space = with_cameras(space, {name: (camera.height, camera.width) for name, camera in cameras.items()})
-            # A loop that is far ahead of the drawing waits: no more than two rounds of segments are due.
-            pixels = sum(camera.height * camera.width for camera in cameras.values())
-            rounds = 2 * segment_length * (env.num_envs if isinstance(streams, str) else streams)
-            writer_options = {"max_pending_bytes": rounds * pixels * 3} | writer_options
         writer = SegmentWriter(
             repo_id,
             root,
-            stream_features(space, describes=describes, **describe_observation(env, space)),
+            stream_features(env.single_observation_space, describes=describes, **describe_observation(env)),
             int(env.metadata["render_fps"]),
             resume=None if state is None else state["num_episodes"],
             origin=origin_of(env, STREAMS, flags or {}),
             **writer_options,
         )
-        recorder = cls(
-            writer, num_envs=env.num_envs, segment_length=segment_length, streams=streams, cameras=cameras
-        )
+        recorder = cls(writer, num_envs=env.num_envs, segment_length=segment_length, streams=streams)
         if state is not None:
             recorder.load_partial_segments(state)
         return recorder
@@ -233,8 +217,7 @@ class StreamRecorder:
     def _write_segment(self, stream: int) -> None:
         # The writer keeps the arrays until they are encoded, so the stream goes on in another buffer.
         length, whole = self._lengths[stream], self._buffers[stream]
-        frames: dict[str, Any] = {key: buffer[:length] for key, buffer in whole.items()}
-        frames |= {key: UndrawnFrames(camera, frames[key]) for key, camera in self._cameras.items()}
+        frames = {key: buffer[:length] for key, buffer in whole.items()}
         self.writer.add_segment(
             frames,
             self._tasks[stream],
@@ -251,8 +234,6 @@ class StreamRecorder:
         buffer = {}
         for key, feature in self.writer.features.items():
             shape, dtype = frame_format(feature)
-            if key in self._cameras:
-                shape, dtype = (self._cameras[key].num_positions,), np.dtype(np.float64)
             buffer[key] = np.empty((self.segment_length, *shape), dtype=dtype)
         return buffer
 

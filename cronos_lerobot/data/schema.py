@@ -152,23 +152,9 @@ def stream_features(
     return demonstration_features(observation_space, **names) | _scalar_features(own)
 
 
-def with_cameras(space: gymnasium.Space, cameras: Mapping[str, tuple[int, int]]) -> gymnasium.spaces.Dict:
-    """An observation space with other pictures: uint8 (height, width, 3) by camera, instead of its own."""
-    spaces = {key: part for key, part in cast(gymnasium.spaces.Dict, space).items() if key != "pixels"}
-    boxes: dict[str, gymnasium.Space] = {
-        name: gymnasium.spaces.Box(0, 255, (*size, 3), np.uint8) for name, size in cameras.items()
-    }
-    return gymnasium.spaces.Dict(spaces | {"pixels": gymnasium.spaces.Dict(boxes)})
-
-
-def describe_observation(env: CronosVectorEnv, space: gymnasium.Space | None = None) -> dict[str, Any]:
-    """What the numbers and pictures of `env` are of, as keyword arguments of `demonstration_features`.
-
-    Args:
-        env: of the scene.
-        space: what is recorded, if that is not what `env` shows.
-    """
-    space = cast(gymnasium.spaces.Dict, space or env.single_observation_space)
+def describe_observation(env: CronosVectorEnv) -> dict[str, Any]:
+    """What the numbers and pictures of `env` are of, as keyword arguments of `demonstration_features`."""
+    space = cast(gymnasium.spaces.Dict, env.single_observation_space)
     size = (space["agent_pos"].shape or (0,))[0]
     names = (agent_pos_names(env.scene, option) for option in TASK_OBSERVATIONS)
     return {

@@ -4,7 +4,7 @@
 streams = StreamDataset("me/stream", root="outputs/train/eer/streams")
 streams.check()                                           # nothing is missing, nothing is there twice
 for segment in streams.segments_of(0):                    # stream 0 from its first step to its last
-    print(segment.step, segment.task, segment.intervention.name, segment.success)
+    print(segment.step, segment.task, segment.event.name, segment.success)
 actions = streams.columns(segment, ["action"])["action"]  # (T, 7)
 ```
 """
@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import IO, Any, cast
 from urllib.parse import quote
@@ -100,19 +99,6 @@ class Segment:
     def frames(self) -> range:
         """LeRobot's indices of its frames."""
         return range(self.start, self.start + self.length)
-
-
-@dataclass(frozen=True)
-class Switch:
-    """The place between two segments of a stream."""
-
-    before: Segment
-    after: Segment
-
-    @property
-    def event(self) -> Intervention:
-        """What happened there; a new instruction at least."""
-        return self.after.event
 
 
 class StreamDataset:
@@ -233,33 +219,6 @@ class StreamDataset:
             raise ValueError(f"stream {stream} is not in {self.repo_id}; it has {self.streams}")
         return [segment for segment in self.segments if segment.stream == stream]
 
-    def switches(self, stream: int | None = None) -> Iterator[Switch]:
-        """The places between two segments that followed one another, of one stream or of all."""
-        for before, after in pairwise(self._in_time(stream)):
-            if before.stream == after.stream and after.step == before.step + before.length:
-                yield Switch(before, after)
-
-    def reset_free_episodes(self, stream: int | None = None) -> Iterator[list[Segment]]:
-        """What there is between two scene resets: the segments of a stream from one to the next."""
-        episode: list[Segment] = []
-        for segment in self._in_time(stream):
-            # What was filtered out may have been the first after a reset.
-            if episode and _reset(segment) != _reset(episode[-1]):
-                yield episode
-                episode = []
-            episode.append(segment)
-        if episode:
-            yield episode
-
-    def _in_time(self, stream: int | None) -> list[Segment]:
-        """The segments of a stream or of all; a ValueError where two runs' lie among each other."""
-        segments = self.segments if stream is None else self.segments_of(stream)
-        if any((a.stream, a.step) == (b.stream, b.step) for a, b in pairwise(segments)):
-            raise ValueError(
-                f"{self.repo_id} holds several recordings: read them one by one to know what followed what"
-            )
-        return segments
-
     def columns(self, segment: Segment, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Columns of a segment, (T, ...) each; all but pixels if no names are given.
 
@@ -276,11 +235,6 @@ class StreamDataset:
             filters=[("episode_index", "=", segment.episode)],
         )
         return {name: to_array(table[name]) for name in table.column_names}
-
-    def stream_columns(self, stream: int, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """Columns of a whole stream, from its first step to its last."""
-        parts = [self.columns(segment, names) for segment in self._in_time(stream)]
-        return {name: np.concatenate([part[name] for part in parts]) for name in names}
 
     def pixels(self, segment: Segment, camera: str, frames: slice = slice(None)) -> np.ndarray:
         """Pictures of a segment, uint8 (T, H, W, 3).
@@ -307,16 +261,6 @@ class StreamDataset:
         path = self.meta.root / self.meta.get_video_file_path(segment.episode, camera)
         return Clip(path, round(first * self.meta.fps), segment.length)
 
-    def switch_frames(self, switch: Switch) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """The last frame before a switch and the first after it, every column and picture."""
-        frames = []
-        for segment, at in ((switch.before, switch.before.length - 1), (switch.after, 0)):
-            frame = {name: column[at] for name, column in self.columns(segment).items()}
-            for camera in self.meta.video_keys:
-                frame[camera] = self.pixels(segment, camera, slice(at, at + 1))[0]
-            frames.append(frame)
-        return frames[0], frames[1]
-
     def annotations(self, names: Sequence[str]) -> Iterator[pd.DataFrame]:
         """Columns of single numbers, of all frames in LeRobot's order, a file at a time."""
         for file in (name for name in named_files(self.meta) if name.startswith("data/")):
@@ -338,11 +282,6 @@ class StreamDataset:
         for frames in self.annotations(COLUMNS):
             check.add(frames)
         check.finish(self.meta.total_frames, self.meta.total_episodes, is_finished=is_finished)
-
-
-def _reset(segment: Segment) -> tuple[int, int]:
-    """The stream, and the number of its first segment since the last scene reset."""
-    return segment.stream, segment.index - segment.position
 
 
 def _segment(row: dict[str, Any]) -> Segment:

@@ -37,64 +37,9 @@ class RecordingError(RuntimeError):
     """The dataset can no longer be written; what was flushed before stays and loads."""
 
 
-@dataclass(frozen=True)
-class LateCamera:
-    """A camera whose pictures are drawn from states when they are written, by the writer's thread.
-
-    A frame of 640 x 480 takes software rendering milliseconds, which the training loop should not wait for. Its
-    pixels take some thousand times the memory of the state.
-
-    Args:
-        height: of a picture [px].
-        width: of a picture [px].
-        num_positions: generalised positions (MuJoCo's nq) of a state.
-        draw: from states float64 (1, nq) to pictures uint8 (1, height, width, 3); called in another thread.
-    """
-
-    height: int
-    width: int
-    num_positions: int
-    draw: Callable[[np.ndarray], np.ndarray]
-
-
-@dataclass(frozen=True)
-class UndrawnFrames:
-    """The pictures of one segment, of which only the states are there: float64 (T, nq)."""
-
-    camera: LateCamera
-    positions: np.ndarray
-
-    dtype = np.dtype(np.uint8)
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Of the pictures."""
-        return len(self), self.camera.height, self.camera.width, 3
-
-    @property
-    def nbytes(self) -> int:
-        """Of the pictures: what stands in a queue counts as the work that it is."""
-        return int(np.prod(self.shape))
-
-    def draw(self, out: np.ndarray) -> np.ndarray:
-        """Draw into the beginning of `out` (at least T, height, width, 3) and return that part of it.
-
-        One at a time, because whoever draws for the training loop meanwhile waits for it.
-        """
-        for i in range(len(self)):
-            out[i] = self.camera.draw(self.positions[i : i + 1])[0]
-        return out[: len(self)]
-
-
-Column = np.ndarray | UndrawnFrames
-
-
 @dataclass
 class _Segment:
-    frames: Mapping[str, Column]
+    frames: Mapping[str, np.ndarray]
     task: str
     metadata: Mapping[str, Any]
     written: Callable[[], None] | None = None
@@ -171,7 +116,6 @@ class SegmentWriter:
         self.episodes_before: Counter[str] = Counter(chain.from_iterable(tasks))
         """Episodes of each task that were there when writing began."""
         self._max_frames = int(MAX_FILE_DURATION_S * meta.fps)
-        self._canvas: dict[str, np.ndarray] = {}
         self._oldest = 0.0
         self._failure: BaseException | None = None
         self._pending = 0
@@ -192,7 +136,7 @@ class SegmentWriter:
 
     def add_segment(
         self,
-        frames: Mapping[str, Column],
+        frames: Mapping[str, np.ndarray],
         task: str,
         *,
         episode_metadata: Mapping[str, Any] | None = None,
@@ -202,8 +146,7 @@ class SegmentWriter:
 
         Args:
             frames: one array (T, *shape) of the feature's dtype per feature ((T,) where the shape is (1,));
-                pixels as uint8 (T, H, W, 3) or still to be drawn. They are NOT copied: leave them alone
-                until `written` is called.
+                pixels as uint8 (T, H, W, 3). They are NOT copied: leave them alone until `written` is called.
             task: the instruction.
             episode_metadata: columns for the episode's row in `meta/episodes`, the same keys every time.
             written: called in the writer's thread when it needs the arrays no longer.
@@ -277,7 +220,7 @@ class SegmentWriter:
         if self._failure is not None:
             raise RecordingError(f"writing to {self.root} failed: {self._failure}") from self._failure
 
-    def _check_frames(self, frames: Mapping[str, Column]) -> None:
+    def _check_frames(self, frames: Mapping[str, np.ndarray]) -> None:
         if set(frames) != set(self.features):
             raise ValueError(f"a segment has the columns {sorted(frames)}, not {sorted(self.features)}")
         length = len(next(iter(frames.values())))
@@ -317,23 +260,12 @@ class SegmentWriter:
         if isinstance(item, _Flush):
             self._dataset.publish()
             return
-        self._dataset.append(self._draw(item.frames), item.task, item.metadata)
+        self._dataset.append(item.frames, item.task, item.metadata)
         if self._dataset.num_unpublished == 1:
             # A writer that lags would else flush after every segment, and never catch up.
             self._oldest = max(item.ended, time.monotonic() - self._flush_interval_s / 2)
         if item.written is not None:
             item.written()
-
-    def _draw(self, frames: Mapping[str, Column]) -> dict[str, np.ndarray]:
-        drawn = {}
-        for key, array in frames.items():
-            if isinstance(array, UndrawnFrames):
-                # Kept from segment to segment: to take this much memory anew costs more than to fill it.
-                if key not in self._canvas or len(self._canvas[key]) < len(array):
-                    self._canvas[key] = np.empty(array.shape, array.dtype)
-                array = array.draw(self._canvas[key])
-            drawn[key] = array
-        return drawn
 
 
 def _check_features(there: Features, ours: Features, what: str) -> None:

@@ -5,7 +5,7 @@ from cronos_lerobot.lazy import lazy_exports
 __getattr__, __all__ = lazy_exports(
     __name__,
     {
-        "actors": "Actor ExpertActor Spectator load_actor make_actor",
+        "actors": "Actor ExpertActor load_actor make_actor",
         "chains": "Chain ChainRunner Rules",
         "config": "CronosEvalConfig SuitesConfig",
         "results": "find_results find_videos read_results",

@@ -153,38 +153,6 @@ class ExpertActor(Actor):
         return ActionSample(self._expert.act()[ids])
 
 
-class Spectator:
-    """An agent of Algorithm 1 that acts by an actor and never learns.
-
-    Args:
-        actor: acts in all streams.
-        num_streams: N.
-        seed: of the actor's sampling.
-    """
-
-    def __init__(self, actor: Actor, num_streams: int, seed: int = 0) -> None:
-        self._actor, self._streams = actor, np.arange(num_streams)
-        self._cut = np.ones(num_streams, bool)
-        actor.seed(seed)
-        actor.begin(self._streams, [(seed, i) for i in range(num_streams)])
-
-    def act(self, o_t: dict[str, Any], tau: list[str]) -> ActionSample:
-        """See `Agent`."""
-        self._actor.begin(np.flatnonzero(self._cut))
-        return self._actor.act(o_t, tau, self._streams)
-
-    def store(
-        self, o_t: Any, tau: list[str], a_t: ActionSample, r_t: np.ndarray, o_tp1: Any, cut_t: np.ndarray,
-        diverged_t: np.ndarray,
-    ) -> None:  # fmt: skip
-        """Remember which streams begin anew."""
-        self._cut = cut_t.copy()
-
-    def update(self) -> dict[str, float]:
-        """Learn nothing."""
-        return {}
-
-
 def make_actor(
     policy: Any, processors: PolicyProcessors, temperature: float, env_processors: tuple[Any, Any] | None = None
 ) -> SamplingPolicy | SelectingPolicy:

@@ -36,24 +36,6 @@ WITHOUT_LANGUAGE = ("act", "diffusion", "gaussian_actor", "tdmpc", "vqbet")
 Features = Mapping[str, PolicyFeature]
 
 
-def expected_env(policy: PreTrainedConfig, scene: str | None = None) -> CronosEnvConfig:
-    """Return the environment that a checkpoint expects.
-
-    Args:
-        policy: its config, with its folder as `pretrained_path`.
-        scene: instead of the one of its training.
-
-    Raises:
-        ValueError: no environment of the scene shows what the policy takes.
-    """
-    features, path = policy.input_features or {}, policy.pretrained_path
-    where = {"scene": scene} if scene else trained_scene(path)
-    env = CronosEnvConfig(**trained_observations(features, path), **where)
-    env = replace(env, task_observation=task_observation_of(features, env))
-    check_observations(policy, env)
-    return env
-
-
 def reads_privileged_state(config: PreTrainedConfig) -> bool:
     """Whether a policy acts on the bodies' poses beside its pictures, which no robot has.
 

@@ -5,9 +5,8 @@ from cronos_lerobot.lazy import lazy_exports
 __getattr__, __all__ = lazy_exports(
     __name__,
     {
-        "encode": "write_gif write_mp4",
+        "encode": "write_mp4",
         "overlay": "Status draw_status",
-        "stream_video": "film_stream",
         "suites": "draw_suite",
     },
 )

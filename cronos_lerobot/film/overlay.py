@@ -8,18 +8,9 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from cronos_lerobot.film.sheets import caption_font
-from cronos_lerobot.protocol.interventions import Intervention
 
 WHITE, BAR = (255, 255, 255), (20, 22, 28, 190)
 SUCCESS, FAILURE, NOTICE, PENDING = (64, 200, 110), (225, 90, 70), (255, 196, 60), (120, 124, 132)
-NOTICES = {
-    Intervention.INITIAL: "first placement",
-    Intervention.TASK_SWITCH: "new task",
-    Intervention.END_EFFECTOR_RESET: "new task, arm sent home",
-    Intervention.HEURISTIC_RESET: "lost bodies put back",
-    Intervention.SCENE_RESET: "scene reset",
-    Intervention.DIVERGENCE: "scene reset: the simulation broke down",
-}
 
 
 @dataclass
@@ -32,16 +23,12 @@ class Status:
     num_segments: int
     succeeded: bool
     """Whether the task has been complete at any step of the segment."""
-    interventions: int
-    """Those that count against the budget."""
-    notice: Intervention = Intervention.NONE
-    """What happened just now."""
+    caption: str
+    """In the bottom bar."""
     outcomes: list[bool] = field(default_factory=list)
     """Success of the segments that are over."""
-    caption: str | None = None
-    """Instead of the number of the segment and of the interventions."""
     message: str = ""
-    """Instead of `notice`."""
+    """Above the bottom bar; empty for none."""
 
 
 def draw_status(frame: np.ndarray, status: Status) -> np.ndarray:
@@ -58,15 +45,13 @@ def draw_status(frame: np.ndarray, status: Status) -> np.ndarray:
     draw.text((margin, bar / 2), status.instruction, WHITE, large, anchor="lm")
     if status.succeeded:
         _draw_check(draw, width - margin - 20 * unit, bar / 2, unit)
-    counts = f"segment {status.segment + 1}/{status.num_segments}   interventions {status.interventions}"
-    caption = counts if status.caption is None else status.caption
-    draw.text((margin, height - bar / 2), caption, WHITE, small, anchor="lm")
-    if message := status.message or NOTICES.get(status.notice):
+    draw.text((margin, height - bar / 2), status.caption, WHITE, small, anchor="lm")
+    if status.message:
         place = (margin, height - bar - round(16 * unit))
-        left, top, right, bottom = draw.textbbox(place, message, small, anchor="lm")
+        left, top, right, bottom = draw.textbbox(place, status.message, small, anchor="lm")
         pad = 6 * unit
         draw.rounded_rectangle((left - pad, top - pad, right + pad, bottom + pad), radius=pad, fill=BAR)
-        draw.text(place, message, NOTICE, small, anchor="lm")
+        draw.text(place, status.message, NOTICE, small, anchor="lm")
     _draw_outcomes(draw, status, width - margin, height - bar / 2, unit)
     return np.asarray(Image.alpha_composite(image, layer).convert("RGB"))
 

@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from cronos_lerobot.evaluation.chains import ChainResult
 from cronos_lerobot.evaluation.results import VIDEOS
-from cronos_lerobot.evaluation.suites import INDEPENDENT, SEQUENTIAL, STREAM, Start
+from cronos_lerobot.evaluation.suites import INDEPENDENT, SEQUENTIAL, STREAM
 from cronos_lerobot.film.encode import write_mp4
 from cronos_lerobot.film.overlay import Status, draw_status
-from cronos_lerobot.film.sheets import draw_grid, encode_palette_png, to_png
+from cronos_lerobot.film.sheets import draw_grid, encode_palette_png
 
 FPS = 20
 """Four times as fast as it happened."""
@@ -25,10 +24,6 @@ NUMBERED = {INDEPENDENT: "task", SEQUENTIAL: "ordering", STREAM: "first_task"}
 """What a chain's number is of."""
 PICTURED = 4
 """Stuck streams on the sheet, and segments of each."""
-COLORS = {
-    Start.FREE: "#cfe1f2", Start.RECEPTACLE_OCCUPIED: "#93c4de", Start.ON_OTHER_RECEPTACLE: "#4a97c9",
-    Start.OUT_OF_REACH: "#08306b", Start.FALLEN: "#7a0177", Start.COMPLETE: "#d9d9d9",
-}  # fmt: skip
 
 Render = Callable[[np.ndarray], np.ndarray]
 """Frames (k, H, W, 3) uint8 of joint positions (k, nq)."""
@@ -37,7 +32,7 @@ Render = Callable[[np.ndarray], np.ndarray]
 def draw_suite(
     folder: Path, numbers: dict[str, Any], ended: Sequence[ChainResult], render: Render, count: int
 ) -> None:
-    """Film some chains of a suite and split; of streams also draw `stream.png` and `stuck.png`.
+    """Film some chains of a suite and split; of streams also draw `stuck.png`.
 
     Args:
         folder: of its results.json.
@@ -55,7 +50,6 @@ def draw_suite(
         film_chain(folder / VIDEOS / name, result, render, where)
     if numbers["suite"] == STREAM:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "stream.png").write_bytes(to_png(draw_streams(numbers), 150))
         (folder / "stuck.png").write_bytes(encode_palette_png(draw_stuck(ended, render)))
 
 
@@ -104,7 +98,6 @@ def _statuses(result: ChainResult, where: str) -> Iterator[Status]:
             position,
             len(tasks),
             succeeded=bool(trajectory.is_complete[t]),
-            interventions=0,
             outcomes=list(result.success[:position]),
             caption=f"{where}   task {position + 1}/{len(tasks)}   step {t}",
         )
@@ -137,7 +130,6 @@ def _last_segments(result: ChainResult, render: Render) -> list[np.ndarray]:
             k,
             length,
             succeeded=result.success[k],
-            interventions=0,
             outcomes=list(result.success[: k + 1]),
             caption=f"configuration {result.chain.configuration}",
             message=f"began {result.starts[k].replace('_', ' ')}",
@@ -146,27 +138,3 @@ def _last_segments(result: ChainResult, render: Render) -> list[np.ndarray]:
     ]
     drawn = render(trajectory.qpos[ends].astype(np.float64))
     return [draw_status(frame, status) for frame, status in zip(drawn, statuses, strict=True)]
-
-
-def draw_streams(numbers: dict[str, Any]) -> Figure:
-    """Success by segment with its interval, above how the segments began."""
-    segments = numbers["by_segment"]
-    x = np.arange(1, len(segments) + 1)
-    figure = Figure(figsize=(7, 5), layout="constrained")
-    top, bottom = figure.subplots(2, 1, sharex=True)
-    low, high = np.array([segment["ci95"] for segment in segments]).T
-    top.fill_between(x, low, high, alpha=0.2, lw=0)
-    top.plot(x, [segment["success"] for segment in segments], "o-", ms=4)
-    top.set(ylim=(0, 1.02), ylabel="success")
-    arm = "the arm goes home at every switch" if numbers["end_effector_reset"] else "the arm stays where it is"
-    top.set_title(
-        f"{numbers['n']} streams, {numbers['split'].replace('_', '-')}: nobody resets, {arm}", fontsize=10
-    )
-    bottom_edge = np.zeros(len(segments))
-    for start, color in COLORS.items():
-        share = np.array([segment["starts"][start.value] for segment in segments]) / numbers["n"]
-        bottom.bar(x, share, 0.9, bottom_edge, color=color, label=start.value.replace("_", " "))
-        bottom_edge += share
-    bottom.set(xlabel="segment since the placement", ylabel="how it began", ylim=(0, 1))
-    figure.legend(loc="outside lower center", ncols=len(COLORS), fontsize=7, frameon=False)
-    return figure

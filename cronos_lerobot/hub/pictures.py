@@ -9,8 +9,9 @@ from lerobot_env_cronos import Benchmark, CronosVectorEnv
 from PIL import Image, ImageDraw
 
 from cronos_lerobot.film.sheets import PICTURE, caption_font, draw_task_sheet, encode_palette_png
-from cronos_lerobot.film.task_pictures import CAMERAS
 
+CAMERAS = ("front", "bridge")
+"""Of the sheet of tasks."""
 ROW_PICTURE = (320, 240)
 """Width and height of a configuration's picture [px]."""
 SHEET_PICTURE, SHEET_COLUMNS, SHEET_ROWS = (200, 150), 6, 2

@@ -23,20 +23,22 @@ SCALES = {
         "clone": "--batch_size=256 --steps=640 --save_freq=640",
         "train": "--num_envs=64 --steps=204800 --eval_freq=102400 --eval.n_episodes=32 --save_freq=102400",
         "evaluate": "",
-        "film": "--segments=16",
+        "film": "",
     },
     "smoke": {
         "record": "--dataset.num_episodes=8",
         "clone": "--batch_size=32 --steps=5 --save_freq=5",
         "train": "--num_envs=4 --steps=640 --protocol.update_interval=80 --eval.n_episodes=1",
         "evaluate": "--eval.n_episodes=1",
-        "film": "--segments=1",
+        "film": "--env.render_size=[120,160]",
     },
 }
 """Flags that depend on the scale."""
 CLONE = "--policy.type=pocketvla --policy.device=cpu --policy.push_to_hub=false"
 CLONE_RUN = "--log_freq=40 --num_workers=0 --wandb.enable=false --seed=1"
 RESETS = "--protocol.scene_reset_interval=320 --protocol.reset_phase=staggered --protocol.end_effector_reset=true"
+SINGLE_TASKS = "--eval.suites=[independent] --eval.videos=0"
+ONE_STREAM = "--eval.suites=[stream] --eval.splits=[train] --eval.n_episodes=1 --end_effector_reset=true"
 RECORD = "--record.repo_id=local/cronos_demo_streams --record.streams=1"
 
 
@@ -45,28 +47,27 @@ def make_commands(scale: str, folder: Path) -> list[Command]:
     more = {name: flags.split() for name, flags in SCALES[scale].items()}
     policy = Path("checkpoints/last/pretrained_model")
     demos, base, tuned = folder / "demos", folder / "base", folder / "finetune"
-    before, after, video = folder / "eval_before", folder / "eval_after", folder / "film" / "stream.mp4"
+    before, after, film = folder / "eval_before", folder / "eval_after", folder / "film"
     dataset = (f"--dataset.repo_id={DATASET}", f"--dataset.root={demos}")
     record = ("cronos-record-demos", *ENV, *dataset, *more["record"], "--seed=1", *WIDE_FLAGS, *DIVERSE_FLAGS)
     clone = ("lerobot-train", *CLONE.split(), *dataset, *more["clone"], *CLONE_RUN.split())
     train = ("cronos-train", f"--policy.path={base / policy}", *ENV, "--seed=1", *RESETS.split())
     train += (*RECORD.split(), *more["train"], "--resume=auto")
-    film = ("python", "-m", "cronos_lerobot.film.stream_video", f"--policy.path={tuned / policy}", *more["film"])
-    report = ("cronos-report", str(tuned), "--before", str(before), "--after", str(after), "--videos", str(video))
+    report = ("cronos-report", str(tuned), "--before", str(before), "--after", str(after), str(film))
     return [
         Command(record, demos),
         Command((*clone, f"--output_dir={base}"), base),
-        _evaluation(base / policy, before, more["evaluate"]),
+        _evaluation(base / policy, before, [*SINGLE_TASKS.split(), *more["evaluate"]]),
         Command((*train, f"--output_dir={tuned}"), tuned, resumes=True),
-        _evaluation(tuned / policy, after, more["evaluate"]),
-        Command((*film, f"--output={video}"), video.parent),
+        _evaluation(tuned / policy, after, [*SINGLE_TASKS.split(), *more["evaluate"]]),
+        _evaluation(tuned / policy, film, [*ONE_STREAM.split(), *more["film"]]),
         Command((*report, f"--output={folder / 'report'}", "--title=CRONOS demo"), folder / "report"),
     ]
 
 
-def _evaluation(policy: Path, output: Path, more: list[str]) -> Command:
-    words = ("cronos-eval", f"--policy.path={policy}", "--eval.suites=[independent]", "--eval.videos=0", *more)
-    return Command((*words, f"--output_dir={output}"), output, resumes=True)
+def _evaluation(policy: Path, output: Path, flags: list[str]) -> Command:
+    words = ("cronos-eval", f"--policy.path={policy}", *flags, f"--output_dir={output}")
+    return Command(words, output, resumes=True)
 
 
 def main() -> None:
@@ -95,7 +96,7 @@ def main() -> None:
         sys.exit("\ninterrupted: run the same command again to continue")
     print(f"\nDone in {(time.perf_counter() - start) / 60:.1f} min.")
     print(f"Open {args.output_dir / 'report' / 'index.html'} in a browser.")
-    print(f"The video of the stream is {args.output_dir / 'film' / 'stream.mp4'}.")
+    print(f"A video of a stream that nobody resets is in {args.output_dir / 'film' / 'stream_train' / 'videos'}.")
 
 
 if __name__ == "__main__":

@@ -47,9 +47,6 @@ class RecordConfig:
     """Folder of the dataset; <output_dir>/streams by default."""
     streams: str = "1"
     """How many of the streams to record, the first N: a number or `all`."""
-    filmed_streams: int = ranged(0, minimum=0)
-    """Record the first N streams once more, with pictures of env.render_size (480 x 640) instead of the
-    observation's: a dataset of its own, repo_id and root with _640x480 at the end."""
     flush_interval_s: float = ranged(FLUSH_INTERVAL_S, above=0)
     """The longest that a finished segment waits to be written [s]; a killed run loses what waits."""
 
@@ -82,8 +79,6 @@ class RecordConfig:
         if env.obs_type == "pixels_agent_pos":
             size = (env.observation_height, env.observation_width)
             check_video_size("--env.observation_height and --env.observation_width", size)
-        if self.filmed_streams:
-            check_video_size("--env.render_size", env.render_size)
 
 
 @dataclass

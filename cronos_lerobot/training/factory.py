@@ -45,8 +45,6 @@ def make_parts(config: CronosTrainConfig, ranks: Ranks) -> Parts:
     """
     share = ranks.share_of(config.num_envs)
     num_envs = share.stop - share.start
-    if config.record.repo_id is not None and config.record.filmed_streams > num_envs:
-        raise ValueError(f"--record.filmed_streams must be <= {num_envs}, the streams of the first process.")
     set_seed(config.seed)
     policy, preprocessor, postprocessor = make_policy_and_processors(config)
     if not ranks.is_main:

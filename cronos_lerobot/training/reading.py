@@ -18,7 +18,7 @@ from cronos_lerobot.training.run_folder import describe_environment, last_checkp
 
 FIXED = (
     "seed", "num_envs", "peft", "rename_map", "env", "policy", "record.repo_id", "record.root", "record.streams",
-    "record.filmed_streams", "protocol.task_switch_interval", "protocol.learned_reset", "protocol.reward",
+    "protocol.task_switch_interval", "protocol.learned_reset", "protocol.reward",
     "algorithm.type", "algorithm.kl_base_coef", "algorithm.temperature", "algorithm.noise_std",
     "algorithm.noise_level", "algorithm.noise_steps", "algorithm.critic_observation",
 )  # fmt: skip

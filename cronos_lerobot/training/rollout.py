@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections import deque
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.loop_state import Event, SegmentEnd, Step
 
 
@@ -106,39 +103,6 @@ class RolloutStatistics:
         counts = table.setdefault(key, [0, 0])
         counts[0] += int(success)
         counts[1] += 1
-
-
-class SmoothedSuccess:
-    """The success of the latest updates that together see every segment since the scene reset equally often.
-
-    With U < T an update sees only some of them: its own success rises and falls from one update to the next
-    although nothing is learned.
-
-    Args:
-        protocol: of the run.
-        num_tasks: of the scene; without scene resets a whole cycle of tasks is the period.
-    """
-
-    def __init__(self, protocol: ProtocolConfig, num_tasks: int) -> None:
-        self._protocol = protocol
-        self._num_tasks = num_tasks
-        self._latest: deque[dict[str, Count]] = deque()
-
-    def add(self, rollout: dict[str, Any], interaction_step: int) -> dict[str, float | None]:
-        """Take in what `RolloutStatistics.pop` returned; returns the rates of RolloutStatistics.SORTS."""
-        self._latest.append(
-            {sort: _total(rollout[f"{sort}_by_segment"].values()) for sort in RolloutStatistics.SORTS}
-        )
-        while len(self._latest) > self._num_updates(interaction_step):
-            self._latest.popleft()
-        return {sort: _total(counts[sort] for counts in self._latest).rate for sort in RolloutStatistics.SORTS}
-
-    def _num_updates(self, interaction_step: int) -> int:
-        """Updates until the same segments come again."""
-        U = self._protocol.update_interval
-        period = self._protocol.scene_reset_interval_at(interaction_step)
-        period = period or self._num_tasks * self._protocol.task_switch_interval
-        return math.lcm(period, U) // U
 
 
 def _total(counts: Any) -> Count:

@@ -85,10 +85,10 @@ class Run:
         """Task order and resets: they may keep something of their own."""
         return (find_inner(self.task_order), *self.resets.all)
 
-    def events(self, env: Any) -> Any:
-        """Algorithm 1 from here to its end, with `env` for the streams."""
+    def events(self) -> Any:
+        """Algorithm 1 from here to its end."""
         return rf_mtrl(
-            env,
+            self.env,
             self.task_set.all,
             self.agent,
             self.task_order,

@@ -18,8 +18,6 @@ import numpy as np
 from cronos_lerobot.protocol.loop_state import Step
 from cronos_lerobot.ranks import Ranks
 
-FILM = "film"
-"""Key of the filmed streams' states in an observation, from which the writer draws; policies never see it."""
 INFO = ("is_success", "is_grasped", "diverged", "intervened")
 OWN = ("action", "log_prob", "value")
 """Arrays of an ActionSample that have a row for each stream of this process."""
@@ -97,14 +95,6 @@ class ShardedEnv:
             # How many numbers it takes to find a free place only the owner knows.
             rng.bit_generator.state = self._ranks.broadcast(rng.bit_generator.state, source=owner)
 
-    def positions(self, ids: np.ndarray) -> np.ndarray:
-        """Generalised positions (k, nq) of the streams `ids`, all of this process."""
-        return self._env.positions(np.asarray(ids) - self.mine.start)
-
-    def render_positions(self, qpos: np.ndarray) -> np.ndarray:
-        """Frames (k, height, width, 3) uint8 of `positions`."""
-        return self._env.render_positions(qpos)
-
     def get_state(self) -> dict[str, np.ndarray]:
         """The state of all N streams, as one process with N streams has it."""
         return {name: self._concatenate(array) for name, array in self._env.get_state().items()}
@@ -132,13 +122,13 @@ def whole_step(step: Step, ranks: Ranks, num_recorded: int) -> Step:
     """Return `step` with the observations and actions of the recorded streams in the first process.
 
     Those are the first `num_recorded` of all N. If they are the first process's own, no observations are sent: the
-    step has that process's only. Films are always its own.
+    step has that process's only.
     """
     if ranks.count == 1:
         return step
     sent = {"action": {name: array for name in OWN if (array := getattr(step.action, name)) is not None}}
     if num_recorded > len(step.action.action):
-        sent["observation"] = {name: value for name, value in step.observation.items() if name != FILM}
+        sent["observation"] = step.observation
     whole = _join(ranks.gather_to_main(sent))
     observation = step.observation | whole.get("observation", {})
     return replace(step, observation=observation, action=replace(step.action, **whole["action"]))

@@ -12,8 +12,8 @@ from cronos_lerobot.evaluation.independent import evaluate_independent
 from cronos_lerobot.protocol.loop_state import Event, SegmentEnd, Step, Update
 from cronos_lerobot.training.checkpoint import point_last_at, restore, save_checkpoint
 from cronos_lerobot.training.logging import RunLogger, SilentLogger
-from cronos_lerobot.training.recording import FilmedEnv, StreamObserver
-from cronos_lerobot.training.rollout import RolloutStatistics, SmoothedSuccess
+from cronos_lerobot.training.recording import StreamObserver
+from cronos_lerobot.training.rollout import RolloutStatistics
 from cronos_lerobot.training.run import Run
 from cronos_lerobot.training.run_folder import note_end, note_start
 from cronos_lerobot.training.sharding import whole_step
@@ -56,7 +56,6 @@ class Trainer:
         self.statistics = RolloutStatistics([task.instruction for task in run.task_set.all], num_tasks)
         if "statistics" in observers:
             self.statistics.load_state_dict(observers["statistics"])
-        self._smoothed = SmoothedSuccess(self.config.protocol, num_tasks)
         evaluated = observers.get("evaluated", {"steps": 0, "interventions": 0})
         self._evaluations = Schedule(self.config.eval_freq, evaluated["steps"])
         self._evaluated_interventions = evaluated["interventions"]
@@ -98,7 +97,7 @@ class Trainer:
             self._logged_steps = self.loop.n
             self.run.stopwatch.lap()
             env_state = None
-            for event in self.run.events(self._filmed_env()):
+            for event in self.run.events():
                 self._observe(event)
                 if isinstance(event, SegmentEnd):
                     # Reading the simulations' state wakes sleeping bodies, so it is done at every switch: the run
@@ -165,11 +164,6 @@ class Trainer:
         wanted = self.config.eval_at_interventions
         return [count for count in wanted if self._evaluated_interventions < count <= self.loop.b]
 
-    def _filmed_env(self) -> Any:
-        record = self.config.record
-        films = record.repo_id is not None and record.filmed_streams and self.run.ranks.is_main
-        return FilmedEnv(self.run.env, record.filmed_streams) if films else self.run.env
-
     def _observe(self, event: Event) -> None:
         self.statistics.on_event(event)
         if isinstance(event, Step):
@@ -192,9 +186,9 @@ class Trainer:
         shares = {name: spent / wall for name, spent in sorted(seconds.items())}
         self.logger.log("update", record | {"time_share": shares})
         self._update = None
-        rates = self._smoothed.add(rollout, self.loop.n)
         if self.loop.updates % self.config.log_freq == 0:
-            self.logger.progress(rates | {"steps_per_s": steps_per_s})
+            rates = {name: rollout[name].rate for name in ("found_complete", "never_grasped")}
+            self.logger.progress({"success": rollout["success"], **rates, "steps_per_s": steps_per_s})
 
     @cached_property
     def _eval_env(self) -> Any:

@@ -18,7 +18,6 @@ from cronos_lerobot.data.stream_filter import SegmentFilter, filter_streams
 from cronos_lerobot.data.stream_statistics import make_tables, statistics
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.data.writer import SegmentWriter
-from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.scripts.streams import main
 
 FRONT = "observation.images.front"
@@ -51,7 +50,9 @@ def test_segments_come_in_the_order_of_their_stream(streams):
 
 
 def test_a_stream_is_whole(streams):
-    columns = streams.stream_columns(2, ["cronos.step", "action", "observation.state", "next.truncated"])
+    names = ["cronos.step", "action", "observation.state", "next.truncated"]
+    parts = [streams.columns(segment, names) for segment in streams.segments_of(2)]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in names}
     t = np.arange(STEPS)
     np.testing.assert_array_equal(columns["cronos.step"], t)
     np.testing.assert_array_equal(columns["action"], np.repeat((2000 + t)[:, None] / 2, 7, axis=1))
@@ -69,34 +70,6 @@ def test_pixels_of_a_segment(streams):
         streams.pixels(segment, "left")
     with pytest.raises(ValueError, match="nothing"):
         streams.columns(segment, ["nothing"])
-
-
-def test_transitions_across_a_switch(streams):
-    switches = list(streams.switches(0))
-    assert [s.after.step for s in switches] == [4, 8, 12, 16, 20, 24, 28]
-    assert switches[3].event == Intervention.SCENE_RESET
-    assert len(list(streams.switches())) == 7 * STREAMS
-    last, first = streams.switch_frames(switches[3])
-    assert (last["cronos.step"], first["cronos.step"]) == (15, 16)
-    assert (last["action"][0], first["action"][0]) == (7.5, 8)
-    assert np.abs(first[FRONT].astype(int) - PICTURES[16 % 7]).mean() < 2.5
-    assert np.abs(last[FRONT].astype(int) - PICTURES[15 % 7]).mean() < 2.5
-
-
-def test_episodes_between_scene_resets(streams):
-    episodes = list(streams.reset_free_episodes())
-    assert [(e[0].stream, e[0].step, len(e)) for e in episodes] == [(i, t, 4) for i in range(3) for t in (0, 16)]
-    assert list(streams.reset_free_episodes(1)) == episodes[2:4]
-
-
-def test_what_was_filtered_out_ends_an_episode_and_joins_nothing(streams, tmp_path):
-    """Stream 1 succeeds in its odd segments; the first ones after a scene reset are 0 and 4."""
-    wanted = SegmentFilter(success=True, streams=[1])
-    filter_streams(streams, wanted, "me/some", tmp_path / "d", schema="streams")
-    some = StreamDataset("me/some", tmp_path / "d")
-    episodes = [[segment.index for segment in episode] for episode in some.reset_free_episodes()]
-    assert episodes == [[1, 3], [5, 7]]
-    assert list(some.switches()) == []
 
 
 def test_statistics(streams):
@@ -194,16 +167,6 @@ def test_help_counts_where_it_begins_and_only_there(tmp_path):
         counts = frames[name] + after
         change(tmp_path / "d", name, dict(enumerate(counts.tolist())))
     streams.check()
-
-
-def test_recordings_of_two_runs_that_were_merged_have_no_order(root, tmp_path):
-    runs = [LeRobotDataset("me/stream", root=root) for _ in range(2)]
-    merge_datasets(runs, output_repo_id="me/both", output_dir=tmp_path / "d")
-    streams = StreamDataset("me/both", tmp_path / "d")
-    assert len(streams.segments) == 2 * len(StreamDataset("me/stream", root).segments)
-    for read in (streams.switches, streams.reset_free_episodes, lambda: streams.stream_columns(2, ["action"])):
-        with pytest.raises(ValueError, match="holds several recordings"):
-            list(read())
 
 
 def test_survives_lerobots_own_tools(root, tmp_path):

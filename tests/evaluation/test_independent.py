@@ -6,7 +6,7 @@ import torch
 from dummies import DummyEnv, DummyPolicy, identity_processors
 
 from cronos_lerobot.agents.processing import PolicyProcessors
-from cronos_lerobot.evaluation.actors import SamplingPolicy, Spectator
+from cronos_lerobot.evaluation.actors import SamplingPolicy
 from cronos_lerobot.evaluation.independent import evaluate_independent
 
 PROCESSORS = PolicyProcessors(*identity_processors())
@@ -148,17 +148,3 @@ def test_a_streams_randomness_is_its_own_whatever_streams_are_beside_it():
     alone = make_actor(Uniform())
     alone.begin(np.array([5]), [seeds[1]])
     assert [act(alone, [5], [0])[0] for _ in range(6)] == expected[1]
-
-
-def test_a_spectator_forgets_where_a_trace_is_cut():
-    agent = Spectator(make_actor(Counting()), 2)
-
-    def play(seen, cut):
-        observation = {"agent_pos": np.array(seen, np.float32)[:, None]}
-        sample = agent.act(observation, ["", ""])
-        agent.store(observation, ["", ""], sample, np.zeros(2), observation, np.array(cut), np.zeros(2, bool))
-        return sample.action[:, 0].tolist()
-
-    assert play([0, 10], [False, True]) == [0, 10]
-    assert play([5, 15], [False, False]) == [1, 15]
-    assert play([6, 16], [False, False]) == [2, 16]

@@ -1,24 +1,18 @@
-"""Recordings of whole runs: films, and what happens when a recording fails."""
+"""Recordings of whole runs: what happens when a recording fails."""
 
 import logging
 import resource
 import shutil
 
-import numpy as np
 import pytest
 from dummies import DummyEnv
-from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from runs import STREAMS, assert_same_weights, metrics, resumed, train
 from runs import config as plain_config
 from test_cronos_train import OBSERVATIONS, SMALL, cronos_train
 
-from cronos_lerobot.agents.base import ActionSample
-from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.streams import StreamDataset
-from cronos_lerobot.data.writer import LateCamera, RecordingError, SegmentWriter
-from cronos_lerobot.protocol.loop_state import Step
+from cronos_lerobot.data.writer import RecordingError, SegmentWriter
 from cronos_lerobot.training.config import RecordConfig
-from cronos_lerobot.training.recording import FILM, FilmedEnv
 
 
 def config(folder, **options):
@@ -112,15 +106,13 @@ def test_a_recording_that_fails_in_the_flush_of_a_checkpoint_is_told_once(tmp_pa
     "flags",
     [
         ["--record.root={folder}/existing"],
-        ["--record.root={folder}/new", "--record.filmed_streams=1", "--env.render_size=[48,64]"],
         # Nobody may make a folder there, not even root.
         ["--record.root=/proc/1/streams"],
-        ["--record.filmed_streams=3"],
+        ["--record.streams=3"],
     ],
 )
 def test_a_recording_that_cannot_begin_stops_the_run_at_once(tmp_path, monkeypatch, flags):
     (tmp_path / "existing").mkdir()
-    (tmp_path / "new_64x48").mkdir()
     flags = [flag.format(folder=tmp_path) for flag in flags]
     with pytest.raises(SystemExit, match=r"^error: "):
         cronos_train(
@@ -141,48 +133,3 @@ def test_resuming_without_the_recording_is_told(tmp_path, monkeypatch):
         cronos_train(monkeypatch, "--resume=true", f"--config_path={file}", "--steps=32")
     assert (run / "metrics.jsonl").read_bytes() == metrics
     assert not (run / "streams").exists()
-
-
-def test_filmed_streams_are_a_dataset_of_their_own(tmp_path):
-    """Its pictures are those of the states that the policy acted on, at another size."""
-    env_config = CronosEnvConfig(obs_type="environment_state_agent_pos", render_size=(48, 64), num_threads=1)
-    env = CronosVectorEnv(3, **env_config.gym_kwargs)
-    seen = []
-    filmed = FilmedEnv(env, 2)
-    assert filmed.num_envs == 3
-    camera = LateCamera(48, 64, env.simulation.model.nq, env.render_positions)
-    recorder = StreamRecorder.open(
-        env, "me/film", tmp_path / "film", segment_length=5, streams=2, cameras={"front": camera}
-    )
-    rng = np.random.default_rng(0)
-    obs = filmed.observe()
-    for t in range(5):
-        seen.append((obs["agent_pos"][:2].copy(), env.render_streams(np.arange(2))))
-        action = rng.uniform(env.single_action_space.low, env.single_action_space.high, (3, 7)).astype(np.float32)
-        observation = {key: obs[key] for key in ("agent_pos", "environment_state")} | {
-            "pixels": {"front": obs[FILM]}
-        }
-        next_obs, reward, *_, info = filmed.step(action)
-        recorder.on_step(
-            Step(
-                t, observation, env.instructions, ActionSample(action, np.zeros(3), np.zeros(3)), reward,
-                info["is_success"], info["diverged"], cut=np.full(3, t == 4), piece=np.zeros(3, int),
-                segments_since_reset=np.zeros(3, int), preceded_by=np.full(3, 0 if t else 6),
-                interventions=np.zeros(3, int), policy_version=0, intervened=np.zeros(3, bool),
-            )
-        )  # fmt: skip
-        obs = next_obs
-    recorder.close()
-    env.close()
-    streams = StreamDataset("me/film", tmp_path / "film", streaming=True)
-    streams.check()
-    for stream in range(2):
-        (segment,) = streams.segments_of(stream)
-        pixels = streams.pixels(segment, "observation.images.front")
-        assert pixels.shape == (5, 48, 64, 3)
-        for t, (state, pictures) in enumerate(seen[:5]):
-            np.testing.assert_array_equal(streams.columns(segment)["observation.state"][t], state[stream])
-            assert np.abs(pixels[t].astype(int) - pictures[stream]).mean() < 4
-        moments = np.stack([pictures[stream] for _, pictures in seen]).astype(int)
-        nearest = [int(np.abs(moments - picture).mean(axis=(1, 2, 3)).argmin()) for picture in pixels]
-        assert nearest == [0, 1, 2, 3, 4]

@@ -3,12 +3,10 @@
 import json
 
 import numpy as np
-import pytest
 
-from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.loop_state import SegmentEnd
 from cronos_lerobot.training.logging import _jsonable, _scalars
-from cronos_lerobot.training.rollout import RolloutStatistics, SmoothedSuccess
+from cronos_lerobot.training.rollout import RolloutStatistics
 
 TASKS = ["a", "b", "put a back"]
 
@@ -49,26 +47,3 @@ def test_statistics_go_on_from_a_checkpoint():
     second.load_state_dict(json.loads(json.dumps(first.state_dict())))
     assert first.pop() == second.pop()
     assert second.pop()["segments"] == 0
-
-
-@pytest.mark.parametrize(
-    ("options", "updates"),
-    [
-        ({"scene_reset_interval": 4}, 1),
-        ({"scene_reset_interval": 16}, 2),
-        ({"scene_reset_interval": 12}, 3),  # 24 steps are two periods and three updates
-        ({"scene_reset_interval": None}, 2),  # a cycle of four tasks
-        ({"scene_reset_interval": 4, "curriculum": [(1000, 16)]}, 2),
-        ({"scene_reset_interval": 4, "curriculum": [(1000, None)]}, 2),
-    ],
-)
-def test_the_consoles_success_is_that_of_whole_reset_periods(options, updates):
-    protocol = ProtocolConfig(task_switch_interval=4, update_interval=8, **options)
-    smoothed = SmoothedSuccess(protocol, num_tasks=4)
-    shown = []
-    for number in range(2 * updates):
-        # The first update of each period is all success, the others all failure.
-        rollout = RolloutStatistics(TASKS)
-        rollout.on_event(end([0, 1], [0, 0], [number % updates == 0] * 2, [0, 0], [0, 0]))
-        shown.append(smoothed.add(rollout.pop(), 100)["success"])
-    assert shown[updates - 1 :] == [1 / updates] * (updates + 1)

@@ -1,5 +1,8 @@
 """A recorded stream into LeRobot's replay buffer and out again."""
 
+from importlib import import_module
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -8,13 +11,18 @@ from lerobot_env_cronos import CronosVectorEnv
 from synthetic_streams import make_step
 
 from cronos_lerobot.data.recorder import StreamRecorder
-from cronos_lerobot.data.replay import to_replay_buffer
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.protocol.interventions import Intervention
 
 K, SEGMENTS, STREAMS = 5, 4, 2
 KEYS = ("observation.state", "observation.environment_state")
 SWITCHES = {5: Intervention.TASK_SWITCH, 10: Intervention.END_EFFECTOR_RESET, 15: Intervention.TASK_SWITCH}
+
+
+@pytest.fixture
+def to_replay_buffer(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "examples")
+    return import_module("replay_buffer").to_replay_buffer
 
 
 def observed(observation):
@@ -71,7 +79,7 @@ def rows(buffer):
     return found
 
 
-def test_dones_truncations_and_successors_are_those_that_happened(recorded):
+def test_dones_truncations_and_successors_are_those_that_happened(recorded, to_replay_buffer):
     root, tape = recorded
     streams = StreamDataset("me/stream", root)
     found = rows(to_replay_buffer(streams, KEYS, image_augmentation_function=random_shift))
@@ -86,7 +94,7 @@ def test_dones_truncations_and_successors_are_those_that_happened(recorded):
         assert (done, truncated) == (False, t in (4, 14))
 
 
-def test_what_no_buffer_can_hold_is_refused(recorded):
+def test_what_no_buffer_can_hold_is_refused(recorded, to_replay_buffer):
     streams = StreamDataset("me/stream", recorded[0])
     with pytest.raises(ValueError, match=r"observation\.smell"):
         to_replay_buffer(streams, ["observation.smell"])

@@ -1,5 +1,8 @@
 """Recorded streams as a replay buffer of `lerobot.rl`: every transition as it happened, cuts as truncations.
 
+    streams = StreamDataset("me/stream", root="outputs/train/recorded/streams")
+    buffer = to_replay_buffer(streams, ["observation.state", "observation.environment_state"])
+
 LeRobot's own `ReplayBuffer.from_lerobot_dataset` knows no truncation: it stores none, and where an episode ends
 without being done it takes a state for its own successor.
 """
