@@ -97,7 +97,7 @@ class PocketVLAConfig(PreTrainedConfig):
     """Hash buckets for words and pairs of words."""
     hidden_width: int = 256
     """Width of the trunk's layers."""
-    hidden_depth: int = 2
+    hidden_depth: int = 3
     """Number of the trunk's layers."""
     value_width: int = 256
     """Width of the value head's hidden layer."""
