@@ -1,11 +1,13 @@
 """Task orders and reset strategies that remember something of their own: it is in the checkpoint."""
 
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from runs import STEPS_PER_UPDATE, assert_same_run, config, resumed, train
+from runs import STEPS_PER_UPDATE, assert_same_run, config, make_trainer, resumed, train
 
+from cronos_lerobot.agents.ppo.agent import PPOAgent
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.own_state import load_own_states, own_states
@@ -76,6 +78,12 @@ def test_what_a_checkpoint_cannot_hold_is_refused_before_the_run_begins(tmp_path
     with pytest.raises(ValueError, match="CountingOrder"):
         train(config(tmp_path, protocol=PROTOCOL))
     assert not (tmp_path / "checkpoints").exists()
+
+
+def test_an_agent_that_no_checkpoint_can_hold_is_refused_before_the_run_begins(tmp_path, monkeypatch):
+    monkeypatch.setattr(PPOAgent, "state_dict", lambda self: {"last": deque([1.0])})
+    with pytest.raises(ValueError, match="PPOAgent"):
+        make_trainer(config(tmp_path))
 
 
 def test_a_run_may_go_on_with_others(tmp_path, caplog):
