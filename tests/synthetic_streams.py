@@ -51,31 +51,28 @@ def make_step(t, *, actions, log_prob, value, **changes) -> Step:
     return Step(t, action=action, **(rest | changes))
 
 
-def step(recorder: StreamRecorder, t: int) -> None:
-    streams = np.arange(STREAMS)
+def step(recorder: StreamRecorder, t: int, num_streams: int = STREAMS, **changes) -> None:
+    streams = np.arange(num_streams)
     code = 1000 * streams + t
-    resets = (t // RESET) * np.ones(STREAMS, int)
-    recorder.on_step(
-        make_step(
-            t,
-            observation={
-                "pixels": {"front": PICTURES[(streams + t) % 7]},
-                "agent_pos": np.repeat(code[:, None], STATE_DIM, axis=1).astype(np.float32),
-            },
-            instructions=[TASKS[(i + t // K) % 2] for i in streams],
-            actions=np.repeat(code[:, None], 7, axis=1).astype(np.float32) / 2,
-            reward=code / 4,
-            success=np.array([success(i, t) for i in streams]),
-            log_prob=-code / 8,
-            value=code / 16,
-            policy_version=t // UPDATE,
-            preceded_by=np.full(STREAMS, intervention(t)),
-            interventions=resets,
-            piece=np.full(STREAMS, t // K),
-            segments_since_reset=np.full(STREAMS, t % RESET // K),
-            cut=np.full(STREAMS, t % K == K - 1),
-        )
-    )
+    columns = {
+        "observation": {
+            "pixels": {"front": PICTURES[(streams + t) % 7]},
+            "agent_pos": np.repeat(code[:, None], STATE_DIM, axis=1).astype(np.float32),
+        },
+        "instructions": [TASKS[(i + t // K) % 2] for i in streams],
+        "actions": np.repeat(code[:, None], 7, axis=1).astype(np.float32) / 2,
+        "reward": code / 4,
+        "success": np.array([success(i, t) for i in streams]),
+        "log_prob": -code / 8,
+        "value": code / 16,
+        "policy_version": t // UPDATE,
+        "preceded_by": np.full(num_streams, intervention(t)),
+        "interventions": np.full(num_streams, t // RESET),
+        "piece": np.full(num_streams, t // K),
+        "segments_since_reset": np.full(num_streams, t % RESET // K),
+        "cut": np.full(num_streams, t % K == K - 1),
+    }
+    recorder.on_step(make_step(t, **(columns | changes)))
 
 
 def record(

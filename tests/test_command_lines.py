@@ -1,19 +1,23 @@
-"""The command lines that the README and the documentation show are read without complaint."""
+"""What the README and the documentation show: command lines, links, and the README's reset strategy."""
 
 import re
 import shlex
 import sys
+from itertools import chain
 from pathlib import Path
 
 import lerobot_policy_openvla  # noqa: F401
 import lerobot_policy_pocketvla  # noqa: F401
+import numpy as np
 import pytest
 from flags import parse_flags
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.scripts.lerobot_edit_dataset import EditDatasetConfig
 
+from cronos_lerobot import LoopState
 from cronos_lerobot.evaluation.config import CronosEvalConfig
+from cronos_lerobot.protocol import ProtocolConfig
 from cronos_lerobot.scripts import publish, streams
 from cronos_lerobot.scripts.record_demos import RecordDemosConfig
 from cronos_lerobot.training.config import CronosTrainConfig
@@ -84,3 +88,45 @@ def test_there_are_command_lines():
     assert sum(len(readable(flags, "")) for _, _, flags in shown) > 300
     with pytest.raises(SystemExit):
         parse_flags(CronosTrainConfig, readable(["--policy.path=<>", "--protocol.scene_resets=1"], ""))
+
+
+LINKED = ("*.md", "docs/*.md", "docs/results/**/*.md", "envs/**/README.md", "policies/**/README.md")
+"""Not the templates of cards, whose links are of the repositories that they are for."""
+
+
+def prose(page: Path) -> str:
+    return re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+
+
+def anchors(page: Path) -> set[str]:
+    """Those that GitHub gives the headings of a page."""
+    headings = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
+    plain = (re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).strip().lower() for heading in headings)
+    return {re.sub(r"[^\w\- ]", "", text).replace(" ", "-") for text in plain}
+
+
+def test_links_lead_somewhere():
+    broken, seen = [], 0
+    for page in chain(*(ROOT.glob(pattern) for pattern in LINKED)):
+        for link in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
+            path, _, anchor = link.partition("#")
+            if "://" in link:
+                continue
+            seen += 1
+            target = page.parent / path if path else page
+            if not target.exists() or (anchor and anchor not in anchors(target)):
+                broken.append(f"{page.relative_to(ROOT)}: {link}")
+    assert seen > 50
+    assert not broken
+
+
+def test_the_reset_strategy_resets_after_four_failures_in_a_row():
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    names = {}
+    exec(code, names)
+    strategy = names["AfterFailures"](np.random.default_rng(0), ProtocolConfig())
+    loop = LoopState(num_streams=4, num_tasks=4)
+    loop.recent_success[:, -5:] = [[1, 0, 0, 0, 0], [0, 0, 0, 0, 1], [-1, -1, 0, 0, 0], [0, 0, 0, 0, 0]]
+    # The last one was reset two segments ago: its older failures were in another scene.
+    loop.segments_since_reset[:] = [5, 5, 3, 2]
+    assert strategy.due(None, loop).tolist() == [0]

@@ -4,6 +4,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_policy_config, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
+from tiny_checkpoints import save_policy
 from tiny_pi0 import save_tiny_tokenizer, tiny_gemma, tokenizer_from, use_tokenizer
 from tiny_smolvla import pretend_num2words, save_tiny_smolvlm
 
@@ -18,16 +19,30 @@ INPUTS = {
 OUTPUTS = {"action": PolicyFeature(FeatureType.ACTION, (DIMS,))}
 
 
-def make_vla(kind, folder, **options):
-    """An untrained policy; `folder` gets what LeRobot would fetch from the Hub."""
+def own_options(kind, folder):
+    """What makes a kind small; `folder` gets what LeRobot would fetch from the Hub."""
     if kind == "smolvla":
         pretend_num2words()
         save_tiny_smolvlm(folder / "vlm")
         own = {"vlm_model_name": str(folder / "vlm"), "num_vlm_layers": 2, "num_steps": STEPS}
-        own |= {"resize_imgs_with_padding": (32, 32)}
-    else:
-        save_tiny_tokenizer(folder / "tokenizer")
-        own = {"image_resolution": (28, 28), "num_inference_steps": STEPS}
+        return own | {"resize_imgs_with_padding": (32, 32)}
+    save_tiny_tokenizer(folder / "tokenizer")
+    return {"image_resolution": (28, 28), "num_inference_steps": STEPS}
+
+
+def save_clone(kind, folder):
+    """An untrained policy of pictures of 64 x 64 that plays five actions, as a checkpoint in `folder`."""
+    pixels = {"observation_height": 64, "observation_width": 64}
+    own = own_options(kind, folder)
+    with tiny_gemma(), tokenizer_from(folder / "tokenizer"):
+        clone = save_policy(folder / "clone", kind, pixels, chunk_size=CHUNK, n_action_steps=5, **own)
+    use_tokenizer(clone, folder / "tokenizer")
+    return clone
+
+
+def make_vla(kind, folder, **options):
+    """An untrained policy; `folder` gets what LeRobot would fetch from the Hub."""
+    own = own_options(kind, folder)
     sizes = {"chunk_size": CHUNK, "n_action_steps": PLAYED, "max_action_dim": PADDED}
     features = {"input_features": dict(INPUTS), "output_features": dict(OUTPUTS)}
     config = make_policy_config(

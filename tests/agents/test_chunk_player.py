@@ -11,6 +11,7 @@ from lerobot.policies.factory import get_policy_class, make_policy_config
 
 from cronos_lerobot.agents.chunk_player import ChunkPlayer, SharedPlayer, make_player
 from cronos_lerobot.agents.processing import PolicyProcessors
+from cronos_lerobot.evaluation.actors import SelectingPolicy
 
 
 def play(player, seen, ids=None):
@@ -116,13 +117,28 @@ def test_streams_in_step_do_what_lerobots_select_action_does(name):
     assert (expected[0] - expected[1]).abs().max() > 1e-4
 
 
-def test_groot_plays_as_many_actions_as_it_queues():
-    """Its `select_action` queues `_action_queue_steps`, which may be fewer than `n_action_steps`."""
-    config = SimpleNamespace(type="groot", n_action_steps=4)
-    policy = SimpleNamespace(config=config, _action_queue_steps=2, reset=lambda: None)
-    policy.predict_action_chunk = lambda batch: batch["observation.state"][:, None] + torch.arange(4.0)[:, None]
-    player = make_player(policy, PolicyProcessors(*identity_processors()))
-    assert [play(player, [seen]) for seen in (0, 10, 20, 30)] == [[0], [1], [20], [21]]
+def test_an_evaluation_plans_anew_where_a_task_begins():
+    class Planner(torch.nn.Module):
+        """Sees one number, and plans to play it three times."""
+
+        config = SimpleNamespace(type="planner", use_amp=False)
+
+        def reset(self):
+            pass
+
+        def predict_action_chunk(self, batch):
+            return batch["observation.state"][:, None].expand(-1, 3, 7)
+
+    actor = SelectingPolicy(Planner(), PolicyProcessors(*identity_processors()), (dict, dict))
+
+    def act(*numbers):
+        observation = {"agent_pos": np.array(numbers, np.float32)[:, None]}
+        return actor.act(observation, ["go"] * 2, np.arange(2)).action[:, 0].tolist()
+
+    assert actor.is_per_stream
+    assert act(1, 2) == [1, 2]
+    actor.begin(np.array([1]))
+    assert act(3, 4) == [1, 4]
 
 
 def test_plans_that_depend_on_plans_are_left_to_the_policy():

@@ -139,21 +139,24 @@ def test_chunks_that_do_not_divide_the_interval_are_refused():
         agent.act(at(1, 2), ["a", "b"])
 
 
+def update_once(shift, **options):
+    """Metrics of an update in which all factors are exp(shift) likelier than when they were drawn."""
+    settings = {"target_kl": None, "lr_schedule": "fixed", "epochs": 1, "normalize_advantage": False}
+    agent, policy = make_agent(**settings | options)
+    torch.nn.init.zeros_(policy.actor.weight)
+    torch.nn.init.constant_(policy.actor.bias, shift)
+    play(agent, 8, [[1, 1]] * 8, cut={(7, 0), (7, 1)})
+    return agent.update()
+
+
 @pytest.mark.parametrize("ratio", ["decision", "factor"])
 def test_ratios_of_decisions_and_of_factors(ratio):
     log_prob = torch.tensor([[-1.0, -2.0], [-3.0, 1.0]])
     expected = log_prob if ratio == "factor" else torch.tensor([[-3.0], [-2.0]])
     torch.testing.assert_close(by_factor(log_prob, ratio), expected)
     torch.testing.assert_close(by_factor(torch.tensor([5.0, 6.0]), ratio), torch.tensor([[5.0], [6.0]]))
-    agent, policy = make_agent(
-        ratio=ratio, target_kl=None, lr_schedule="fixed", epochs=1, normalize_advantage=False
-    )
-    with torch.no_grad():
-        policy.actor.weight.fill_(0.0)
-        policy.actor.bias.fill_(0.5)
-    play(agent, 8, [[1, 1]] * 8, cut={(7, 0), (7, 1)})
-    # All factors are exp(0.5) likelier than when they were drawn: a decision of two factors exp(1.0).
-    metrics = agent.update()
+    # A decision of two factors is exp(1.0) likelier.
+    metrics = update_once(0.5, ratio=ratio)
     shift = 1.0 if ratio == "decision" else 0.5
     assert metrics["ratio_max"] == pytest.approx(np.exp(shift), rel=1e-4)
     factors = 1 if ratio == "decision" else 2
@@ -163,16 +166,7 @@ def test_ratios_of_decisions_and_of_factors(ratio):
 
 def test_factors_weigh_as_much_as_decisions_beside_the_rest_of_the_loss():
     """Where all ratios are 1 both clip nothing: the gradient is that of the decision's log-probability."""
-    norms = []
-    for ratio in ("decision", "factor"):
-        agent, policy = make_agent(
-            ratio=ratio, target_kl=None, lr_schedule="fixed", epochs=1, normalize_advantage=False
-        )
-        with torch.no_grad():
-            policy.actor.weight.fill_(0.0)
-            policy.actor.bias.fill_(0.0)
-        play(agent, 8, [[1, 1]] * 8, cut={(7, 0), (7, 1)})
-        norms.append(agent.update()["policy_grad_norm"])
+    norms = [update_once(0.0, ratio=ratio)["policy_grad_norm"] for ratio in ("decision", "factor")]
     assert norms[0] > 0
     assert norms[1] == pytest.approx(norms[0])
 
@@ -180,15 +174,9 @@ def test_factors_weigh_as_much_as_decisions_beside_the_rest_of_the_loss():
 def test_the_first_steps_of_a_denoising_may_count_less():
     assert factor_weights(torch.zeros(5, 3), 0.5).tolist() == [0.25, 0.5, 1]
     assert factor_weights(torch.zeros(5, 1), 1.0).tolist() == [1]
-    options = {"target_kl": None, "lr_schedule": "fixed", "epochs": 1, "normalize_advantage": False}
-    losses = []
-    for discount in (1.0, 0.5):
-        agent, policy = make_agent(ratio="factor", denoising_discount=discount, **options)
-        with torch.no_grad():
-            policy.actor.weight.fill_(0.0)
-            policy.actor.bias.fill_(0.5)
-        play(agent, 8, [[1, 1]] * 8, cut={(7, 0), (7, 1)})
-        losses.append(agent.update()["policy_loss"])
+    all_alike, less = (
+        update_once(0.5, ratio="factor", denoising_discount=discount)["policy_loss"] for discount in (1.0, 0.5)
+    )
     # Both factors of a decision have the same ratio: (1/2 + 1) / 2 of the loss is left.
-    assert losses[0] != 0
-    assert losses[1] == pytest.approx(0.75 * losses[0])
+    assert all_alike != 0
+    assert less == pytest.approx(0.75 * all_alike)

@@ -127,36 +127,6 @@ def test_likelihoods_are_those_of_the_draw(adapter, temperature):
     assert again["entropy"] is None
 
 
-def test_what_is_played_begins_with_the_present():
-    """With two observations, the chunk's first action is one of the past."""
-    adapter = make_trainable(make_diffusion(2), AdapterOptions())
-    batch = make_batch(adapter.policy, history=(2,))
-    with torch.no_grad():
-        sample = adapter.sample_actions(batch, generator=torch.Generator().manual_seed(2))
-    assert torch.equal(sample["actions"], sample["trace"][:, -1, 1 : 1 + STEPS])
-
-
-def test_gradients_are_finite_differences():
-    adapter = make_trainable(make_diffusion(images=True), AdapterOptions(noise_std=0.5, noise_level=1.0))
-    batch = make_batch(adapter.policy, n=2)
-    with torch.no_grad():
-        trace = adapter.sample_actions(batch, generator=torch.Generator().manual_seed(3))["trace"]
-    model = adapter.policy.diffusion
-    params = [model.unet.final_conv[1].weight, model.unet.final_conv[1].bias, model.rgb_encoder[0].out.bias]
-    adapter.evaluate_actions(batch, trace)["log_prob"].sum().backward()
-    for param in params:
-        flat, grad = param.data.view(-1), param.grad.view(-1)
-        assert grad.abs().max() > 0.1
-        for i in (0, len(flat) - 1):
-            ends = []
-            for shift in (1e-2, -1e-2):
-                flat[i] += shift
-                with torch.no_grad():
-                    ends.append(adapter.evaluate_actions(batch, trace)["log_prob"].double().sum().item())
-                flat[i] -= shift
-            assert grad[i].item() == pytest.approx((ends[0] - ends[1]) / 2e-2, rel=2e-2, abs=2e-2)
-
-
 def test_the_value_does_not_train_the_policy(adapter):
     batch = make_batch(adapter.policy)
     torch.nn.init.normal_(adapter.critic.layers[-1].weight)

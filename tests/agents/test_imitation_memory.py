@@ -8,6 +8,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.factory import resolve_delta_timestamps
+from tiny_datasets import write_dataset
 
 from cronos_lerobot.agents.imitation.batches import Demonstrations, join_batches, segment_batch
 from cronos_lerobot.agents.imitation.config import DemosConfig
@@ -123,26 +124,8 @@ def episodes():
 
 @pytest.fixture(scope="module")
 def dataset_root(episodes, tmp_path_factory):
-    root = tmp_path_factory.mktemp("demos") / "dataset"
-    features = {
-        "observation.state": {"dtype": "float32", "shape": (4,), "names": None},
-        "observation.images.front": {
-            "dtype": "image",
-            "shape": (8, 6, 3),
-            "names": ["height", "width", "channel"],
-        },
-        "action": {"dtype": "float32", "shape": (7,), "names": None},
-        "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
-    }
-    dataset = LeRobotDataset.create("me/demos", fps=5, features=features, root=root, use_videos=False)
-    for episode in episodes:
-        for i in range(len(episode)):
-            frame = {name: column[i] for name, column in episode.columns.items()}
-            frame["next.reward"] = frame["next.reward"][None]
-            dataset.add_frame(frame | {"task": episode.instruction})
-        dataset.save_episode()
-    dataset.finalize()
-    return root
+    tasks = [(episode.instruction, episode.columns) for episode in episodes]
+    return write_dataset(tmp_path_factory.mktemp("demos") / "dataset", tasks)
 
 
 @pytest.mark.parametrize("name", DELTAS)

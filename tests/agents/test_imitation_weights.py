@@ -9,7 +9,6 @@ from tiny_pocketvla import make_pocketvla
 
 from cronos_lerobot.agents.imitation.batches import draw_batch, segment_batch
 from cronos_lerobot.agents.imitation.memory import (
-    Remembered,
     Segment,
     SegmentMemory,
     by_advantage,
@@ -17,7 +16,6 @@ from cronos_lerobot.agents.imitation.memory import (
     discounted_returns,
     effective_share,
 )
-from cronos_lerobot.ranks import Ranks
 
 
 def segment(task, rewards):
@@ -43,36 +41,6 @@ def test_weights_by_hand():
     assert by_advantage(RETURNS, TASKS, 1e-6, 20.0) == pytest.approx([20, 0, 1])
     assert effective_share(np.ones(3), np.array([3, 2, 1])) == pytest.approx(1)
     assert effective_share(np.array([1, 0, 0]), np.array([3, 2, 1])) == pytest.approx(0.5)
-
-
-class BesideOneThatFailed(Ranks):
-    """The first of two processes, the second of which has failed at task a once, in four frames."""
-
-    count = 2
-
-    def gather(self, value):
-        return [value, (np.array(["a"]), np.array([4]), np.zeros(1))]
-
-
-def test_processes_weigh_all_that_they_remember():
-    memory = SegmentMemory(2**20)
-    for kept in SEGMENTS:
-        memory.add(kept)
-    everyone = Remembered.of(memory, BesideOneThatFailed(), 0.5)
-    weights = by_return(everyone.returns, 0.25)
-    own, other = everyone.split(weights)
-    e = math.e
-    assert (own, other) == (pytest.approx([e**-3, e**-4, 1]), pytest.approx([e**-4]))
-    # By the frames that can be drawn.
-    assert everyone.masses(weights) == pytest.approx([3 * e**-3 + 2 * e**-4 + 1, 4 * e**-4])
-    # The mean of task a is 1/12 now.
-    advantages = by_advantage(everyone.returns, everyone.instructions, 0.25, 20.0)
-    assert advantages == pytest.approx([e ** (2 / 3), e ** (-1 / 3), 1, e ** (-1 / 3)])
-    # By itself it is a process like any other, and one with nothing has no weights.
-    assert by_return(Remembered.of(memory, Ranks(), 0.5).returns, 0.25) == pytest.approx(own)
-    nothing = Remembered.of(SegmentMemory(2**20), BesideOneThatFailed(), 0.5)
-    assert [len(part) for part in nothing.split(by_return(nothing.returns, 0.25))] == [0, 1]
-    assert nothing.masses(np.ones(1)).tolist() == [0, 4]
 
 
 class Demos:

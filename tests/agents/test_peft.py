@@ -11,7 +11,7 @@ from lerobot.configs.default import PeftConfig
 from lerobot.policies.factory import get_policy_class
 from peft import PeftModel
 from test_act_adapter import make_act
-from test_diffusion_adapter import HORIZON, make_diffusion
+from test_diffusion_adapter import make_diffusion
 from test_imitation_agent import learn, make_imitating
 from test_vla_adapters import OPTIONS, STATISTICS, TEXTS, generator, one_update
 from tiny_pi0 import tiny_gemma
@@ -110,40 +110,6 @@ def assert_only_adapters_moved(wrapped, before, adapters):
 
 def trained(wrapped):
     return {name: param.detach().clone() for name, param in wrapped.named_parameters() if param.requires_grad}
-
-
-def select(policy, batch, **noise):
-    """The first actions of a new episode (B, n, A), by LeRobot's `select_action`."""
-    policy.reset()
-    steps = policy.config.n_action_steps
-    return torch.stack([policy.select_action(dict(batch), **noise) for _ in range(steps)], 1)
-
-
-@pytest.mark.parametrize("kind", SMALL)
-def test_ppo_trains_adapters_in_policies_without_defaults(kind, tmp_path):
-    wrapped, _ = make_wrapped(kind, tmp_path / "base")
-    adapter = make_trainable(wrapped, OPTIONS)
-    batch = {"observation.state": torch.randn(2, 5), "observation.environment_state": torch.randn(2, 6)}
-    noise = {"noise": torch.randn(2, HORIZON, 3, generator=generator())} if kind == "diffusion" else {}
-    with torch.no_grad():
-        actions = adapter.sample_actions(batch, temperature=0, **noise)["actions"]
-        torch.testing.assert_close(actions, select(wrapped, batch, **noise))
-        with wrapped.disable_adapter():
-            assert not torch.allclose(actions, adapter.sample_actions(batch, temperature=0, **noise)["actions"])
-        sample = adapter.sample_actions(batch, generator=generator())
-    evaluated = adapter.evaluate_actions(batch, sample["trace"])
-    torch.testing.assert_close(evaluated["log_prob"], sample["log_prob"], atol=1e-4, rtol=0)
-    (evaluated["log_prob"].sum() + evaluated["value"].sum()).backward()
-    learning = {name for name, param in adapter.named_parameters() if param.grad is not None}
-    own = set(adapter.own_parameters())
-    assert own <= learning
-    # The encoder of ACT's latent has adapters too, which acting does not use.
-    lora = {name for name, _ in adapter.named_parameters() if ".lora_" in name and ".vae_encoder" not in name}
-    assert learning - own == lora
-    assert all(param.grad.any() for name, param in adapter.named_parameters() if name in lora)
-    groups = {id(param) for group in adapter.rl_parameter_groups() for param in group["params"]}
-    assert {name for name, param in adapter.named_parameters() if id(param) in groups} == learning
-    adapter.zero_grad()
 
 
 @pytest.mark.parametrize("kind", SMALL)

@@ -146,15 +146,6 @@ def test_a_policy_that_leaps_is_stopped_before_another_backward_pass():
     assert all(p.grad is None for p in ppo.policy.parameters())
 
 
-def test_a_stop_does_not_wait_for_the_rest_of_an_accumulated_step():
-    ppo = make_ppo(epochs=3, policy_lr=100.0, value_epochs=0, minibatch_size=16, grad_accumulation=4)
-    evaluated = []
-    evaluate = ppo.policy.evaluate_actions
-    ppo.policy.evaluate_actions = lambda *args, **kwargs: evaluated.append(1) or evaluate(*args, **kwargs)
-    assert ppo.update(rollout(ppo, reward_for_up))["policy_epochs"] == 0.5
-    assert len(evaluated) == 5
-
-
 def test_the_base_policy_keeps_what_is_trained_and_nothing_else():
     ppo = make_ppo(kl_base_coef=0.1, policy_lr=1e-2)
     assert set(ppo.base_policy.parameters) == {"actor.weight", "actor.bias"}

@@ -23,15 +23,6 @@ def test_batch_equals_lerobots_own():
         assert torch.equal(ours[name], tensor), name
 
 
-def test_uint8_images_are_the_same_ones():
-    columns = observation_columns(observation())
-    floats = PolicyProcessors(*identity_processors()).batch(columns, ["a", "b"])
-    integers = PolicyProcessors(*identity_processors(), uint8_images=True).batch(columns, ["a", "b"])
-    key = "observation.images.front"
-    assert integers[key].dtype == torch.uint8
-    assert torch.equal(integers[key].float() / 255, floats[key])
-
-
 @pytest.mark.parametrize(
     ("takes_uint8", "mode", "expected"),
     [

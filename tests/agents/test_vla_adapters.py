@@ -1,10 +1,12 @@
 """SmolVLA, pi0 and pi0.5 as policies that PPO can train, against LeRobot's own classes on tiny checkpoints."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 from tiny_vlas import (
     CHUNK,
     DIMS,
@@ -22,6 +24,7 @@ from cronos_lerobot.agents.ppo.agent import PPOAgent
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
+from cronos_lerobot.agents.weights import train_in_float32
 
 OPTIONS = AdapterOptions(noise_level=0.8)
 THAWED = {"smolvla": {"train_expert_only": False, "freeze_vision_encoder": False}}
@@ -142,6 +145,29 @@ def test_the_critic_sees_the_picture_the_instruction_and_the_state(adapter):
         for name in ("observation.state", "observation.images.front", "observation.language.tokens"):
             other = batch | {name: batch[name].flip(0)}
             assert (adapter.predict_values(other) - value)[0].abs() > 1e-4, name
+
+
+class Mixed(torch.nn.Module):
+    """As SmolVLA is made: all of it in bfloat16, and a part of it frozen."""
+
+    def __init__(self, policy_type):
+        super().__init__()
+        self.config = SimpleNamespace(type=policy_type)
+        self.trained = torch.nn.Linear(3, 2, bias=False, dtype=torch.bfloat16)
+        self.frozen = torch.nn.Linear(3, 2, bias=False, dtype=torch.bfloat16).requires_grad_(False)
+
+
+@pytest.mark.parametrize(("policy_type", "dtype"), [("smolvla", torch.float32), ("other", torch.bfloat16)])
+def test_small_steps_of_a_checkpoint_survive_its_loading(tmp_path, policy_type, dtype):
+    # 1 + 2^-12 is 1 in bfloat16, which has 7 bits after the first.
+    trained, frozen = torch.full((2, 3), 1 + 2**-12), torch.ones(2, 3)
+    save_file({"trained.weight": trained, "frozen.weight": frozen}, tmp_path / "model.safetensors")
+    policy = Mixed(policy_type)
+    policy.load_state_dict({"trained.weight": trained, "frozen.weight": frozen})
+    assert policy.trained.weight.float().eq(1).all(), "LeRobot's own loading rounds"
+    train_in_float32(policy, tmp_path)
+    assert (policy.trained.weight.dtype, policy.frozen.weight.dtype) == (dtype, torch.bfloat16)
+    assert policy.trained.weight.float().equal(trained) == (policy_type == "smolvla")
 
 
 STATISTICS = {

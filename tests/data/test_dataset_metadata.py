@@ -107,12 +107,6 @@ def test_a_repository_without_this_version_is_told(tmp_path, monkeypatch, tags, 
         StreamDataset("me/stream", streaming=True)
 
 
-def test_a_revision_of_a_folder_is_refused(root, monkeypatch):
-    monkeypatch.setattr("lerobot.datasets.dataset_metadata.HF_LEROBOT_HOME", root.parent)
-    with pytest.raises(ValueError, match="revision=v2"):
-        StreamDataset("d", revision="v2", streaming=True)
-
-
 def test_unusual_names_are_read(tmp_path):
     root = tmp_path / "{a} k=v, b" / "d]"
     record(root, steps=4)

@@ -1,53 +1,28 @@
 import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset
-from synthetic_segments import FPS, STATE_DIM, images, observation_space
-from synthetic_streams import make_step
+from synthetic_segments import FPS, STATE_DIM, observation_space
+from synthetic_streams import PICTURES, RESET, TASKS, K, intervention, step, success
 
 from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.schema import stream_features
 from cronos_lerobot.data.writer import SegmentWriter
 from cronos_lerobot.protocol.interventions import Intervention
 
-K = 4
-SWITCH = [Intervention.TASK_SWITCH, Intervention.END_EFFECTOR_RESET, Intervention.SCENE_RESET]
-
 
 class Loop:
     """Feeds a recorder as a training loop would: every number says which stream and step it belongs to."""
 
     def __init__(self, num_envs: int):
-        self.n = num_envs
+        self.n, self.t = num_envs, 0
         self.space = observation_space(environment_state=None)
-        self.pictures = images(7)
-        self.t = 0
 
     def writer(self, root, **options):
         return SegmentWriter("me/stream", root, stream_features(self.space), FPS, **options)
 
-    def step(self, recorder: StreamRecorder, **overrides):
-        t, streams = self.t, np.arange(self.n)
-        code = 1000 * streams + t
-        preceded = SWITCH[(t // K) % 3] if t else Intervention.INITIAL
-        arguments = {
-            "observation": {
-                "pixels": {"front": self.pictures[(streams + t) % 7]},
-                "agent_pos": np.repeat(code[:, None], STATE_DIM, axis=1).astype(np.float32),
-            },
-            "instructions": [f"task {(i + t // K) % 3}" for i in streams],
-            "actions": np.repeat(code[:, None], 7, axis=1).astype(np.float32) / 2,
-            "reward": code / 4,
-            "success": (streams + t) % 5 == 0,
-            "log_prob": -code / 8,
-            "value": code / 16,
-            "policy_version": t // (2 * K),
-            "preceded_by": np.full(self.n, preceded if t % K == 0 else Intervention.NONE),
-            "interventions": streams + t // K,
-            "piece": np.full(self.n, t // K),
-            "segments_since_reset": np.full(self.n, 5 + t // K),
-            "cut": np.full(self.n, t % K == K - 1),
-        }
-        recorder.on_step(make_step(t, **(arguments | overrides)))
+    def step(self, recorder: StreamRecorder, **changes):
+        own = {"interventions": np.arange(self.n) + self.t // K}
+        step(recorder, self.t, self.n, **(own | changes))
         self.t += 1
 
 
@@ -73,19 +48,17 @@ def assert_whole(dataset: LeRobotDataset, num_streams: int, steps: int, num_envs
         np.testing.assert_array_equal(stream["observation.state"][:, 0], code)
         np.testing.assert_array_equal(stream["action"][:, 6], code / 2)
         np.testing.assert_array_equal(stream["next.reward"], code / 4)
-        np.testing.assert_array_equal(stream["next.success"], (i + t) % 5 == 0)
+        np.testing.assert_array_equal(stream["next.success"], [success(i, at) for at in t])
         np.testing.assert_array_equal(stream["cronos.log_prob"], -code / 8)
         np.testing.assert_array_equal(stream["cronos.value"], code / 16)
         np.testing.assert_array_equal(stream["cronos.policy_version"], t // (2 * K))
         np.testing.assert_array_equal(stream["cronos.stream_interventions"], i + t // K)
         n = num_envs or num_streams
         np.testing.assert_array_equal(stream["cronos.total_interventions"], n * (n - 1) // 2 + n * (t // K))
-        np.testing.assert_array_equal(stream["cronos.segments_since_reset"], 5 + t // K)
+        np.testing.assert_array_equal(stream["cronos.segments_since_reset"], t % RESET // K)
         np.testing.assert_array_equal(stream["next.truncated"], t % K == K - 1)
         assert not stream["next.done"].any()
-        kinds = np.where(t % K == 0, [SWITCH[k % 3] for k in t // K], 0)
-        kinds[0] = Intervention.INITIAL
-        np.testing.assert_array_equal(stream["cronos.event"], kinds)
+        np.testing.assert_array_equal(stream["cronos.event"], [intervention(at) for at in t])
 
 
 def test_64_interleaved_streams_come_apart_again(tmp_path):
@@ -100,9 +73,9 @@ def test_64_interleaved_streams_come_apart_again(tmp_path):
     for index in (0, 100, 767):
         item = dataset[index]
         stream, t = int(item["cronos.stream_id"]), int(item["cronos.step"])
-        assert item["task"] == f"task {(stream + t // K) % 3}"
+        assert item["task"] == TASKS[(stream + t // K) % 2]
         assert np.abs(item["observation.images.front"].numpy().transpose(1, 2, 0) * 255
-                      - loop.pictures[(stream + t) % 7]).mean() < 2.5  # fmt: skip
+                      - PICTURES[(stream + t) % 7]).mean() < 2.5  # fmt: skip
 
 
 def test_one_episode_is_one_segment_of_one_stream(tmp_path):
@@ -115,7 +88,7 @@ def test_one_episode_is_one_segment_of_one_stream(tmp_path):
     found = [(e["cronos.stream_id"], e["cronos.segment_index"], e["cronos.step"], e["length"]) for e in episodes]
     assert found == [(i, k, k * K, K) for k in range(2) for i in range(3)]
     assert episodes["cronos.event"] == [Intervention.INITIAL] * 3 + [Intervention.END_EFFECTOR_RESET] * 3
-    assert episodes["next.success"] == [any((i + t) % 5 == 0 for t in range(k * K, k * K + K))
+    assert episodes["next.success"] == [any(success(i, t) for t in range(k * K, k * K + K))
                                         for k in range(2) for i in range(3)]  # fmt: skip
 
 
@@ -177,7 +150,7 @@ def test_buffers_are_copies(tmp_path):
     loop = Loop(1)
     recorder = StreamRecorder(loop.writer(tmp_path / "d"), num_envs=1, segment_length=K)
     state = np.zeros((1, STATE_DIM), np.float32)
-    pictures = loop.pictures[:1].copy()
+    pictures = PICTURES[:1].copy()
     for t in range(K):
         state[:] = t
         loop.step(recorder, observation={"pixels": {"front": pictures}, "agent_pos": state})
@@ -191,8 +164,8 @@ def test_buffers_are_copies(tmp_path):
     [
         (0, {"preceded_by": np.array([0, 0])}),
         (2, {"preceded_by": np.array([0, 4])}),
-        (2, {"instructions": ["task 0", "other"]}),
-        (K, {"preceded_by": np.array([0, 0]), "instructions": ["task 0", "task 1"]}),
+        (2, {"instructions": [TASKS[0], "other"]}),
+        (K, {"preceded_by": np.array([0, 0]), "instructions": list(TASKS)}),
     ],
     ids=["no event at the start", "an event inside", "another instruction", "too long"],
 )

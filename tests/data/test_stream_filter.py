@@ -12,7 +12,6 @@ from cronos_lerobot.data.stats import image_stats, vector_stats
 from cronos_lerobot.data.stream_filter import SegmentFilter, filter_streams
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.data.video import Clip, CopiedVideoFile, read_frames
-from cronos_lerobot.locks import FolderInUseError, FolderLock
 from cronos_lerobot.scripts import streams as script
 
 FRONT = "observation.images.front"
@@ -138,13 +137,6 @@ def test_mistakes_leave_nothing_behind(source, tmp_path):
         SegmentFilter(events=["reset", "initial"])
     with pytest.raises(FileExistsError, match=r"--output\.root"):
         filter_streams(source, SegmentFilter(), "me/all", tmp_path)
-
-
-def test_two_do_not_write_one_dataset(source, tmp_path):
-    (tmp_path / ".d.partial").mkdir()
-    with FolderLock(tmp_path / "d"), pytest.raises(FolderInUseError):
-        filter_streams(source, SegmentFilter(), "me/d", tmp_path / "d")
-    assert (tmp_path / ".d.partial").is_dir()
 
 
 def test_clips_that_begin_between_keyframes_are_refused(source, tmp_path):

@@ -7,8 +7,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from datasets import load_dataset
+from lerobot.configs import FeatureType
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
+from lerobot.utils.feature_utils import dataset_to_policy_features
 from synthetic_segments import FPS, features, observation_space, segment
 from synthetic_streams import ORIGIN, PICTURES, STEPS, STREAMS, TASKS, UPDATE, K, record
 
@@ -208,3 +210,14 @@ def test_errors_are_one_line(root, tmp_path, monkeypatch, command):
         with pytest.raises(SystemExit, match=rf"^error: [^\n]*{line}"):
             main()
     writer.finalize()
+
+
+def test_annotations_are_no_policy_features():
+    policy_features = dataset_to_policy_features(stream_features(observation_space()))
+    assert {key: feature.type for key, feature in policy_features.items()} == {
+        "observation.images.front": FeatureType.VISUAL,
+        "observation.state": FeatureType.STATE,
+        "observation.environment_state": FeatureType.ENV,
+        "action": FeatureType.ACTION,
+    }
+    assert policy_features["observation.images.front"].shape == (3, 64, 64)

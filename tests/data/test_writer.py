@@ -154,13 +154,6 @@ def test_truncates_to_a_state_and_goes_on(tmp_path, segments, flush_after, video
             np.testing.assert_allclose(resumed.meta.stats[key][name], value, atol=1e-9, err_msg=f"{key} {name}")
 
 
-def test_truncates_to_nothing(tmp_path, segments, video):
-    write(tmp_path / "d", segments, video=video).finalize()
-    with resume(tmp_path / "d", 0, video) as writer:
-        writer.add_segment(*segments[3], episode_metadata={"number": 0})
-    assert_holds(tmp_path / "d", [segments[3]])
-
-
 @pytest.mark.parametrize("relative", ["data/chunk-000/file-001.parquet", "meta/info.json", "meta/stats.json"])
 def test_killed_while_publishing_it_still_loads_and_resumes(tmp_path, segments, monkeypatch, relative, video):
     """The process dies right before one of the files of the second flush is moved into place."""

@@ -20,7 +20,6 @@ from lerobot_env_cronos.benchmark.configurations import (
 from lerobot_env_cronos.benchmark.files import (
     BODIES_KEY,
     BenchmarkError,
-    check_tag,
     read_benchmark,
     write_benchmark,
 )
@@ -102,14 +101,6 @@ def test_what_is_wrong_is_named_and_nothing_registered(scene, bodies, named):
     with pytest.raises(ValueError, match=named):
         register_scene(scene, bodies=bodies)
     assert before == (SCENES, BODIES)
-
-
-def test_a_scene_may_be_written_with_lists_but_not_with_a_name():
-    assert Scene("s", ["toy bear"], ["newspaper"], spawn_low=[0.2, -0.15]) == Scene(
-        "s", ("toy bear",), ("newspaper",)
-    )
-    with pytest.raises(ValueError, match="objects"):
-        Scene("s", "toy bear", ("cloth",))
 
 
 # Configurations ------------------------------------------------------------------------------------------
@@ -215,14 +206,6 @@ def test_bodies_that_are_not_those_of_the_scene(study, text):
     pq.write_table(pq.read_table(folder / TRAIN).replace_schema_metadata({BODIES_KEY: text}), folder / TRAIN)
     with pytest.raises(BenchmarkError, match="configurations/train"):
         read_benchmark(folder, "it")
-
-
-def test_a_revision_that_names_a_fingerprint_has_it(study):
-    benchmark, _ = study
-    for revision in ("", "@main", "@benchmark-mine", f"@benchmark-{benchmark.fingerprint}"):
-        assert check_tag(benchmark, f"me/study{revision}") is benchmark
-    with pytest.raises(BenchmarkError, match=f"{benchmark.fingerprint} here, not 0123456789abcdef"):
-        check_tag(benchmark, "me/study@benchmark-0123456789abcdef")
 
 
 def peg(half_width, friction=1.0):

@@ -54,12 +54,6 @@ def test_reach_by_hand(place, within):
     assert find_reach(get_scene("kitchen_2x2")).contains(np.array(place)) == within
 
 
-def test_a_taller_object_is_carried_less_far():
-    """The toy bear, 56 mm, travels higher than the kitchen's 21 mm, where the arm is sooner stretched out."""
-    kitchen, playroom = (find_reach(get_scene(name)).within.sum() for name in ("kitchen_2x2", "playroom_2x2"))
-    assert playroom < kitchen
-
-
 def test_same_seed_same_layouts_and_none_of_the_held_out_ones():
     poses = draw("kitchen_2x2", n=40)
     np.testing.assert_array_equal(poses[:10], draw("kitchen_2x2", n=10))

@@ -1,9 +1,7 @@
 """Drawing in processes of their own: the same frames, and nothing left behind."""
 
-import contextlib
 import os
 import signal
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,36 +27,11 @@ def pool(simulation):
     pool.close()
 
 
-def children() -> set[int]:
-    """Drawing processes of this one."""
-    pids = set()
-    for folder in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):
-            parent = (folder / "stat").read_text().rsplit(")", 1)[1].split()[1]
-            if int(parent) == os.getpid() and b"canvas.py" in (folder / "cmdline").read_bytes():
-                pids.add(int(folder.name))
-    return pids
-
-
 def test_frames_are_those_of_one_process(simulation, pool):
     alone = ClassicRenderer(simulation.render_model, *SIZE, "front").render(simulation.qpos)
     assert len(np.unique(alone.reshape(-1, 3), axis=0)) > 50  # A picture, not an empty canvas.
     assert np.array_equal(pool.render(simulation.qpos), alone)
     assert np.array_equal(pool.render(simulation.qpos[3:]), alone[3:])
-
-
-@pytest.mark.parametrize(("frames", "drawing"), [(16, 2), (23, 2), (24, 3), (64, 3)])
-def test_as_many_processes_draw_as_have_frames_enough(simulation, frames, drawing):
-    """On many cores, too: with 64 frames not one, and not all of 16."""
-    renderer = ClassicRenderer(simulation.render_model, *SIZE, "front", processes=3)
-    if renderer._processes == 1:
-        pytest.skip("drawn by a GPU, which needs no processes")
-    before = children()
-    many = simulation.qpos[np.arange(frames) % 2]
-    expected = ClassicRenderer(simulation.render_model, *SIZE, "front").render(many[:2])
-    assert np.array_equal(renderer.render(many), expected[np.arange(frames) % 2])
-    assert len(children() - before) == drawing
-    renderer.close()
 
 
 def test_what_is_broken_off_is_not_taken_for_what_comes_next(simulation, monkeypatch):

@@ -2,9 +2,8 @@
 
 import numpy as np
 from env_rollouts import make
-from lerobot.envs.utils import env_to_policy_features
-from lerobot_env_cronos import CronosEnvConfig, SequentialVectorEnv, Task, get_scene
-from lerobot_env_cronos.simulation.observations import AGENT_POS_NAMES, agent_pos_names
+from lerobot_env_cronos import SequentialVectorEnv, Task, get_scene
+from lerobot_env_cronos.simulation.observations import AGENT_POS_NAMES
 
 SCENE = get_scene("kitchen_2x2")
 TOLD = {"obs_type": "environment_state_agent_pos", "task_observation": "one_hot"}
@@ -64,11 +63,3 @@ def test_a_chain_is_told_its_next_task_when_it_begins():
     observation, *_ = env.step(np.zeros((1, 7)))
     assert env.instructions == [SCENE.tasks[0].instruction]
     assert observation["agent_pos"][0, 13:].tolist() == [1, 0, 1, 0, 0]
-
-
-def test_features_and_names_follow_the_flag():
-    config = CronosEnvConfig(**TOLD)
-    assert env_to_policy_features(config)["observation.state"].shape == (18,)
-    env = config.create_envs(2)["independent_train"][1]
-    assert env.reset(seed=[0, 1])[0]["agent_pos"][:, 13:].tolist() == [[1, 0, 0, 1, 0]] * 2
-    assert len(agent_pos_names(get_scene("kitchen_3x3"), "one_hot")) == 13 + 3 + 4

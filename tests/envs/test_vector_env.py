@@ -52,23 +52,6 @@ def test_same_seed_same_streams_at_one_and_two_threads():
     np.testing.assert_array_equal(*streams)
 
 
-def test_all_cores_are_those_that_the_process_may_use(monkeypatch):
-    monkeypatch.setattr("os.sched_getaffinity", lambda pid: {5}, raising=False)
-    assert make(2).simulation.num_threads == 1
-
-
-def test_a_loaded_state_continues_bit_for_bit():
-    env, other = make(4), make(4)
-    env.reset(seed=0)
-    env.set_task([1, 2], [env.scene.tasks[3], env.scene.tasks[1]])
-    roll(env, 20)
-    state = env.get_state()
-    expected = roll(env, 20, seed=5)
-    other.set_state(state)
-    assert other.instructions == [env.scene.tasks[i].instruction for i in (0, 3, 1, 0)]
-    np.testing.assert_array_equal(roll(other, 20, seed=5), expected)
-
-
 def test_observations_share_no_memory():
     env = make(2, obs_type="pixels_agent_pos", privileged_state=True, observation_height=32, observation_width=32)
     before, _ = env.reset(seed=0)
@@ -290,14 +273,10 @@ def test_where_nothing_can_be_drawn_the_cause_is_told(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [
-        {"scene": "garage"}, {"reward": "dense"}, {"obs_type": "pixels"}, {"num_threads": -3},
-        {"camera_name": "top"}, {"observation_height": 0}, {"render_size": (1, 2, 3)},
-        {"task_observation": "words"}, {"renderer": "ray"},
-    ],
-)  # fmt: skip
-def test_errors_name_the_argument_and_its_value(wrong):
-    ((name, value),) = wrong.items()
-    with pytest.raises(ValueError, match=f"{name}.*{value if isinstance(value, str) else ''}"):
+    "wrong", [{"reward": "dense"}, {"num_threads": -3}, {"observation_height": 0}, {"render_size": (1, 2, 3)}]
+)
+def test_errors_name_the_argument(wrong):
+    """Those that the config leaves to the environment."""
+    (name,) = wrong
+    with pytest.raises(ValueError, match=name):
         make(1, **wrong)

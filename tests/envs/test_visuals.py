@@ -6,7 +6,7 @@ import pytest
 from lerobot_env_cronos.scene import model as model_module
 from lerobot_env_cronos.scene.model import build_model
 from lerobot_env_cronos.scene.scenes import BODIES, SCENES
-from lerobot_env_cronos.scene.visuals.meshes import VISUAL_GROUP, prism, rectangle
+from lerobot_env_cronos.scene.visuals.meshes import VISUAL_GROUP
 
 SCENE = SCENES["kitchen_2x2"]
 BODIES_OF_SCENES = [(scene, body) for scene in SCENES for body in SCENES[scene].bodies]
@@ -64,10 +64,3 @@ def test_body_fills_its_bounding_box_and_stays_inside(models, scene, name):
     assert (np.abs(vertices) <= half + 1e-4).all()
     # At least 90 % of the published extent is visible in every direction.
     assert (np.ptp(vertices, axis=0) >= 0.9 * 2 * half).all()
-
-
-def test_faces_look_outwards():
-    vertices, faces = prism(rectangle(0.5, 1.0), 0.0, 3.0)
-    corners = vertices[faces]
-    volume = (corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() / 6
-    assert volume == pytest.approx(1.0 * 2.0 * 3.0)

@@ -13,7 +13,7 @@ from cronos_lerobot.evaluation.results import independent_results, read_evaluati
 from cronos_lerobot.hub.benchmark import choose_benchmark
 from cronos_lerobot.hub.config import BenchmarkConfig, ResultsConfig
 from cronos_lerobot.hub.push import PublishError, push_folder
-from cronos_lerobot.hub.results import FILE, changes_of_policy, make_entries, merge, read_own_results
+from cronos_lerobot.hub.results import FILE, changes_of_policy, make_entries, read_own_results
 from cronos_lerobot.scripts.publish import publish_results
 
 BENCHMARK = draw_benchmark("kitchen_2x2", seed=0, num_configurations=2, num_orderings=2, chain_length=2)
@@ -111,15 +111,6 @@ def test_nothing_to_publish_and_damaged_results():
         entries(independent(), suites="sequential")
     with pytest.raises(ValueError, match="damaged"):
         entries(independent(ci95=3))
-
-
-def test_merging_replaces_only_the_same_benchmark_and_task():
-    def entry(dataset, task, value):
-        return {"dataset": {"id": dataset, "task_id": task}, "value": value}
-
-    there = [entry("me/b", "x", 1), entry("other/b", "x", 2), entry("me/b", "y", 3)]
-    new = [entry("me/b", "z", 4), entry("me/b", "x", 5)]
-    assert [e["value"] for e in merge(there, new)] == [5, 2, 3, 4]
 
 
 def test_a_benchmark_is_drawn_or_loaded_or_the_packages():

@@ -56,23 +56,6 @@ def folder(tmp_path):
     return root
 
 
-def test_only_named_files_are_staged_and_the_others_are_told(folder, tmp_path, capsys):
-    out = tmp_path / "out"
-    before = (folder / "train_config.json").read_text()
-    stage(folder, ["config.json", "train_config.json"], out, {"config.json": {"base": "me/b"}})
-    assert sorted(path.name for path in out.iterdir()) == ["config.json", "train_config.json"]
-    assert json.loads((out / "config.json").read_text()) == {"type": "act", "base": "me/b"}
-    assert json.loads((out / "train_config.json").read_text()) == {"output_dir": ".../eer", "hub": ["<token>"]}
-    assert (folder / "train_config.json").read_text() == before
-    assert capsys.readouterr().out == "not pushed: .env, id_rsa, keys/token, model.safetensors\n"
-
-
-def test_what_has_nothing_private_stays_byte_for_byte(folder, tmp_path):
-    stage(folder, ["config.json", "model.safetensors"], tmp_path / "out")
-    for name in ("config.json", "model.safetensors"):
-        assert (tmp_path / "out" / name).read_bytes() == (folder / name).read_bytes()
-
-
 def test_a_link_may_lead_within_the_folder_and_not_out_of_it(folder, tmp_path):
     (tmp_path / "secret.json").write_text("{}")
     (folder / "inside.json").symlink_to("config.json")

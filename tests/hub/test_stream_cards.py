@@ -82,17 +82,6 @@ def test_a_filter_is_told_and_what_it_chose_by_is_no_result(
     assert ["before a segment", "times"] in rows(card)
 
 
-def test_filters_one_after_the_other_are_all_told(recorded, tmp_path):
-    won, two = tmp_path / "won", tmp_path / "two"
-    streams = StreamDataset("me/stream", recorded)
-    filter_streams(streams, SegmentFilter(success=True), "me/won", won, schema="streams")
-    filter_streams(StreamDataset("me/won", won), SegmentFilter(streams=[0]), "me/two", two, schema="streams")
-    card = card_of(two, tmp_path / "out")
-    assert "of 12 segments of `me/won`: `--filter.streams=[0]`" in card
-    assert "kept 12 of 24 segments of `me/stream`: `--filter.success=True`" in card
-    assert CHOSEN in card
-
-
 def test_a_recording_that_broke_off_is_told(tmp_path):
     record(tmp_path / "cut", skip=[(1, 7)])
     card = card_of(tmp_path / "cut", tmp_path / "out")

@@ -10,7 +10,6 @@ from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import SegmentEnd, Step
 from cronos_lerobot.protocol.resets import (
     EXTRA_RESETS,
-    EndEffectorReset,
     ResetStrategy,
     register_reset,
 )
@@ -189,17 +188,6 @@ def test_a_stream_that_was_put_back_after_a_divergence_gets_its_periodic_reset()
     assert loop.interventions[:, Intervention.SCENE_RESET].tolist() == [1, 1]
 
 
-@pytest.mark.parametrize("kind", [None, Intervention.NONE, Intervention.INITIAL, Intervention.HELP])
-def test_a_strategy_says_what_it_counts_as(kind, monkeypatch):
-    class Unnamed(EndEffectorReset):
-        def __init__(self, rng, protocol):
-            self.kind = kind
-
-    monkeypatch.setitem(EXTRA_RESETS, "unnamed", Unnamed)
-    with pytest.raises(ValueError, match="extra_resets=unnamed"):
-        run(protocol(extra_resets=["unnamed"]), 8)
-
-
 def test_own_strategy_and_own_order_by_name():
     @register_reset("stuck")
     class ResetStuck(ResetStrategy):
@@ -241,22 +229,6 @@ def test_own_strategy_and_own_order_by_name():
             run(protocol(**options), steps=8)
 
 
-@pytest.mark.parametrize(
-    "drawn", [[0, -1], [0, 6], [0.0, 1.0], [True, False], [0], 0, None], ids=lambda drawn: str(drawn)
-)
-def test_a_task_order_draws_a_task_for_every_stream(drawn, monkeypatch):
-    class Wrong:
-        def __init__(self, rng):
-            pass
-
-        def draw(self, loop):
-            return drawn
-
-    monkeypatch.setitem(TASK_ORDERS, "wrong", Wrong)
-    with pytest.raises(ValueError, match="task_order"):
-        run(protocol(task_order="wrong", learned_reset=True), steps=8)
-
-
 def test_a_stream_that_an_own_strategy_has_reset_is_not_reset_and_counted_again(monkeypatch):
     class First(ResetStrategy):
         kind = Intervention.SCENE_RESET
@@ -274,26 +246,47 @@ def test_a_stream_that_an_own_strategy_has_reset_is_not_reset_and_counted_again(
     assert loop.interventions[:, Intervention.SCENE_RESET].tolist() == [6, 3]
 
 
-@pytest.mark.parametrize("due", [[1, 0], [1, 1], [2], [-1], [0.0], [[0]], np.array([True, False])])
-def test_streams_that_a_strategy_cannot_mean_are_told(due, monkeypatch):
-    class Own(ResetStrategy):
-        kind = Intervention.SCENE_RESET
+class Own(ResetStrategy):
+    """Of a kind, due at streams, and never applied."""
 
-        def due(self, env, loop):
-            return due
+    def __init__(self, kind=Intervention.SCENE_RESET, due=()):
+        self.kind, self.streams = kind, due
 
-        def apply(self, env, ids):
-            raise AssertionError(ids)
+    def due(self, env, loop):
+        return self.streams
 
-    monkeypatch.setitem(EXTRA_RESETS, "own", lambda rng, config: Own())
-    with pytest.raises(ValueError, match=r"Own\.due"):
-        run(protocol(extra_resets=["own"]), steps=8)
+    def apply(self, env, ids):
+        raise AssertionError(ids)
 
 
-def test_recent_history_holds_the_last_segments():
-    env = DummyEnv(2)
-    env.scene_reset = lambda ids, configurations: None
-    env.x[:] = [1.0, 0.0]
-    _, _, loop, _ = run(protocol(scene_reset_interval=None), 16, env=env)
-    assert loop.recent_task[:, -5:].tolist() == [[-1, 0, 1, 2, 3], [-1, 1, 2, 3, 0]]
-    assert loop.recent_success[:, -5:].tolist() == [[-1, 1, 0, 0, 0], [-1, 0, 0, 0, 0]]
+class OwnOrder:
+    def __init__(self, drawn):
+        self.drawn = drawn
+
+    def draw(self, loop):
+        return self.drawn
+
+
+WRONG = [
+    *(
+        (EXTRA_RESETS, Own(kind=kind), "extra_resets=own")
+        for kind in (None, Intervention.NONE, Intervention.INITIAL, Intervention.HELP)
+    ),
+    *(
+        (EXTRA_RESETS, Own(due=due), r"Own\.due")
+        for due in ([1, 0], [1, 1], [2], [-1], [0.0], [[0]], np.array([True, False]))
+    ),
+    *(
+        (TASK_ORDERS, OwnOrder(drawn), "task_order")
+        for drawn in ([0, -1], [0, 6], [0.0, 1.0], [True, False], [0], 0, None)
+    ),
+]
+
+
+@pytest.mark.parametrize(("registry", "own", "named"), WRONG)
+def test_what_an_own_strategy_or_order_cannot_mean_is_told(registry, own, named, monkeypatch):
+    """What a strategy counts as, the streams at which it is due, and a task for every stream."""
+    monkeypatch.setitem(registry, "own", lambda *_: own)
+    flags = {"extra_resets": ["own"]} if registry is EXTRA_RESETS else {"task_order": "own", "learned_reset": True}
+    with pytest.raises(ValueError, match=named):
+        run(protocol(**flags), steps=8)

@@ -232,7 +232,7 @@ def test_successes_are_told_apart_by_what_was_done_for_them():
         assert end.never_grasped.tolist() == [False, False, True, False]
 
 
-def test_history_counts_segments_by_stream_and_task():
+def test_history_is_of_segments_by_stream_and_task():
     env = DummyEnv(2)
     config = protocol(scene_reset_interval=None)
     loop = LoopState(2, len(TASKS))
@@ -241,6 +241,8 @@ def test_history_counts_segments_by_stream_and_task():
     run(config, 16, env=env, loop=loop)
     assert loop.attempts.tolist() == [[1, 1, 1, 1], [1, 1, 1, 1]]
     assert loop.successes.tolist() == [[1, 0, 0, 0], [0, 0, 0, 0]]
+    assert loop.recent_task[:, -5:].tolist() == [[-1, 0, 1, 2, 3], [-1, 1, 2, 3, 0]]
+    assert loop.recent_success[:, -5:].tolist() == [[-1, 1, 0, 0, 0], [-1, 0, 0, 0, 0]]
 
 
 def test_loop_state_survives_json():

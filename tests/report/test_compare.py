@@ -1,7 +1,6 @@
 """`cronos-report compare`: evaluations and runs, paired episode by episode."""
 
 import json
-import os
 import sys
 
 import pytest
@@ -189,15 +188,3 @@ def test_one_training_counts_once(tmp_path, monkeypatch):
         write_evaluation(tmp_path / "c" / name, "me/c", tasks=["1111"])
     with pytest.raises(SystemExit, match="two evaluations of the same episodes"):
         compare(monkeypatch, tmp_path / "a", tmp_path / "c")
-
-
-@pytest.mark.parametrize("more", [[], ["--json"]])
-def test_a_comparison_into_a_closed_pipe_ends_without_a_traceback(more, tmp_path, monkeypatch):
-    a, b = (write_evaluation(tmp_path / name, f"me/{name}", tasks=["01010101"]) for name in "ab")
-    reader, writer = os.pipe()
-    os.close(reader)
-    with open(writer, "w") as closed:
-        monkeypatch.setattr(sys, "stdout", closed)
-        with pytest.raises(SystemExit) as ended:
-            compare(monkeypatch, a, b, *more)
-    assert ended.value.code == 1

@@ -1,13 +1,16 @@
-"""What a user got wrong is one line, whichever library found it."""
+"""What a user got wrong is one line, whichever library found it; text is the text that it is."""
 
 import sys
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import httpx
 import pytest
+from lerobot_env_cronos.simulation import rendering
 
 from cronos_lerobot.command_line import parse_command_line
 from cronos_lerobot.ranges import check_ranges, limits, ranged
+from cronos_lerobot.scripts import publish, record_demos
 from cronos_lerobot.scripts.errors import WORK_ERRORS, error_line, reason
 from cronos_lerobot.scripts.subcommands import run_subcommand
 
@@ -116,3 +119,78 @@ def test_a_hub_that_is_not_reached_is_one_line(monkeypatch):
 
 def test_an_error_that_says_nothing_is_named():
     assert reason(FileNotFoundError()) == "FileNotFoundError"
+
+
+@dataclass
+class Place:
+    root: Path | None = None
+
+
+@dataclass
+class Titled:
+    title: str = ""
+    revision: str | None = None
+    count: int = 0
+    words: list[str] = field(default_factory=list)
+    dataset: Place = field(default_factory=Place)
+
+
+def parsed(monkeypatch, *arguments) -> Titled:
+    found = []
+    monkeypatch.setattr(sys, "argv", ["command", "show", *arguments])
+    run_subcommand({"show": (Titled, found.append)})
+    return found[0]
+
+
+@pytest.mark.parametrize(
+    "text", ["Kitchen: two plates", "Kitchen #2", "[draft] kitchen", "on", "1.10", "0123456", "it's", "plain", ""]
+)
+def test_text_stays_what_it_is(monkeypatch, text):
+    assert parsed(monkeypatch, f"--title={text}", f"--revision={text or 'x'}").title == text
+    if text:
+        assert parsed(monkeypatch, "--title", text).title == text
+        assert parsed(monkeypatch, f"--dataset.root=a/{text} #1/b").dataset.root == Path(f"a/{text} #1/b")
+
+
+def test_all_else_is_read_as_ever(monkeypatch):
+    config = parsed(monkeypatch, "--revision=null", "--count=3", "--words=[a, b]", "--dataset.root=null")
+    assert (config.revision, config.count, config.words, config.dataset.root) == (None, 3, ["a", "b"], None)
+    with pytest.raises(SystemExit, match=r"^error: "):
+        parsed(monkeypatch, "--words=[a")
+
+
+def no_canvas(*_):
+    raise ImportError("EGL")
+
+
+@pytest.mark.parametrize(
+    ("script", "flags", "folder", "advice"),
+    [
+        (
+            record_demos,
+            "--env.type=cronos --env.num_threads=1 --num_envs=1 --dataset.repo_id=me/d",
+            "dataset.root",
+            "",
+        ),
+        (publish, "benchmark --repo_id=me/d --dry_run=true", "output_dir", "--pictures=false publishes without"),
+    ],
+)
+def test_that_nothing_can_be_drawn_is_told_before_anything_is_made(
+    script, flags, folder, advice, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(rendering, "Canvas", no_canvas)
+    monkeypatch.setattr(sys, "argv", ["command", *flags.split(), f"--{folder}={tmp_path / 'out'}"])
+    with pytest.raises(SystemExit, match=rf"^error: cannot open an OpenGL context.*{advice}"):
+        script.main()
+    assert not (tmp_path / "out").exists()
+
+
+def test_demonstrations_from_the_state_draw_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(rendering, "Canvas", no_canvas)
+    flags = (
+        "--env.type=cronos --env.num_threads=1 --env.obs_type=environment_state_agent_pos --num_envs=1"
+        " --dataset.repo_id=me/d --dataset.num_episodes=1"
+    )
+    monkeypatch.setattr(sys, "argv", ["command", *flags.split(), f"--dataset.root={tmp_path / 'out'}"])
+    record_demos.main()
+    assert (tmp_path / "out/meta/info.json").is_file()

@@ -1,13 +1,11 @@
 """Commands know the scenes that installed plugins bring."""
 
 import os
-import re
 import sys
 
 import pytest
 from forked_commands import run_forked
 
-from cronos_lerobot.hub.checkpoint import environment_flags
 from cronos_lerobot.scripts import streams
 
 PLUGIN = """
@@ -67,24 +65,3 @@ def test_a_command_imports_installed_plugins_before_it_looks_for_a_scene(tmp_pat
         [sys.executable, "-c", CODE.format(module=module, command=command)], env=environment, check=True
     )
     assert "study_1x1" in done.stdout.rpartition("scenes:")[2].split()
-
-
-def test_the_cards_of_a_scene_of_ones_own_name_its_module(tmp_path):
-    (tmp_path / "my_scenes.py").write_text(PLUGIN)
-    publish = [
-        "cronos-publish", "benchmark", "--discover_packages_path=my_scenes", "--scene=study_1x1",
-        "--repo_id=me/study", "--pictures=false", "--dry_run=true", f"--output_dir={tmp_path / 'out'}",
-    ]  # fmt: skip
-    run_forked(publish, env=os.environ | {"PYTHONPATH": str(tmp_path)}, check=True)
-    card = (tmp_path / "out/README.md").read_text()
-    assert "import the module that registers it" in card
-    commands = [
-        line for line in card.replace("`", "\n").splitlines() if re.match(r"(lerobot|cronos)-\w+ -?", line)
-    ]
-    assert [line.split()[0] for line in commands if "discover_packages_path=<its module>" in line] == [
-        "cronos-eval", "cronos-publish", "lerobot-eval",
-    ]  # fmt: skip
-    assert "import <its module>  # registers study_1x1\n\nenvs = make_env(" in card
-    flags = environment_flags({}, {}, "study_1x1")
-    assert flags[:2] == ["--env.discover_packages_path=<module of the scene>", "--env.type=cronos"]
-    assert environment_flags({}, {}, "kitchen_3x3")[0] == "--env.type=cronos"

@@ -9,6 +9,7 @@ from safetensors.torch import load_file
 
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.training.checkpoint import read_state
 from cronos_lerobot.training.config import CronosTrainConfig, PeriodicEvaluationConfig
 from cronos_lerobot.training.run import Parts, Run
@@ -104,6 +105,18 @@ def assert_same_run(a, b):
         state["observers"].pop("logger")
     for name in states[0]:
         assert plain(states[0][name]) == plain(states[1][name]), name
+
+
+def train_share(cfg, policy, env_class=DummyEnv, ranks=None):
+    """Train with the streams of this process; returns the trainer, or None if the run was killed."""
+    ranks = ranks or Ranks()
+    mine = ranks.share_of(cfg.num_envs)
+    trainer = make_trainer(cfg, env_class(mine.stop - mine.start, diverge_at={(5, 1)}), policy, ranks)
+    try:
+        trainer.train()
+    except KilledError:
+        return None
+    return trainer
 
 
 class KilledError(Exception):

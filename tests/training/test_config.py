@@ -56,11 +56,6 @@ def test_a_saved_config_reads_back_and_takes_flags(name, tmp_path):
     assert copy.resume is False
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="nowhere"):
-        load(tmp_path / "nowhere.json")
-
-
 def test_steps_are_rounded_up_to_whole_updates():
     assert CronosTrainConfig(steps=1).total_steps == 64 * 160
     assert CronosTrainConfig(steps=1_300_000).total_steps == 127 * 64 * 160

@@ -15,8 +15,6 @@ import torch
 from dummies import DummyPolicyConfig
 from forked_commands import run_forked
 from huggingface_hub.errors import LocalTokenNotFoundError
-from lerobot.policies import make_policy, make_pre_post_processors
-from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_cronos import CronosEnvConfig
 from runs import assert_same_run, assert_same_weights, metrics, weights
 from safetensors.torch import load_file
@@ -164,21 +162,6 @@ def test_a_run_of_a_gpu_resumes_on_a_cpu(tmp_path, monkeypatch, capsys):
     for index, values in optimizer["state"].items():
         assert values["step"] > state["optimizer"]["state"][index]["step"] > 0
     assert all(group["fused"] for group in optimizer["param_groups"])
-
-
-def test_checkpoint_is_a_lerobot_policy(tmp_path, monkeypatch):
-    cronos_train(monkeypatch, *SMALL, *OBSERVATIONS["state"], f"--output_dir={tmp_path / 'run'}", "--steps=16")
-    register_third_party_plugins()
-    from lerobot.configs import PreTrainedConfig
-
-    folder = tmp_path / "run/checkpoints/last/pretrained_model"
-    config = PreTrainedConfig.from_pretrained(folder)
-    config.pretrained_path = folder
-    policy = make_policy(config, env_cfg=CronosEnvConfig(obs_type="environment_state_agent_pos"))
-    preprocessor, postprocessor = make_pre_post_processors(config, str(folder))
-    observation = {"observation.state": torch.zeros(3, 13), "observation.environment_state": torch.zeros(3, 48)}
-    action = postprocessor(policy.select_action(preprocessor(observation | {"task": ["put it there"] * 3})))
-    assert action.shape == (3, 7)
 
 
 def code_of_the_docs(pattern, package):

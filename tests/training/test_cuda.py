@@ -12,14 +12,12 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot_env_cronos import CronosEnvConfig
 from runs import metrics, weights
 from safetensors.torch import load_file
-from test_adapters import DIFFUSION, FLAGS, SMOLVLA, VLA_FLAGS
+from test_adapters import DIFFUSION, FLAGS, VLA_FLAGS
 from test_cronos_train import OBSERVATIONS, SMALL, cronos_train, train_and_resume
 from test_flow_head import TINY, TRAIN
-from test_pi0_commands import PIXELS, SIZES
 from test_steering_commands import STEERED
-from tiny_checkpoints import save_policy
-from tiny_pi0 import save_tiny_tokenizer, tiny_gemma, tokenizer_from, use_tokenizer
-from tiny_smolvla import pretend_num2words, save_tiny_smolvlm
+from tiny_pi0 import tiny_gemma
+from tiny_vlas import save_clone
 
 from cronos_lerobot.agents.steering.steered import STEERING
 from cronos_lerobot.scripts import eval as cronos_eval
@@ -30,34 +28,18 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch f
 FLOW = ("--policy.type=pocketvla", "--policy.head=flow", *TINY, *TRAIN)
 
 
-def smolvla(folder):
-    """An untrained small one, as a checkpoint."""
-    pretend_num2words()
-    save_tiny_smolvlm(folder / "vlm")
-    return save_policy(folder / "clone", "smolvla", PIXELS, vlm_model_name=str(folder / "vlm"), **SMOLVLA)
-
-
-def pi0(folder):
-    """An untrained small one, as a checkpoint."""
-    save_tiny_tokenizer(folder / "tokenizer")
-    with tiny_gemma(), tokenizer_from(folder / "tokenizer"):
-        clone = save_policy(folder / "clone", "pi0", PIXELS, **SIZES)
-    use_tokenizer(clone, folder / "tokenizer")
-    return clone
-
-
 KINDS = {
     "pocketvla from the state": (None, (*SMALL, *OBSERVATIONS["state"]), 32),
     "pocketvla from pixels": (None, (*SMALL, *OBSERVATIONS["pixels"]), 32),
     "its flow head": (None, (*FLOW, *OBSERVATIONS["state"]), 40),
     "act": (None, FLAGS, 160),
-    "diffusion": (None, (*DIFFUSION, "--policy.noise_scheduler_type=DDIM"), 160),
-    "smolvla": (smolvla, (*VLA_FLAGS, "--algorithm.critic_observation=environment_state"), 40),
-    "smolvla with lora": (smolvla, (*VLA_FLAGS, "--peft.r=2"), 40),
-    "smolvla steered": (smolvla, STEERED, 40),
-    "pi0": (pi0, VLA_FLAGS, 40),
+    "diffusion": (None, DIFFUSION, 160),
+    "smolvla": ("smolvla", (*VLA_FLAGS, "--algorithm.critic_observation=environment_state"), 40),
+    "smolvla with lora": ("smolvla", (*VLA_FLAGS, "--peft.r=2"), 40),
+    "smolvla steered": ("smolvla", STEERED, 40),
+    "pi0": ("pi0", VLA_FLAGS, 40),
 }
-"""What makes the checkpoint, flags on a CPU, and the steps of two updates or more, of which half end at a save."""
+"""The tiny policy that it begins with, flags on a CPU, and the steps of two updates or more, half until a save."""
 
 
 def steps_of(optimizer):
@@ -73,10 +55,10 @@ def test_it_trains_saves_resumes_and_is_evaluated(kind, tmp_path, monkeypatch):
 
     Floats may differ by atomic additions.
     """
-    make, flags, steps = KINDS[kind]
+    tiny, flags, steps = KINDS[kind]
     flags = [flag.replace("device=cpu", "device=cuda") for flag in flags if not flag.startswith("--save_freq")]
-    if make is not None:
-        flags.append(f"--policy.path={make(tmp_path)}")
+    if tiny is not None:
+        flags.append(f"--policy.path={save_clone(tiny, tmp_path)}")
     names = {"smolvla with lora": "adapter_model.safetensors", "smolvla steered": STEERING}
 
     def assert_alike(run, again):

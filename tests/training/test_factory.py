@@ -4,9 +4,7 @@ import json
 import logging
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
-import torch
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.utils.constants import OBS_STATE
@@ -115,15 +113,6 @@ def act_config():
     policy = ACTConfig(device="cpu", chunk_size=4, n_action_steps=4, dim_model=32, n_heads=2, dim_feedforward=32)
     env = CronosEnvConfig(**STATE, task_observation="one_hot")
     return CronosTrainConfig(env, policy, num_envs=2, algorithm=ImitationConfig())
-
-
-def test_one_decision_at_the_start_draws_nothing(monkeypatch):
-    drawn = []
-    for _ in range(2):
-        make_parts(act_config(), Ranks()).env.close()
-        drawn.append((torch.rand(1).item(), np.random.rand()))
-        monkeypatch.setattr("cronos_lerobot.training.factory.check_decision", lambda *parts: None)
-    assert drawn[0] == drawn[1]
 
 
 def test_a_policy_that_cannot_act_is_refused_in_a_sentence(monkeypatch):

@@ -110,7 +110,7 @@ def test_an_evaluation_repeats_with_its_seed(tmp_path):
 
 @pytest.mark.usefixtures("paid_for_moving")
 def test_lora_in_every_layer_as_lerobot_train_has_it(tmp_path, monkeypatch):
-    """Cloned by `lerobot-train --peft.*`, trained on from its adapters, and of a clone wrapped here."""
+    """Cloned by `lerobot-train --peft.*` and trained on from its adapters."""
     record_demos(
         RecordDemosConfig(
             env=CronosEnvConfig(**STATE), dataset=DemoDatasetConfig("me/demos", tmp_path / "demos", 2), num_envs=2
@@ -118,29 +118,23 @@ def test_lora_in_every_layer_as_lerobot_train_has_it(tmp_path, monkeypatch):
     )
     sizes = {"hidden_width": 16, "hidden_depth": 1, "flow_width": 16, "flow_depth": 1, "num_inference_steps": 3}
     clone = save_policy(tmp_path / "clone", "pocketvla", STATE, head="flow", **sizes)
-    peft = ("--peft.r=2", "--peft.target_modules=all-linear")
     lerobot(
-        "lerobot_train", f"--policy.path={clone}", "--policy.device=cpu", "--policy.push_to_hub=false", *peft,
-        "--dataset.repo_id=me/demos", f"--dataset.root={tmp_path / 'demos'}", "--batch_size=8", "--steps=2",
-        "--num_workers=0", f"--output_dir={tmp_path / 'adapted'}",
+        "lerobot_train", f"--policy.path={clone}", "--policy.device=cpu", "--policy.push_to_hub=false",
+        "--peft.r=2", "--peft.target_modules=all-linear", "--dataset.repo_id=me/demos",
+        f"--dataset.root={tmp_path / 'demos'}", "--batch_size=8", "--steps=2", "--num_workers=0",
+        f"--output_dir={tmp_path / 'adapted'}",
     )  # fmt: skip
     adapted = tmp_path / "adapted/checkpoints/last/pretrained_model"
-    steering = [*(flag for flag in TRAIN if not flag.startswith("--algorithm.")), "--algorithm.type=steering"]
-    with pytest.raises(SystemExit, match="--peft"):
-        cronos_train(
-            monkeypatch, f"--policy.path={clone}", "--policy.device=cpu", *OBSERVATIONS["state"], *steering, *peft,
-            "--steps=40", f"--output_dir={tmp_path / 'none'}",
-        )  # fmt: skip
-    for name, base, flags in (("on", adapted, ()), ("new", clone, peft)):
-        cronos_train(
-            monkeypatch, f"--policy.path={base}", "--policy.device=cpu", *OBSERVATIONS["state"], *TRAIN, *flags,
-            "--steps=40", f"--output_dir={tmp_path / name}",
-        )  # fmt: skip
-        updates = [line["agent"] for line in metrics(tmp_path / name) if line["kind"] == "update"]
-        assert all(update["policy_grad_norm"] > 0 and update["value_grad_norm"] > 0 for update in updates)
-        folders = [tmp_path / name / "checkpoints" / step / "pretrained_model" for step in ("000020", "last")]
-        names = moved(*folders, "adapter_model.safetensors")
-        assert all(".lora_" in name for name in load_file(folders[1] / "adapter_model.safetensors"))
-        for part in (".head.", ".value_head.", ".critic."):
-            assert [name for name in names if part in name], part
-        assert not (folders[1] / "model.safetensors").exists()
+    run = tmp_path / "run"
+    cronos_train(
+        monkeypatch, f"--policy.path={adapted}", "--policy.device=cpu", *OBSERVATIONS["state"], *TRAIN,
+        "--steps=40", f"--output_dir={run}",
+    )  # fmt: skip
+    updates = [line["agent"] for line in metrics(run, "update")]
+    assert all(update["policy_grad_norm"] > 0 and update["value_grad_norm"] > 0 for update in updates)
+    first, last = (run / "checkpoints" / step / "pretrained_model" for step in ("000020", "last"))
+    names = moved(first, last, "adapter_model.safetensors")
+    assert all(".lora_" in name for name in load_file(last / "adapter_model.safetensors"))
+    for part in (".head.", ".value_head.", ".critic."):
+        assert [name for name in names if part in name], part
+    assert not (last / "model.safetensors").exists()

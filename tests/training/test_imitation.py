@@ -1,25 +1,31 @@
 """Whole runs of the imitation agent: on the dummies, where it succeeds, and with ACT on the real scene."""
 
 import json
-from dataclasses import dataclass
-from types import SimpleNamespace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
-from dummies import DummyEnv, DummyPolicy, DummyPolicyConfig, identity_processors
+from dummies import DummyEnv, DummyPolicy, DummyPolicyConfig
 from forked_processes import together
 from lerobot.configs import PreTrainedConfig
 from lerobot.optim import AdamWConfig, MultiAdamConfig
 from lerobot_env_cronos import CronosEnvConfig
-from runs import STEPS_PER_UPDATE, KilledError, MortalEnv, assert_same_run, config, make_trainer, metrics, weights
+from runs import (
+    STEPS_PER_UPDATE,
+    MortalEnv,
+    assert_same_run,
+    config,
+    make_trainer,
+    metrics,
+    resumed,
+    train_share,
+    weights,
+)
 from test_cronos_train import moved, train_and_resume
 
 from cronos_lerobot.agents.imitation.agent import ImitationAgent, copy_trained
 from cronos_lerobot.agents.imitation.config import ImitationConfig
-from cronos_lerobot.agents.processing import PolicyProcessors
-from cronos_lerobot.evaluation.actors import SelectingPolicy
-from cronos_lerobot.evaluation.independent import evaluate_independent
 from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig, record_demos
 
@@ -59,21 +65,11 @@ class ClonedPolicy(DummyPolicy):
 def settings(folder, resumes=False, **options):
     algorithm = ImitationConfig(steps_per_update=5, batch_size=8, warmup_segments=3, tail_steps=1)
     defaults = {"policy": ClonedConfig(), "algorithm": algorithm, "steps": 6 * STEPS_PER_UPDATE, "eval_freq": 0}
-    cfg = config(folder, **defaults | options)
-    cfg.checkpoint_path = (folder / "checkpoints/last").resolve() if resumes else None
-    return cfg
+    return (resumed if resumes else config)(folder, **defaults | options)
 
 
-def train(cfg, env_class=DummyEnv, ranks=None):
-    ranks = ranks or Ranks()
-    mine = ranks.share_of(cfg.num_envs)
-    env = env_class(mine.stop - mine.start, diverge_at={(5, 1)})
-    trainer = make_trainer(cfg, env, ClonedPolicy(8 if cfg.checkpoint_path else 0), ranks)
-    try:
-        trainer.train()
-    except KilledError:
-        return None
-    return trainer
+def train(cfg, *options):
+    return train_share(cfg, ClonedPolicy(8 if cfg.checkpoint_path else 0), *options)
 
 
 def train_and_resume_dummies(folder, **options):
@@ -214,10 +210,54 @@ def test_a_process_without_a_success_takes_the_steps_of_the_others(tmp_path):
     assert np.abs(learned[1]).max() > 0
 
 
-def test_weights_too_coarse_for_its_steps_are_refused(tmp_path):
-    policy = ClonedPolicy().bfloat16()
-    with pytest.raises(ValueError, match="bfloat16"):
-        make_trainer(settings(tmp_path), policy=policy)
+def weighted(folder, weighting, beta):
+    algorithm = ImitationConfig(
+        steps_per_update=5, batch_size=8, warmup_segments=3, tail_steps=1, weighting=weighting, weighting_beta=beta
+    )
+    return settings(folder, algorithm=algorithm)
+
+
+def update_own(ranks, cfg, memories):
+    return update_once(ranks, cfg, memories[ranks.rank], ranks.rank)
+
+
+def remembered(folder):
+    """Of a run, what succeeded and what failed."""
+    segments = train(weighted(folder, "return", 0.2)).run.agent.memory.state_dict()
+    parts = [[segment for segment in segments if segment["success"] is one] for one in (True, False)]
+    assert min(map(len, parts)) >= 3
+    return parts
+
+
+def test_a_process_that_has_only_failed_clones_next_to_nothing_of_it(tmp_path):
+    """Its largest return is not the largest: exp(-0.3 / 0.01) and less of a success's weight is its own."""
+    won, lost = remembered(tmp_path / "run")
+    for segment in won:
+        segment["columns"]["next.reward"][-1] = 1
+    for segment in lost:
+        segment["columns"]["next.reward"][:] = 0
+    cfg = replace(weighted(tmp_path / "run", "return", 0.01), output_dir=tmp_path / "other")
+    alone = update_once(Ranks(), cfg, won)
+    assert alone[0]["optimizer_steps"] == 5
+    first, second = together(update_own, cfg, [won, lost])
+    assert first[1:] == second[1:]
+    assert first[0] == second[0]
+    assert first[0]["failed_segments"] == len(lost)
+    # The loss that is logged is the one that is learned from.
+    assert first[0]["loss"] == pytest.approx(alone[0]["loss"], rel=1e-4)
+    for found, expected in zip(first[1:], alone[1:], strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("weighting", ["return", "advantage"])
+def test_the_effective_share_is_that_of_one_process_with_all_of_it(tmp_path, weighting):
+    won, lost = remembered(tmp_path / "run")
+    cfg = replace(weighted(tmp_path / "run", weighting, 0.2), output_dir=tmp_path / "other")
+    alone = update_once(Ranks(), cfg, [*won, *lost])[0]
+    first, second = together(update_own, cfg, [won, lost])
+    assert 0 < alone["effective_share"] < 1
+    for found in (first[0], second[0]):
+        assert found["effective_share"] == pytest.approx(alone["effective_share"])
 
 
 OBSERVATIONS = {"obs_type": "environment_state_agent_pos", "task_observation": "one_hot"}
@@ -253,67 +293,6 @@ def test_act_trains_saves_resumes_and_is_a_lerobot_policy(tmp_path, monkeypatch)
     shapes = {name: feature.shape for name, feature in policy.config.input_features.items()}
     batch = {name: torch.zeros(2, *shape) for name, shape in shapes.items()}
     assert postprocessor(policy.select_action(preprocessor(batch))).shape == (2, 7)
-
-
-def test_an_evaluation_keeps_the_environments_apart():
-    """What a policy without `sample_actions` has planned for one episode is not played in the next."""
-
-    class Planner(torch.nn.Module):
-        """Sees one number, and plans to play it three times."""
-
-        config = ClonedConfig()
-
-        def reset(self):
-            pass
-
-        def predict_action_chunk(self, batch):
-            return batch["observation.state"][:, None, :1].expand(-1, 3, 7)
-
-    actor = SelectingPolicy(Planner(), PolicyProcessors(*identity_processors()), (dict, dict))
-    assert actor.is_per_stream
-    actor.begin(np.array([0, 1]))
-    assert ask(actor, [1, 2], [0, 1]) == [1, 2]
-    actor.begin(np.array([1]))
-    assert ask(actor, [3, 4], [0, 1]) == [1, 4]
-    assert ask(actor, [5], [1]) == [4]
-    assert ask(actor, [6, 7], [0, 1]) == [1, 4]
-    assert ask(actor, [8, 9], [0, 1]) == [8, 9]
-    # It has no temperature, whatever the flag says.
-    options = {"n_episodes": 1, "split": "train", "temperature": 0.6, "seed": 0}
-    result = evaluate_independent(DummyEnv(4), Planner(), PolicyProcessors(*identity_processors()), **options)
-    assert (result["temperature"], result["n"]) == (None, 4)
-
-
-def test_an_evaluation_clears_one_memory_for_all_whenever_a_task_begins():
-    class Rememberer(torch.nn.Module):
-        """Plays the numbers that it saw first since it was reset."""
-
-        config = SimpleNamespace(type="act", temporal_ensemble_coeff=0.01, use_amp=False)
-        remembered = None
-
-        def reset(self):
-            self.remembered = None
-
-        def select_action(self, batch):
-            if self.remembered is None:
-                self.remembered = batch["observation.state"][:, :1].expand(-1, 7)
-            return self.remembered
-
-    actor = SelectingPolicy(Rememberer(), PolicyProcessors(*identity_processors()), (dict, dict))
-    assert not actor.is_per_stream
-    actor.begin(np.array([0, 1]))
-    assert ask(actor, [1, 2], [0, 1]) == [1, 2]
-    assert ask(actor, [3, 4], [0, 1]) == [1, 2]
-    actor.begin(np.array([], int))
-    assert ask(actor, [5, 6], [0, 1]) == [1, 2]
-    actor.begin(np.array([1]))
-    assert ask(actor, [7, 8], [0, 1]) == [7, 8]
-
-
-def ask(actor, numbers, ids):
-    """First numbers of the actions in environments `ids` that show these numbers."""
-    state = np.array([[number, 0] for number in numbers], np.float32)
-    return actor.act({"agent_pos": state}, ["go"] * len(ids), np.array(ids)).action[:, 0].tolist()
 
 
 class TwoOptimizersConfig(ClonedConfig):

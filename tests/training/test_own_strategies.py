@@ -1,14 +1,15 @@
 """Task orders and reset strategies that remember something of their own: it is in the checkpoint."""
 
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from runs import STEPS_PER_UPDATE, assert_same_run, config, resumed, train
+from runs import STEPS_PER_UPDATE, assert_same_run, config, make_trainer, resumed, train
 
+from cronos_lerobot.agents.ppo.agent import PPOAgent
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.interventions import Intervention
-from cronos_lerobot.protocol.own_state import load_own_states, own_states
 from cronos_lerobot.protocol.resets import EXTRA_RESETS, SceneReset
 from cronos_lerobot.protocol.task_orders import TASK_ORDERS
 
@@ -78,17 +79,14 @@ def test_what_a_checkpoint_cannot_hold_is_refused_before_the_run_begins(tmp_path
     assert not (tmp_path / "checkpoints").exists()
 
 
+def test_an_agent_that_no_checkpoint_can_hold_is_refused_before_the_run_begins(tmp_path, monkeypatch):
+    monkeypatch.setattr(PPOAgent, "state_dict", lambda self: {"last": deque([1.0])})
+    with pytest.raises(ValueError, match="PPOAgent"):
+        make_trainer(config(tmp_path))
+
+
 def test_a_run_may_go_on_with_others(tmp_path, caplog):
     train(config(tmp_path, 2 * STEPS_PER_UPDATE, protocol=PROTOCOL))
     trainer = train(resumed(tmp_path, protocol=replace(PROTOCOL, task_order="heuristic")))
     assert trainer.loop.n == 4 * STEPS_PER_UPDATE
     assert "has the state of CountingOrder, which this run does not have" in caplog.text
-
-
-def test_two_of_one_class_are_told_apart():
-    first, second = EveryThirdSwitch(None, ProtocolConfig()), EveryThirdSwitch(None, ProtocolConfig())
-    second.asked = {"of": np.ones(4, int), "history": []}
-    states = own_states([first, CountingOrder(None), second])
-    assert list(states) == ["EveryThirdSwitch", "CountingOrder", "EveryThirdSwitch 2"]
-    load_own_states([second, first], states)
-    assert (first.asked["history"], second.asked["history"]) == ([], [1.0])

@@ -22,11 +22,8 @@ from cronos_lerobot.agents.ppo.config import PaperPPOConfig, PPOConfig
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.training.checkpoint import read_state
 from cronos_lerobot.training.config import RecordConfig
-from cronos_lerobot.training.logging import MetricsFile
 from cronos_lerobot.training.reading import check_resumed
-from cronos_lerobot.training.recording import StreamObserver
 from cronos_lerobot.training.run_folder import check_links
-from cronos_lerobot.training.seeding import NamedGenerators
 from cronos_lerobot.training.trainer import Trainer
 
 
@@ -161,29 +158,6 @@ def test_a_damaged_checkpoint_is_named(name, tmp_path):
         make_trainer(resumed(tmp_path))
 
 
-def test_generators_of_another_device_begin_with_numbers_of_the_step():
-    """A generator of CUDA has a state of 16 bytes, one of the CPU 5,056."""
-
-    def draws(state, step):
-        generators = NamedGenerators(5)
-        generator, rng = generators.for_torch("actions"), generators.for_numpy("tasks")
-        if state is not None:
-            generators.load_state_dict(state, step)
-        return torch.rand(3, generator=generator).tolist(), rng.random(3).tolist()
-
-    first, saved = draws(None, 0), NamedGenerators(5)
-    saved.for_numpy("tasks").random(3)
-    torch.rand(3, generator=saved.for_torch("actions"))
-    same = saved.state_dict()
-    other = same | {"torch": {"actions": [0] * 16}}
-    went_on = draws(same, 40)
-    assert draws(same, 80) == went_on
-    # NumPy's go on, whatever the device.
-    assert draws(other, 40)[1] == went_on[1] != first[1]
-    different = [draws(other, 40)[0], draws(other, 80)[0], went_on[0], first[0]]
-    assert len(set(map(tuple, different))) == 4
-
-
 def test_a_learning_rate_that_is_given_is_the_optimizers(tmp_path):
     """The other one stays what the run has made of it."""
     algorithm = PPOConfig(minibatch_size=16, policy_lr=1e-2, policy_lr_max=1.0, kl_base_coef=0.1)
@@ -195,27 +169,6 @@ def test_a_learning_rate_that_is_given_is_the_optimizers(tmp_path):
         trainer = make_trainer(resumed(tmp_path, algorithm=changed))
         groups = {group["name"]: group for group in trainer.run.agent.optimizer.param_groups}
         assert (groups["policy"]["lr"], groups["value"]["lr"]) == (expected, 1e-3)
-
-
-def test_a_recording_that_is_refused_leaves_the_metrics_as_they_were(tmp_path, monkeypatch):
-    train(config(tmp_path, eval_freq=0))
-    before = (tmp_path / "metrics.jsonl").read_bytes()
-
-    def refuse(*args):
-        raise ValueError("another process has it")
-
-    monkeypatch.setattr(StreamObserver, "__init__", refuse)
-    with pytest.raises(ValueError, match="another process has it"):
-        make_trainer(resumed(tmp_path, "000032"))
-    assert (tmp_path / "metrics.jsonl").read_bytes() == before
-
-
-def test_a_shorter_metrics_file_is_not_filled_up(tmp_path):
-    path = tmp_path / "metrics.jsonl"
-    path.write_text('{"kind": "update"}\n')
-    with pytest.raises(ValueError, match=r"metrics\.jsonl has 19 bytes, 50"):
-        MetricsFile(path, 50)
-    assert path.read_text() == '{"kind": "update"}\n'
 
 
 def budget(reset_budget):

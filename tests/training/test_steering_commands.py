@@ -9,11 +9,10 @@ from lerobot.configs import PreTrainedConfig
 from runs import assert_same_run, metrics
 from safetensors import safe_open
 from safetensors.torch import load_file
-from test_adapters import DIFFUSION, FLAGS, SMOLVLA, VLA_FLAGS
+from test_adapters import FLAGS, VLA_FLAGS
 from test_cronos_train import OBSERVATIONS, SMALL, cronos_train, train_and_resume
 from test_steering_runs import assert_same_actor
-from tiny_checkpoints import save_policy
-from tiny_smolvla import pretend_num2words, save_tiny_smolvlm
+from tiny_vlas import save_clone
 
 from cronos_lerobot.agents.steering.steered import STEERING, SteeredPolicy
 from cronos_lerobot.evaluation.policy_source import fingerprint
@@ -32,10 +31,7 @@ def assert_same_steering(run, again):
 
 
 def test_smolvla_is_steered_saved_resumed_and_evaluated(tmp_path, monkeypatch, caplog):
-    pretend_num2words()
-    save_tiny_smolvlm(tmp_path / "vlm")
-    pixels = {"observation_height": 64, "observation_width": 64}
-    clone = save_policy(tmp_path / "clone", "smolvla", pixels, vlm_model_name=str(tmp_path / "vlm"), **SMOLVLA)
+    clone = save_clone("smolvla", tmp_path)
     run = tmp_path / "run"
     flags = (f"--policy.path={clone}", *STEERED, "--steps=40")
     _, folder = train_and_resume(monkeypatch, run, *flags, same=assert_same_steering)
@@ -99,21 +95,6 @@ def test_pocketvlas_flow_head_is_steered_from_the_state(tmp_path, monkeypatch, c
     resume = ("--resume=true", f"--config_path={steered}/train_config.json", "--steps=48")
     cronos_train(monkeypatch, *resume)
     assert "steers the policy" not in capsys.readouterr().err
-
-
-def test_a_diffusion_that_looks_back_is_steered(tmp_path, monkeypatch):
-    flags = [flag for flag in DIFFUSION if not flag.startswith("--algorithm.")]
-    flags += [
-        "--policy.noise_scheduler_type=DDIM",
-        "--algorithm.type=steering",
-        "--algorithm.utd=1",
-        "--algorithm.batch_size=8",
-    ]
-    flags += ["--algorithm.warmup_decisions=8", "--algorithm.observation=policy", "--algorithm.hidden_width=16"]
-    run = tmp_path / "run"
-    train_and_resume(monkeypatch, run, *flags, "--steps=160", same=assert_same_steering)
-    # Four streams decide every five steps: 16 times in an update.
-    assert [line["agent"]["decisions"] for line in metrics(run, "update")] == [16, 32]
 
 
 def policy_config(folder):

@@ -9,23 +9,23 @@ import torch
 from dummies import DummyEnv, DummyPolicyConfig
 from forked_processes import together
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.configs.default import PeftConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from runs import (
     STEPS_PER_UPDATE,
-    KilledError,
     MortalEnv,
     assert_same_run,
     config,
-    make_trainer,
     metrics,
     plain,
+    resumed,
+    train_share,
     weights,
 )
 from safetensors.torch import load_file
 
 from cronos_lerobot.agents.steering.config import SteeringConfig
 from cronos_lerobot.agents.steering.steered import STEERING, SteeredPolicy, with_steering
-from cronos_lerobot.ranks import Ranks
 
 
 @PreTrainedConfig.register_subclass("dummy_noise")
@@ -79,21 +79,11 @@ def settings(folder, resumes=False, **options):
     }
     algorithm = SteeringConfig(**own | options.pop("algorithm", {}))
     defaults = {"policy": NoiseConfig(), "algorithm": algorithm, "steps": 6 * STEPS_PER_UPDATE, "eval_freq": 0}
-    cfg = config(folder, **defaults | options)
-    cfg.checkpoint_path = (folder / "checkpoints/last").resolve() if resumes else None
-    return cfg
+    return (resumed if resumes else config)(folder, **defaults | options)
 
 
-def train(cfg, env_class=DummyEnv, ranks=None):
-    ranks = ranks or Ranks()
-    mine = ranks.share_of(cfg.num_envs)
-    env = env_class(mine.stop - mine.start, diverge_at={(5, 1)})
-    trainer = make_trainer(cfg, env, NoisePolicy(seed=8 if cfg.checkpoint_path else 0), ranks)
-    try:
-        trainer.train()
-    except KilledError:
-        return None
-    return trainer
+def train(cfg, *options):
+    return train_share(cfg, NoisePolicy(seed=8 if cfg.checkpoint_path else 0), *options)
 
 
 def assert_same_actor(a, b):
@@ -138,6 +128,11 @@ def test_two_processes_learn_together_and_resume(tmp_path):
     assert together(in_processes, settings(tmp_path / "broken"), MortalEnv) == [None, None]
     assert together(in_processes, settings(tmp_path / "broken", resumes=True)) == [first, second]
     assert_same_run(tmp_path / "unbroken", tmp_path / "broken")
+
+
+def test_adapters_that_it_would_not_train_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="--peft"):
+        train(settings(tmp_path, peft=PeftConfig()))
 
 
 def test_what_is_evaluated_and_saved_is_steered_once_it_has_learned(tmp_path, monkeypatch, caplog):

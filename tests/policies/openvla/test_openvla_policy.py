@@ -77,18 +77,6 @@ def test_a_sample_does_not_depend_on_its_batch(published):
     assert not torch.equal(first["trace"], together["trace"])
 
 
-def test_fresh_adapters_change_nothing_and_trained_ones_do(published, base):
-    batch = make_batch(2)
-    tokens = base.sample_actions(batch)["trace"]
-    with torch.no_grad():
-        expected = base.evaluate_actions(batch, tokens)["log_prob"]
-        fresh = make_policy(published, stir=False, lora_rank=4)
-        torch.testing.assert_close(fresh.evaluate_actions(batch, tokens)["log_prob"], expected)
-        stirred = make_policy(published, lora_rank=4).evaluate_actions(batch, tokens)["log_prob"]
-    assert (stirred - expected).abs().min() > 1e-2
-    assert fresh.predict_values(batch).tolist() == [0.0, 0.0]
-
-
 def test_what_is_trained(lora, published):
     groups = {group["name"]: group["params"] for group in lora.rl_parameter_groups()}
     trained = {id(p) for params in groups.values() for p in params}

@@ -1,14 +1,8 @@
 """Reinforcement learning on a frozen encoder: encodings are made once, while acting, and trained on later."""
 
-import numpy as np
 import pytest
 import torch
-from lerobot.policies import make_pre_post_processors
 from pocketvla_samples import make_batch, make_policy
-
-from cronos_lerobot.agents.ppo.config import PPOConfig
-from cronos_lerobot.agents.ppo.ppo import PPO
-from cronos_lerobot.agents.processing import make_processors
 
 
 @pytest.fixture
@@ -40,21 +34,6 @@ def test_a_trainable_encoder_keeps_the_images():
     assert policy.encode_observation is None
     count = sum(len(group["params"]) for group in policy.rl_parameter_groups())
     assert count == len(list(policy.parameters()))
-
-
-def test_what_is_frozen_gathers_no_gradient(policy):
-    PPO(
-        policy,
-        make_processors(policy, *make_pre_post_processors(policy.config)),
-        PPOConfig(),
-        np.random.default_rng(0),
-    )
-    batch = policy.encode_observation(make_batch(4))
-    result = policy.evaluate_actions(batch, policy.sample_actions(batch)["trace"])
-    (result["log_prob"].sum() + result["value"].sum()).backward()
-    grown = {name.rsplit(".", 1)[0] for name, p in policy.named_parameters() if p.grad is not None}
-    assert grown
-    assert not [name for name in grown if name.startswith("encoder")]
 
 
 CRITICS = {

@@ -95,13 +95,6 @@ def test_the_actor_ignores_what_observation_does_not_name():
         assert not torch.equal(policy.select_action(used), policy.select_action(batch))
 
 
-def test_the_value_loss_never_trains_the_encoder():
-    policy = make_policy(freeze_encoder=False)
-    policy.predict_values(make_batch(2)).sum().backward()
-    touched = {name.split(".")[0] for name, p in policy.named_parameters() if p.grad is not None}
-    assert touched == {"critic", "value_head"}
-
-
 @pytest.mark.parametrize("critic", ["actor", "environment_state"])
 @pytest.mark.parametrize("image", [True, False])
 def test_the_rl_groups_hold_every_parameter_once(image, critic):
