@@ -41,16 +41,11 @@ CAPTIONS = {
         "How success decays between scene resets",
         "Training segments by their number since the stream's last scene reset, in the last quarter of the run.",
     ),
-    "segment_history": (
-        "The same, over the run",
-        "Bright is success. Rows further up are longer without a reset; time runs to the right.",
-    ),
-    "agent": ("Agent's diagnostics", "One point for each policy update."),
     "sequential": ("Sequential suite", "Share of chains whose first k tasks all succeeded, with 95 % intervals."),
     "stream": ("Stream suite", "Success by segment of a stream that is never reset, with 95 % intervals."),
 }
 """Title and caption of each figure."""
-SHOWN = ("gains", "seeds", "independent", "stream", "lerobot_eval", "interventions", "speed")
+SHOWN = ("gains", "seeds", "independent", "stream", "lerobot_eval", "interventions")
 NAMES = (*SHOWN, "sequential", "evaluations", "updates", "segments")
 """Of the tables: those that the page shows, and all that have a CSV file."""
 
@@ -106,7 +101,6 @@ def make_tables(report: Report) -> dict[str, pd.DataFrame]:
         "updates": loaded.updates,
         "segments": loaded.segments,
         "interventions": loaded.interventions,
-        "speed": tables.speed_table(loaded.updates),
     }
     return {name: table for name, table in made.items() if len(table)}
 
@@ -117,8 +111,6 @@ def draw_figures(loaded: Loaded) -> dict[str, Figure]:
         "evaluation": figures.evaluation_figure(loaded.evaluations),
         "training": figures.training_figure(loaded.updates),
         "segments": figures.segments_figure(loaded.segments),
-        "segment_history": figures.segment_history_figure(loaded.segments),
-        "agent": figures.agent_figure(loaded.updates),
     }
     drawn |= {suite: figures.part_figure(loaded.evaluations, suite) for suite in ("sequential", "stream")}
     return {name: figure for name, figure in drawn.items() if figure is not None}

@@ -161,20 +161,6 @@ def chain_table(parts: pd.DataFrame) -> pd.DataFrame:
     return table.reset_index().rename_axis(columns=None)
 
 
-def speed_table(updates: pd.DataFrame) -> pd.DataFrame:
-    """Steps per second of every run, and the shares of its time, without evaluations and checkpoints."""
-    rows = []
-    shares = [name for name in updates if name.startswith("time/")]
-    for (label, run, seed), some in updates.groupby(["row", "run", "seed"], sort=False, dropna=False):
-        steps = some["steps"].diff().fillna(some["steps"])
-        seconds = steps / some["steps_per_s"]
-        row = {"runs": label, "run": run, "seed": seed, "steps_per_s": steps.sum() / seconds.sum()}
-        row |= {"minutes": seconds.sum() / 60}
-        means = (some[shares].mul(seconds, axis=0)).sum() / seconds.sum()
-        rows.append(row | {f"{name.removeprefix('time/')} share": value for name, value in means.items()})
-    return pd.DataFrame(rows)
-
-
 def rates_by_part(segments: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """Training success by `by`: of one run with a Wilson interval, of several with Student's over the seeds.
 

@@ -13,7 +13,7 @@ from synthetic_runs import INSTRUCTIONS, edit_lines, write_lerobot_eval, write_t
 from cronos_lerobot.report.page import write_report
 from cronos_lerobot.scripts.report import main, make_report
 
-FIGURES = ("evaluation", "training", "segments", "segment_history", "agent")
+FIGURES = ("evaluation", "training", "segments")
 
 
 def page_of(tmp_path, *folders, **options):
@@ -52,7 +52,7 @@ def test_page_shows_the_inputs_numbers(report):
 def test_page_is_self_contained(report):
     folder, page = report
     sources = re.findall(r'(?:src|href)="(.*?)"', page)
-    assert len(sources) == 5 + 8
+    assert len(sources) == len(FIGURES) + 8
     assert all(source.startswith("data:") for source in sources)
     videos = [base64.b64decode(s.split(",")[1]) for s in sources if s.startswith("data:video")]
     assert videos == [b"old video"] * 4 + [b"new video"] * 4
