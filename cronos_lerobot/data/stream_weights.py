@@ -67,18 +67,13 @@ class Weighting:
 
         Args:
             origin: of the recording.
-
-        Raises:
-            ValueError: a value that is not given changed while the run was recorded.
         """
         if self.weight_by == PROGRESS:
             return PROGRESS_GAMMA if self.gamma is None else self.gamma, 0.0
         found = []
         for name, default in (("gamma", ADVANTAGE_GAMMA), ("gae_lambda", ADVANTAGE_LAMBDA)):
-            values, given = origin.values(f"algorithm.{name}", default), getattr(self, name)
-            if given is None and len(values) > 1:
-                raise ValueError(f"the recorded run was resumed with another {name}, {values}: give --{name}")
-            found.append(float(values[0]) if given is None else given)
+            given = getattr(self, name)
+            found.append(float(origin.flags.get(f"algorithm.{name}", default)) if given is None else given)
         return found[0], found[1]
 
 

@@ -33,8 +33,8 @@ SETTING = (
 IDENTITY = ["experiment", "row", "seed", "run", "folder"]
 EVALUATIONS = [
     *IDENTITY, "source", "steps", "interventions", "split", "suite", "n", "success", "ci95_low", "ci95_high",
-    "found_complete", "never_grasped", "policy", "fingerprint", "path", "trained_in", "is_alike",
-    "is_budget_spent", "parts", "episodes", "setting",
+    "found_complete", "never_grasped", "policy", "fingerprint", "path", "trained_in", "is_budget_spent",
+    "parts", "episodes", "setting",
 ]  # fmt: skip
 UPDATES = [
     *IDENTITY, "steps", "interventions", "updates", "steps_per_s", "success", "segments", "reward_per_segment",
@@ -88,9 +88,8 @@ def load_evaluations(folders: Iterable[Path]) -> pd.DataFrame:
         source; experiment (job name of the run); row (what tells it from other runs, or the policy); seed; run and
         folder; steps and interventions of the training; split; suite; n; success, ci95_low and ci95_high;
         found_complete and never_grasped; policy; fingerprint; path; trained_in (folder of the run that made the
-        policy); is_alike (made like the last one of the run) and is_budget_spent, of cronos-train alone; parts
-        (cells by task, position or segment); episodes ((n, 4) int: seed, number, configuration, length); setting
-        (see `SETTING`).
+        policy); is_budget_spent, of cronos-train alone; parts (cells by task, position or segment); episodes
+        ((n, 4) int: seed, number, configuration, length); setting (see `SETTING`).
     """
     return load(folders).evaluations
 
@@ -215,12 +214,12 @@ def _evaluation_cells(run: TrainingRun) -> Iterator[Cells]:
     setting = dict.fromkeys(SETTING) | {name: env.get(name) for name in ("scene", "obs_type", "renderer")}
     setting |= {name: start.get(name) for name in ("environment", "versions")}
     setting["benchmark"] = (start.get("benchmark") or {}).get("fingerprint")
-    alike, budget = run.alike, run.config["protocol"].get("reset_budget")
+    budget = run.config["protocol"].get("reset_budget")
     for one in run.evaluations:
         steps, interventions = one["interaction_steps"], one["interventions"]
         cells = {"source": TRAIN, "steps": steps, "interventions": interventions, "split": str(one["split"])}
         cells |= {"suite": "independent", "policy": run.name, "fingerprint": f"{run.folder} {steps}"}
-        cells |= {"path": str(run.folder / METRICS), "trained_in": str(run.folder), "is_alike": one in alike}
+        cells |= {"path": str(run.folder / METRICS), "trained_in": str(run.folder)}
         cells |= {"is_budget_spent": budget is not None and interventions >= budget}
         cells |= {"parts": [{"part": str(task)} | _rate(rate) for task, rate in one["per_task"].items()]}
         cells |= {"episodes": np.array(one["episodes"], int).reshape(-1, 4)}
@@ -274,15 +273,8 @@ def _rate(found: Cells) -> Cells:
 
 
 def _said_of(run: TrainingRun) -> Iterator[str]:
-    """Which evaluations of a run are not on its curve, and what that means."""
-    if not run.evaluations:
-        return
-    if others := len(run.evaluations) - len(run.alike):
-        yield (
-            f"{others} of {len(run.evaluations)} evaluations of {run.folder}: split, temperature or number of "
-            "episodes differ from the last one"
-        )
-    if first := run.alike[0]["interaction_steps"]:
+    """What the evaluations of a run do not say."""
+    if run.evaluations and (first := run.evaluations[0]["interaction_steps"]):
         yield f"success before, D and C of {run.folder}: the first evaluation is after {first:,} steps"
 
 

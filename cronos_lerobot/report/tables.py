@@ -52,8 +52,8 @@ def seed_table(evaluations: pd.DataFrame) -> pd.DataFrame:
 
 
 def training_curves(evaluations: pd.DataFrame) -> dict[str, list[pd.DataFrame]]:
-    """The evaluations of each run that were made like its last one, by row."""
-    own = evaluations[(evaluations["source"] == TRAIN) & evaluations["is_alike"].astype(bool)]
+    """The evaluations of each run, by row."""
+    own = evaluations[evaluations["source"] == TRAIN]
     return {
         str(label): [curve for _, curve in some.groupby("folder", sort=False)]
         for label, some in own.groupby("row", sort=False)

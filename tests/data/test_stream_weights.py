@@ -54,16 +54,6 @@ def test_what_was_found_complete_and_taken_away_has_levels():
     assert reward_levels(np.array([-0.5, 0]), never[:2], "difference") is None
 
 
-def test_discounts_of_a_run_that_changed_them_are_asked_for(tmp_path):
-    record_weighted(tmp_path / "streams")
-    streams = StreamDataset("me/stream", tmp_path / "streams", streaming=True)
-    change = {"episodes": 3, "flags": {"algorithm.gamma": 0.9}}
-    streams.origin = replace(streams.origin, flags={"algorithm.gamma": 0.99}, resumed=[change])
-    with pytest.raises(ValueError, match=r"resumed with another gamma, \[0\.99, 0\.9\]: give --gamma"):
-        write_progress(streams, tmp_path / "out.parquet", Weighting(weight_by="advantage"))
-    write_progress(streams, tmp_path / "out.parquet", Weighting(weight_by="advantage", gamma=0.9))
-
-
 def test_progress_of_every_frame(root, tmp_path):
     rows = write(root, tmp_path / "new/progress.parquet", gamma=GAMMA)
     np.testing.assert_array_equal(rows["index"], np.arange(26))

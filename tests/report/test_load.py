@@ -188,37 +188,18 @@ def test_of_two_runs_of_one_seed_the_longer_counts(tmp_path):
     assert len(load([tmp_path]).runs) == 3
 
 
-def resume(run, steps, **protocol):
-    def edit(starts):
-        start = json.loads(json.dumps(starts[0])) | {"interaction_steps": steps}
-        start["config"]["protocol"] |= protocol
+def test_a_resumed_run_is_a_seed_of_the_others(tmp_path):
+    for seed in (1, 2):
+        config = {"policy": {"pretrained_path": "base"}}
+        write_training_run(tmp_path / str(seed), seed=seed, interval=320, config=config)
+
+    def resume(starts):
+        start = json.loads(json.dumps(starts[0])) | {"interaction_steps": 2560}
         start["config"]["policy"] = {"pretrained_path": "its own checkpoint"}
         starts.append(start)
 
-    edit_starts(run, edit)
-
-
-def test_a_resumed_run_is_a_seed_of_the_others_unless_its_protocol_changed(tmp_path):
-    for seed in (1, 2, 3):
-        config = {"policy": {"pretrained_path": "base"}}
-        write_training_run(tmp_path / str(seed), seed=seed, interval=320, config=config)
-    resume(tmp_path / "2", 2560)
-    resume(tmp_path / "3", 5120, scene_reset_interval=1280)
-    assert rows_of(tmp_path) == {"T = 320": [1, 2], "T = 1280, scene_reset_interval=320, then 1280": [3]}
-    # The resume is undone: the run went on from an earlier checkpoint with its own settings.
-    resume(tmp_path / "3", 2560)
-    assert rows_of(tmp_path) == {"T = 320": [1, 2, 3]}
-
-
-@pytest.mark.parametrize("settings", [{"split": "held_out"}, {"temperature": 0.0}, {"n": 64}])
-def test_evaluations_made_otherwise_than_the_last_are_not_on_the_curve_and_said(tmp_path, settings):
-    run = write_training_run(tmp_path / "run", successes=(2, 4, 6))
-    edit_lines(run, lambda lines: lines[0].update(settings))
-    loaded = load([run])
-    assert loaded.evaluations["is_alike"].tolist() == [False, True, True]
-    assert len(loaded.left_out) == 2
-    assert "1 of 3 evaluations" in loaded.left_out[0]
-    assert "D and C" in loaded.left_out[1]
+    edit_starts(tmp_path / "2", resume)
+    assert rows_of(tmp_path) == {"T = 320": [1, 2]}
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,7 @@ def test_seeds_together_end_where_all_have_been(tmp_path):
 def test_areas_need_a_first_evaluation_at_step_0(tmp_path):
     run = write_training_run(tmp_path / "run", successes=(2, 4, 6))
     edit_lines(run, lambda lines: lines.pop(0))
+    assert "D and C" in load([run]).left_out[0]
     (row,) = seed_table(load_evaluations([run])).to_dict("records")
     assert row["success"] == 0.75
     assert np.isnan(row["D / steps"])
