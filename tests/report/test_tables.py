@@ -3,8 +3,8 @@
 import numpy as np
 import pandas as pd
 import pytest
-from synthetic_evaluations import write_evaluation
-from synthetic_runs import edit_lines, write_lerobot_eval, write_training_run
+from synthetic_evaluations import AFTER, BEFORE, write_evaluation
+from synthetic_runs import edit_lines, write_training_run
 
 from cronos_lerobot.report.figures import evaluation_curve, mean_curve, segment_curve
 from cronos_lerobot.report.load import EVALUATIONS, load, load_evaluations
@@ -80,8 +80,8 @@ def test_gain_of_three_seeds_is_over_the_trainings(tmp_path):
 
 
 def test_gain_of_evaluations_before_and_after(tmp_path):
-    old = load_evaluations([write_lerobot_eval(tmp_path / "old", successes=(1, 2, 3, 4))])
-    new = load_evaluations([write_lerobot_eval(tmp_path / "new", successes=(8, 6, 7, 5))])
+    old = load_evaluations([write_evaluation(tmp_path / "old", "me/a", tasks=BEFORE)])
+    new = load_evaluations([write_evaluation(tmp_path / "new", "me/b", tasks=AFTER)])
     overall, first, *_ = gain_table(NOTHING, old, new).to_dict("records")
     assert (overall["before"], overall["after"], overall["gain"]) == (10 / 32, 26 / 32, 0.5)
     assert (first["before"], first["after"]) == (1 / 8, 1)
