@@ -70,8 +70,6 @@ class Origin:
     versions: dict[str, str] = field(default_factory=dict)
     """Of the packages that began it."""
     commit: str | None = None
-    start_policy: str | None = None
-    """Of demonstrations that begin where a policy left the scene: a hash of that policy's files."""
     filters: list[dict[str, Any]] = field(default_factory=list)
     """Calls of `cronos-streams filter` that it came through, the last one at the end; see `filter_streams`."""
     format: int = FORMAT
@@ -82,10 +80,8 @@ class Origin:
         return check_environment_id(self.environment, "the dataset")
 
 
-def origin_of(
-    env: CronosVectorEnv, kind: str, flags: Mapping[str, Any], start_policy: str | None = None
-) -> Origin:
-    """The origin of what is about to be recorded in `env`; `start_policy` as in `Origin`."""
+def origin_of(env: CronosVectorEnv, kind: str, flags: Mapping[str, Any]) -> Origin:
+    """The origin of what is about to be recorded in `env`."""
     source = env.benchmark.source
     return Origin(
         kind,
@@ -96,7 +92,6 @@ def origin_of(
         json.loads(json.dumps(flags)),
         package_versions(),
         git_commit(),
-        start_policy,
     )
 
 
@@ -188,7 +183,7 @@ def check_same(there: Origin, here: Origin, what: str, ignored: tuple[str, ...] 
     Raises:
         ValueError: names what differs.
     """
-    for name in ("kind", "environment", "benchmark", "start_policy"):
+    for name in ("kind", "environment", "benchmark"):
         if (had := getattr(there, name)) != (has := getattr(here, name)):
             raise ValueError(f"{what} cannot be resumed: its {name} is {brief(had)}, not {brief(has)}")
     if there.kind != DEMONSTRATIONS:

@@ -77,9 +77,9 @@ def test_demonstrations_are_resumed_as_they_were_begun(demos, changes, message):
 def test_a_dataset_has_one_writer(demos):
     config = command(demos, resume=True, noise=NoiseConfig(share=0.5), seed=7)
     env = CronosVectorEnv(2, obs_type=STATE)
-    with open_writer(config, env, None), pytest.raises(FolderInUseError, match="is being written by process"):
-        open_writer(config, env, None)
-    open_writer(config, env, None).finalize()
+    with open_writer(config, env), pytest.raises(FolderInUseError, match="is being written by process"):
+        open_writer(config, env)
+    open_writer(config, env).finalize()
     env.close()
 
 
