@@ -33,7 +33,6 @@ examples:
 """
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -41,7 +40,6 @@ from typing import Any
 
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot.utils.import_utils import register_third_party_plugins
-from rich.console import Console
 
 from cronos_lerobot.data.file_check import check_dataset
 from cronos_lerobot.data.stream_check import COLUMNS, StreamCheck
@@ -148,9 +146,9 @@ class WeightsConfig:
 def print_statistics(config: StatisticsConfig) -> None:
     """`cronos-streams statistics`."""
     result = statistics(config.dataset.open(streaming=True))
-    console = Console(width=None if sys.stdout.isatty() else 140)
+    print(f"{result['streams']} streams, {result['segments']} segments, {result['frames']} frames")
     for table in make_tables(result):
-        console.print(table)
+        print(table.to_string(index=False), end="\n\n")
     if config.output is not None:
         with written_whole(config.output) as file:
             json.dump(result, file, indent=2)
