@@ -13,10 +13,16 @@ HEAD |= {"environment": gymnasium_id("kitchen_2x2"), "benchmark": BENCHMARK, "re
 HEAD |= {"advance": "window", "end_effector_reset": False, "versions": {"mujoco": "4"}}
 
 
-def write_evaluation(folder, policy, *, tasks=None, chains=None, stream=None, split="held_out", **changes):
+BEFORE, AFTER = (["1" * wins + "0" * (8 - wins) for wins in some] for some in ((1, 2, 3, 4), (8, 6, 7, 5)))
+"""Outcomes of four tasks: 10 and 26 of 32."""
+
+
+def write_evaluation(
+    folder, policy, *, tasks=None, chains=None, stream=None, split="held_out", video=None, **changes
+):
     """Results of one suite: `tasks` has a string of 0 and 1 for each, `chains` the lengths for each ordering.
 
-    `stream` has a string of 0 and 1 for each stream.
+    `stream` has a string of 0 and 1 for each stream, `video` the bytes of one.
     """
     suite = "independent" if tasks else "sequential" if chains else "stream"
     rows = tasks or chains or [[line.count("1")] for line in stream]
@@ -46,6 +52,9 @@ def write_evaluation(folder, policy, *, tasks=None, chains=None, stream=None, sp
     path = folder / f"{suite}_{split}"
     path.mkdir(parents=True)
     (path / "results.json").write_text(json.dumps(head))
+    if video is not None:
+        (path / "videos").mkdir()
+        (path / "videos/own.mp4").write_bytes(video)
     return folder
 
 

@@ -1,7 +1,6 @@
-"""Run folders of cronos-train and lerobot-eval with made-up numbers."""
+"""Run folders of cronos-train with made-up numbers."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 from lerobot_env_cronos import gymnasium_id, load_benchmark
@@ -131,18 +130,3 @@ def evaluation(tasks, split="train"):
         [flag for line in flags for flag in line]
     )
     return head | {"per_task": dict(zip(INSTRUCTIONS, map(rate, flags), strict=False))}
-
-
-def write_lerobot_eval(folder, suite="independent_train", successes=(1, 2, 3, 4), n=8, video=None):
-    """Output of lerobot-eval: `successes[i]` of `n` episodes of task i, the last ones; `video` is of episode 0."""
-    per_task = []
-    for number, wins in enumerate(successes):
-        if video:
-            path = Path(folder) / "videos" / f"{suite}_{number}" / "eval_episode_0.mp4"
-            path.parent.mkdir(parents=True)
-            path.write_bytes(video)
-        metrics = {"successes": [i >= n - wins for i in range(n)], "video_paths": ["elsewhere/x.mp4"]}
-        per_task.append({"task_group": suite, "task_id": number, "metrics": metrics})
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    (Path(folder) / "eval_info.json").write_text(json.dumps({"per_task": per_task}))
-    return folder

@@ -36,21 +36,14 @@ class StartConfig:
     """Where a demonstration begins after another task: after 1 to N of them, with equal chances. The last one is
     as above, those before it are any others. From two on all objects may lie on receptacles, and two on one, as
     in a stream that goes on without a scene reset."""
-    policy: str | None = None
-    """Checkpoint or Hub id of a policy that does the earlier tasks instead of the expert: 1 to `earlier_tasks` of
-    any, each for `max_steps`, whether it succeeds or not. Demonstrations then begin where its own streams get
-    stuck (as in DAgger, Ross et al. 2011, an expert for the states of the learner)."""
-    leaning_share: float = ranged(0.0, minimum=0, maximum=1)
-    """Share of the layouts in which one object has fallen over the edge of another body, from 0 to 1."""
     share: float = ranged(1.0, minimum=0, maximum=1)
-    """Share of the episodes that `arm_pose`, `occupied_receptacles`, `misplaced_objects`, `earlier_tasks` and
-    `policy` apply to; the others start at home, with every object on the table."""
+    """Share of the episodes that `arm_pose`, `occupied_receptacles`, `misplaced_objects` and `earlier_tasks` apply
+    to; the others start at home, with every object on the table."""
 
     @property
     def is_after_another(self) -> bool:
         """Whether demonstrations begin where another task ended."""
-        after_task = self.arm_pose in ("after_task", "either")
-        return self.occupied_receptacles or self.misplaced_objects or after_task or bool(self.policy)
+        return self.occupied_receptacles or self.misplaced_objects or self.arm_pose in ("after_task", "either")
 
 
 def check_starts(start: StartConfig, scene: Scene, tasks: Iterable[Task]) -> None:
@@ -70,13 +63,10 @@ def check_starts(start: StartConfig, scene: Scene, tasks: Iterable[Task]) -> Non
 def tasks_before(task: Task, scene: Scene, start: StartConfig) -> list[Task]:
     """What may be done before: another object onto the target receptacle, or the task's own onto another one.
 
-    With neither asked for, another object onto another receptacle; before a reset task, its object onto any. A
-    policy does any other task.
+    With neither asked for, another object onto another receptacle; before a reset task, its object onto any.
     """
     if task.receptacle is None:
         return [other for other in scene.tasks if other.object == task.object]
-    if start.policy is not None:
-        return other_tasks(task, scene)
     # Whether the task before had the same object, and the same receptacle.
     wanted = {(False, True)} if start.occupied_receptacles else set()
     wanted |= {(True, False)} if start.misplaced_objects else set()

@@ -9,7 +9,6 @@ from lerobot.utils.constants import ACTION, DONE, REWARD
 from lerobot_env_cronos import CronosVectorEnv, Scene, Task
 from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW
 
-from cronos_lerobot.agents.base import Actor
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.data.demo_starts import FREE_LAYOUTS, StartConfig, check_starts, other_tasks, tasks_before
 from cronos_lerobot.data.perturbations import (
@@ -17,7 +16,6 @@ from cronos_lerobot.data.perturbations import (
     GraspMisses,
     MissConfig,
     NoiseConfig,
-    drop_against_another,
     move_arm_at_random,
 )
 from cronos_lerobot.data.schema import CONFIGURATION, SUCCESS, TRUNCATED
@@ -97,7 +95,6 @@ class DemoCollector:
         *,
         seed: int = 0,
         tasks: Sequence[Task] | None = None,
-        policy: Actor | None = None,
     ) -> None:
         """Collect from all streams of `env` into `writer`, which may already hold episodes.
 
@@ -108,9 +105,8 @@ class DemoCollector:
             config: what a demonstration is.
             seed: decides layouts, noise, misses and starts.
             tasks: to demonstrate; all of the scene's when None, with its reset tasks if `config` says so.
-            policy: that of `config.start.policy`.
         """
-        self.env, self.expert, self.writer, self.config, self.policy = env, expert, writer, config, policy
+        self.env, self.expert, self.writer, self.config = env, expert, writer, config
         self.finished, self.successes = 0, 0
         self._started = 0
         self._seed = (seed, writer.num_episodes)
@@ -141,27 +137,11 @@ class DemoCollector:
         while any(episode is not None for episode in self._episodes):
             labels = np.clip(self.expert.act(), ACTION_LOW, ACTION_HIGH).astype(np.float32)
             columns = observation_columns(observation) | {ACTION: labels}
-            executed = self._perturb(self._let_policy_act(observation, labels))
-            observation, reward, _, _, info = self.env.step(executed)
+            observation, reward, _, _, info = self.env.step(self._perturb(labels))
             columns |= {REWARD: reward, SUCCESS: info["is_success"]}
             for stream in range(self.env.num_envs):
                 self._after_step(stream, columns, info)
             self._start_idle_streams(total)
-
-    def _is_policys(self, episode: _Episode) -> bool:
-        """Whether what is done before is done by the policy."""
-        return self.policy is not None and not episode.at_home
-
-    def _let_policy_act(self, observation: dict[str, np.ndarray], labels: np.ndarray) -> np.ndarray:
-        """Actions in which earlier tasks are the policy's, if there is one."""
-        if self.policy is None:
-            return labels
-        earlier = np.array([e is not None and bool(e.preludes) and self._is_policys(e) for e in self._episodes])
-        if not earlier.any():
-            return labels
-        everyone = np.arange(self.env.num_envs)
-        chosen = self.policy.act(observation, self.env.instructions, everyone).action
-        return np.where(earlier[:, None], chosen, labels)
 
     def _perturb(self, labels: np.ndarray) -> np.ndarray:
         recording = np.array([episode is not None and not episode.preludes for episode in self._episodes])
@@ -178,9 +158,6 @@ class DemoCollector:
             return
         if episode.settling:
             episode.settling = False
-            if self.policy is not None:
-                # What it planned at rest, it planned for what it saw before.
-                self.policy.begin(np.array([stream]))
             if not episode.preludes and info["is_success"][stream]:
                 self._discard(stream, episode)
             return
@@ -192,13 +169,11 @@ class DemoCollector:
                 episode.frames.setdefault(key, []).append(column[stream].copy())
         succeeded = episode.released > self.config.steps_after_release
         is_late = episode.steps >= self.config.max_steps
-        if info["diverged"][stream] and episode.preludes and self._is_policys(episode):
-            self._discard(stream, episode)
-        elif info["diverged"][stream]:
+        if info["diverged"][stream]:
             self._end(stream, episode, succeeded=False, keep=False)
-        elif episode.preludes and (is_late if self._is_policys(episode) else succeeded):
+        elif succeeded and episode.preludes:
             self._end_prelude(stream, episode)
-        elif succeeded and not episode.preludes:
+        elif succeeded:
             self._end(stream, episode, succeeded=True, keep=True)
         elif is_late:
             self._end(stream, episode, succeeded=False, keep=self.config.keep_failures and not episode.preludes)
@@ -226,21 +201,17 @@ class DemoCollector:
     def _end_prelude(self, stream: int, episode: _Episode) -> None:
         ids = np.array([stream])
         del episode.preludes[0]
-        if episode.arm_goes_home and (self._is_policys(episode) or not episode.preludes):
-            self.env.end_effector_reset(ids)
         if episode.preludes:
             self._begin_prelude(ids, episode)
             return
+        if episode.arm_goes_home:
+            self.env.end_effector_reset(ids)
         self._begin_task(ids, episode)
-        if self._is_policys(episode) and self.env.is_success[stream]:
-            self._discard(stream, episode)
 
     def _discard(self, stream: int, episode: _Episode) -> None:
-        """Nothing can be shown: the task was complete from the start, or the policy broke the simulation."""
+        """Nothing can be shown: the task was complete from the start."""
         self._episodes[stream] = None
-        self._count_failure(
-            "the start was complete or broken, or the expert failed,", repr(episode.task.instruction)
-        )
+        self._count_failure("the start was complete, or the expert failed,", repr(episode.task.instruction))
 
     def _count_failure(self, what: str, last: str) -> None:
         """One more attempt came to nothing; give up after too many without a success between them."""
@@ -273,8 +244,6 @@ class DemoCollector:
             number = -1
             self.env.place_bodies(ids, FREE_LAYOUTS[start.layouts](self.env.scene, rng)[None])
         episode = _Episode(task, number, preludes=[], at_home=rng.random() >= start.share, rng=rng)
-        if start.leaning_share and rng.random() < start.leaning_share:
-            drop_against_another(self.env, stream, rng)
         # An object that lies on the table from the start would leave nothing to show of its reset task.
         if task.receptacle is None or (start.is_after_another and not episode.at_home):
             earlier = [] if episode.at_home else self._earlier(task, rng)
@@ -303,8 +272,6 @@ class DemoCollector:
     def _begin_prelude(self, ids: np.ndarray, episode: _Episode) -> None:
         self.env.set_task(ids, episode.preludes[:1])
         self.expert.reset(ids)
-        # A policy has seen neither its task yet nor the arm at home.
-        episode.settling |= self._is_policys(episode)
         episode.steps, episode.released = 0, 0
 
     def _begin_task(self, ids: np.ndarray, episode: _Episode) -> None:

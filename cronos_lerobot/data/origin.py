@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,6 @@ DEMONSTRATIONS, STREAMS, SEGMENTS = "demonstrations", "streams", "segments"
 the columns of demonstrations."""
 NO_FLAGS = ("root", "discover_packages_path", "features", "features_map")
 """Fields that are left out: folders of whoever made the dataset, and what follows from the flags."""
-CHANGEABLE = ("protocol.", "algorithm.")
-"""What the flags begin with that a resumed run may change."""
 MAYBE_FOLDERS = ("benchmark", "policy", "pretrained_path", "checkpoint", "adapter")
 """Fields that name a folder or something on the Hub; of a folder only that it was one. A hash says which."""
 
@@ -72,19 +70,9 @@ class Origin:
     versions: dict[str, str] = field(default_factory=dict)
     """Of the packages that began it."""
     commit: str | None = None
-    start_policy: str | None = None
-    """Of demonstrations that begin where a policy left the scene: a hash of that policy's files."""
-    resumed: list[dict[str, Any]] = field(default_factory=list)
-    """Of streams, where their run was resumed with other flags of protocol or algorithm: the number of `episodes`
-    before that, of the recording before any filter, and the changed `flags`."""
     filters: list[dict[str, Any]] = field(default_factory=list)
     """Calls of `cronos-streams filter` that it came through, the last one at the end; see `filter_streams`."""
     format: int = FORMAT
-
-    def values(self, flag: str, default: Any) -> list[Any]:
-        """Everything that a flag has been, in its order; its default where none is said."""
-        changes = [change["flags"] for change in self.resumed if flag in change["flags"]]
-        return [self.flags.get(flag, default), *(change[flag] for change in changes)]
 
     @property
     def scene(self) -> str:
@@ -92,10 +80,8 @@ class Origin:
         return check_environment_id(self.environment, "the dataset")
 
 
-def origin_of(
-    env: CronosVectorEnv, kind: str, flags: Mapping[str, Any], start_policy: str | None = None
-) -> Origin:
-    """The origin of what is about to be recorded in `env`; `start_policy` as in `Origin`."""
+def origin_of(env: CronosVectorEnv, kind: str, flags: Mapping[str, Any]) -> Origin:
+    """The origin of what is about to be recorded in `env`."""
     source = env.benchmark.source
     return Origin(
         kind,
@@ -106,7 +92,6 @@ def origin_of(
         json.loads(json.dumps(flags)),
         package_versions(),
         git_commit(),
-        start_policy,
     )
 
 
@@ -154,25 +139,6 @@ def write_origin(root: Path, origin: Origin) -> None:
     (root / "README.md").write_text(README.format(what=what[origin.kind], environment=origin.environment))
 
 
-def with_changes(there: Origin, here: Origin, num_episodes: int) -> Origin:
-    """The origin of a dataset that is resumed after `num_episodes`, with the flags that have changed.
-
-    Args:
-        there: of the dataset.
-        here: of what is to be appended.
-        num_episodes: that the dataset keeps; what had changed after them has not.
-    """
-    kept = [change for change in there.resumed if change["episodes"] < num_episodes]
-    before = dict(there.flags)
-    for change in kept:
-        before |= change["flags"]
-    names = sorted(name for name in here.flags if name.startswith(CHANGEABLE))
-    changed = {name: here.flags[name] for name in names if here.flags[name] != before.get(name)}
-    if changed and there.flags:
-        kept.append({"episodes": num_episodes, "flags": changed})
-    return replace(there, resumed=kept)
-
-
 def read_origin(root: Path, features: Mapping[str, Mapping[str, Any]], what: str) -> Origin:
     """Where a dataset comes from.
 
@@ -217,7 +183,7 @@ def check_same(there: Origin, here: Origin, what: str, ignored: tuple[str, ...] 
     Raises:
         ValueError: names what differs.
     """
-    for name in ("kind", "environment", "benchmark", "start_policy"):
+    for name in ("kind", "environment", "benchmark"):
         if (had := getattr(there, name)) != (has := getattr(here, name)):
             raise ValueError(f"{what} cannot be resumed: its {name} is {brief(had)}, not {brief(has)}")
     if there.kind != DEMONSTRATIONS:

@@ -1,4 +1,4 @@
-"""What is done to the expert on purpose: noise, missed grasps, unusual arm poses, objects that lean on others.
+"""What is done to the expert on purpose: noise, missed grasps, unusual arm poses.
 
 Only the EXECUTED action is perturbed. The recorded action stays the expert's own for the state that it finds
 itself in, so the data show how to come back from states the expert alone would never visit (Laskey et al.
@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from lerobot_env_cronos import CronosVectorEnv
-from lerobot_env_cronos.expert.reach import find_reach
-from lerobot_env_cronos.scene.scenes import BODIES
 from lerobot_env_cronos.simulation.kinematics import inverse_kinematics
 from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW
 
@@ -167,33 +165,3 @@ def move_arm_at_random(env: CronosVectorEnv, stream: int, rng: np.random.Generat
     turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ rotation[ids]
     # The solver converges from where the arm is; a few rounds cover the widest moves.
     sim.move_arm(ids, inverse_kinematics(sim.qpos[ids, :6], position, turned, iterations=40))
-
-
-DROP_M, NUM_DROPS = 0.005, 20
-"""Height from which an object falls on another body [m], and places that are tried until one is within reach."""
-
-
-def drop_against_another(env: CronosVectorEnv, stream: int, rng: np.random.Generator) -> None:
-    """Let one object of a stream fall over the edge of another body, where it comes to rest; the arm goes home.
-
-    So objects lie in streams without scene resets: half on a receptacle, on or against each other.
-    """
-    scene, ids = env.scene, np.array([stream])
-    name = scene.objects[rng.integers(len(scene.objects))]
-    others = [body for body in scene.bodies if body != name]
-    support = others[rng.integers(len(others))]
-    pose = env.simulation.body_pose(support)[stream]
-    heading = 2 * np.arctan2(pose[6], pose[3])
-    for _ in range(NUM_DROPS):
-        angle, yaw = rng.uniform(0, 2 * np.pi, size=2)
-        # The point of the other body's rim that lies in this direction, seen from above.
-        edge = np.array([np.cos(angle), np.sin(angle)]) * BODIES[support].size[:2] / 2
-        c, s = np.cos(heading), np.sin(heading)
-        xy = pose[:2] + np.array([[c, -s], [s, c]]) @ edge
-        if find_reach(scene).contains(xy):
-            break
-    else:
-        return
-    z = BODIES[support].size[2] + BODIES[name].size[2] / 2 + DROP_M
-    env.simulation.move_body(ids, name, np.array([[*xy, z, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]]))
-    env.end_effector_reset(ids)

@@ -22,7 +22,7 @@ from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 from cronos_lerobot.agents.processing import VECTOR_KEYS
 from cronos_lerobot.data.video import check_video_size
 
-FORMAT = 2
+FORMAT = 3
 """Of the columns below and of `meta/cronos.json`. Any other number is refused."""
 ROBOT_TYPE = "widowx"
 """`robot_type` of demonstrations and streams: LeRobot merges only datasets of one robot."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import pandas as pd
-from rich.table import Table
 
 from cronos_lerobot.data.schema import (
     EVENT,
@@ -63,24 +62,23 @@ def statistics(streams: StreamDataset) -> dict[str, Any]:
     }
 
 
-def make_tables(result: dict[str, Any]) -> list[Table]:
-    """The statistics for the console, with 95 % intervals."""
-    title = f"{result['streams']} streams, {result['segments']} segments, {result['frames']} frames"
-    tables = []
+def make_tables(result: dict[str, Any]) -> list[pd.DataFrame]:
+    """The statistics to print, with 95 % intervals: by position, task and policy version, and the events."""
+    tables, together = [], [("all", result["success"]), ("with help", result["helped"])]
     for name in ("position", "task", "policy_version"):
-        table = Table(BY[name][1], "success", "95 %", "complete from the start", "segments", title=title)
-        rows = [*result[f"success_by_{name}"].items(), ("all", result["success"])]
-        for key, (successes, found, n) in [*rows, ("with help", result["helped"])]:
-            if n:
-                low, high = wilson_interval(successes, n)
-                table.add_row(str(key), f"{successes / n:.3f}", f"[{low:.2f}, {high:.2f}]", str(found), str(n))
-        tables.append(table)
-        title = ""
+        counts = [*result[f"success_by_{name}"].items(), *together]
+        tables.append(pd.DataFrame([{BY[name][1]: key} | _cells(*n) for key, n in counts if n[2]]))
     kinds = [kind.name.lower() for kind in BEFORE_SEGMENTS]
-    table = Table("segments that began after, from step", *kinds)
-    for key, counts in [*result["began_after_over_time"].items(), ("all", result["began_after"])]:
-        table.add_row(str(key), *(str(counts.get(kind, 0)) for kind in kinds))
-    return [*tables, table]
+    rows = [*result["began_after_over_time"].items(), ("all", result["began_after"])]
+    began = pd.DataFrame([counts for _, counts in rows]).reindex(columns=kinds).fillna(0).astype(int)
+    began.insert(0, "began after, from step", [key for key, _ in rows])
+    return [*tables, began]
+
+
+def _cells(successes: int, found: int, n: int) -> dict[str, Any]:
+    low, high = wilson_interval(successes, n)
+    rate = {"success": f"{successes / n:.3f}", "95 %": f"[{low:.2f}, {high:.2f}]"}
+    return rate | {"complete from the start": found, "segments": n}
 
 
 def _successes(rows: pd.DataFrame) -> list[int]:

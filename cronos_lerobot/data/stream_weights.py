@@ -14,32 +14,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-import torch
 from lerobot.utils.constants import REWARD
 from lerobot_env_cronos.vector_env import GRASP_REWARD, SUCCESS_REWARD
 
-from cronos_lerobot.agents.ppo.gae import compute_gae
-from cronos_lerobot.data.origin import Origin
-from cronos_lerobot.data.schema import STEP, STREAM_ID, SUCCESS, VALUE
+from cronos_lerobot.data.schema import STEP, STREAM_ID, SUCCESS
 from cronos_lerobot.data.streams import StreamDataset
-from cronos_lerobot.ranges import check_ranges, ranged
 from cronos_lerobot.whole_files import written_whole
 
-PROGRESS, ADVANTAGE = "progress", "advantage"
-WEIGHT_BY = (PROGRESS, ADVANTAGE)
-"""What a weight comes from: how near a level of the reward is, or PPO's advantages."""
-PROGRESS_GAMMA = 0.98
+GAMMA = 0.98
 """One step nearer to the success is 0.02 of progress: more than LeRobot's kappa, which 1 - 0.99 is not."""
-ADVANTAGE_GAMMA, ADVANTAGE_LAMBDA = 0.99, 0.9
-"""Where a recording does not say what its values were learned with: the defaults of `cronos-train`."""
 COLUMN = "progress_sparse"
 """What LeRobot reads unless `--sample_weighting.head_mode` says otherwise."""
 INDICES = ("index", "episode_index", "frame_index")
@@ -48,80 +37,29 @@ MADE_WITH = b"cronos"
 """Key of the file's metadata: how it was made, as JSON."""
 
 
-@dataclass
-class Weighting:
-    """How progress is computed."""
-
-    weight_by: str = ranged(PROGRESS, choices=WEIGHT_BY)
-    """`progress`: how near the segment came to grasp and success; `advantage`: GAE of its rewards and values."""
-    gamma: float | None = ranged(None, minimum=0, maximum=1)
-    """Discount per control step, from 0 to 1; null is 0.98 for progress, and the run's for advantage."""
-    gae_lambda: float | None = ranged(None, minimum=0, maximum=1)
-    """Weight of the longer returns in an advantage, from 0 to 1; null is the run's."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
-    def discounts(self, origin: Origin) -> tuple[float, float]:
-        """gamma and gae_lambda with numbers instead of null.
-
-        Args:
-            origin: of the recording.
-
-        Raises:
-            ValueError: a value that is not given changed while the run was recorded.
-        """
-        if self.weight_by == PROGRESS:
-            return PROGRESS_GAMMA if self.gamma is None else self.gamma, 0.0
-        found = []
-        for name, default in (("gamma", ADVANTAGE_GAMMA), ("gae_lambda", ADVANTAGE_LAMBDA)):
-            values, given = origin.values(f"algorithm.{name}", default), getattr(self, name)
-            if given is None and len(values) > 1:
-                raise ValueError(f"the recorded run was resumed with another {name}, {values}: give --{name}")
-            found.append(float(values[0]) if given is None else given)
-        return found[0], found[1]
-
-
-def write_progress(streams: StreamDataset, output: Path, weighting: Weighting) -> dict[str, Any]:
+def write_progress(streams: StreamDataset, output: Path, gamma: float = GAMMA) -> None:
     """Write the parquet that LeRobot's RA-BC reads: `index`, `episode_index`, `frame_index`, `progress_sparse`.
+
+    Its metadata says how it was made: `dataset` and `gamma`.
 
     Args:
         streams: a recording, whole or filtered, here or on the Hub.
         output: the file, which appears when it is whole; one that is there is replaced.
-        weighting: how.
-
-    Returns:
-        How it was made, which the file's metadata repeats: `dataset`, `weight_by`, `gamma` and, of advantages,
-        `gae_lambda`.
+        gamma: discount per control step.
 
     Raises:
-        ValueError: rewards that do not fit the successes, or no value for every frame.
+        ValueError: rewards that do not fit the successes.
     """
-    gamma, gae_lambda = weighting.discounts(streams.origin)
-    made_with: dict[str, Any] = {"dataset": streams.repo_id, "weight_by": weighting.weight_by, "gamma": gamma}
-    is_progress = weighting.weight_by == PROGRESS
-    if not is_progress and VALUE not in streams.meta.features:
-        raise ValueError(
-            f"{streams.repo_id} has no {VALUE}: its agent has no critic; --weight_by={PROGRESS} needs none"
-        )
-    names = [*INDICES, STREAM_ID, STEP, REWARD, SUCCESS, *(() if is_progress else (VALUE,))]
+    names = [*INDICES, STREAM_ID, STEP, REWARD, SUCCESS]
     frames = pd.concat(streams.annotations(names)).sort_values("index", kind="stable")
-    if is_progress:
-        # What is not said is the default of `cronos-train`: LeRobot's tools drop it.
-        rows = _progress_rows(frames, streams.origin.flags.get("protocol.reward", "difference"), gamma)
-    else:
-        made_with["gae_lambda"] = gae_lambda
-        _check_values(frames)
-        rows = [
-            summed_advantages(rewards.astype(np.float64), values.astype(np.float64), gamma, gae_lambda)
-            for rewards, values in _segments(frames, REWARD, VALUE)
-        ]
+    # What is not said is the default of `cronos-train`: LeRobot's tools drop it.
+    rows = _progress_rows(frames, streams.origin.flags.get("protocol.reward", "difference"), gamma)
     columns = {name: frames[name].to_numpy(np.int64) for name in INDICES}
     columns[COLUMN] = np.concatenate(rows).astype(np.float32)
-    table = pa.table(columns).replace_schema_metadata({MADE_WITH: json.dumps(made_with).encode()})
+    made_with = json.dumps({"dataset": streams.repo_id, "gamma": gamma})
+    table = pa.table(columns).replace_schema_metadata({MADE_WITH: made_with.encode()})
     with written_whole(output, "wb") as file:
         pq.write_table(table, file)
-    return made_with
 
 
 def _progress_rows(frames: pd.DataFrame, reward: str, gamma: float) -> list[np.ndarray]:
@@ -131,7 +69,7 @@ def _progress_rows(frames: pd.DataFrame, reward: str, gamma: float) -> list[np.n
         if levels is None:
             raise ValueError(
                 f"stream {streams[0]}, step {steps[0]}: the rewards are not those of --protocol.reward={reward}"
-                f" ({GRASP_REWARD} grasped, {SUCCESS_REWARD} complete); --weight_by={ADVANTAGE} takes any reward"
+                f" ({GRASP_REWARD} grasped, {SUCCESS_REWARD} complete)"
             )
         rows.append(progress(levels, gamma))
     return rows
@@ -141,23 +79,6 @@ def _segments(frames: pd.DataFrame, *names: str) -> Iterator[tuple[np.ndarray, .
     """Columns of one episode after the other."""
     begins = np.flatnonzero(np.diff(frames["episode_index"].to_numpy())) + 1
     return zip(*(np.split(frames[name].to_numpy(), begins) for name in names), strict=True)
-
-
-def _check_values(frames: pd.DataFrame) -> None:
-    values, episodes = frames[VALUE].to_numpy(), frames["episode_index"].to_numpy()
-    instead = f"; --weight_by={PROGRESS} needs none"
-    if bad := int((~np.isfinite(values)).sum()):
-        raise ValueError(f"{VALUE} is not finite in {bad} of {len(values)} frames{instead}")
-    # The value of a decision is recorded with each of its actions: two a decision repeat half of them. The flags
-    # need not tell, as those of your own policy, and are lost with LeRobot's tools.
-    # Before the first update a critic may say 0 of everything.
-    within = (episodes[1:] == episodes[:-1]) & (values[1:] != 0)
-    repeated = int((within & (values[1:] == values[:-1])).sum())
-    if repeated > within.sum() / 3:
-        raise ValueError(
-            f"{VALUE} is that of the frame before in {repeated} of {within.sum()} frames: the policy played "
-            f"several actions a decision, and advantages need a value of every frame{instead}"
-        )
 
 
 def reward_levels(rewards: np.ndarray, successes: np.ndarray, reward: str) -> np.ndarray | None:
@@ -209,52 +130,5 @@ def progress(levels: np.ndarray, gamma: float) -> np.ndarray:
     nearness = levels.copy()
     for t in reversed(range(len(nearness) - 1)):
         nearness[t] = max(levels[t], gamma * nearness[t + 1])
-    return _with_last_action(nearness)
-
-
-def summed_advantages(rewards: np.ndarray, values: np.ndarray, gamma: float, gae_lambda: float) -> np.ndarray:
-    """The advantages of a segment's actions before each frame, summed: a difference is those of a chunk's actions.
-
-    The observation after the segment is not recorded, so its end is bootstrapped from the value of its last one,
-    as PPO does at a divergence.
-
-    Args:
-        rewards: (T,) of each action.
-        values: (T,) of each observation.
-        gamma: discount per control step.
-        gae_lambda: weight of the longer returns.
-
-    Returns:
-        (T,) in units of the reward; the last row is the sum with the last action's.
-    """
-    ends = np.zeros((len(rewards), 1), np.bool_)
-    ends[-1] = True
-    advantages, _ = compute_gae(rewards[:, None], values[:, None], ends, values[:, None], gamma, gae_lambda)
-    return _with_last_action(np.concatenate([[0.0], np.cumsum(advantages[:, 0], dtype=np.float64)]))
-
-
-def _with_last_action(moments: np.ndarray) -> np.ndarray:
-    """Rows (T,) of the moments (T + 1,) of a segment: that before the last action is left out."""
-    return np.append(moments[:-2], moments[-1])
-
-
-def count_weights(path: Path, chunk_size: int) -> dict[str, int]:
-    """How many frames get which weight, by LeRobot's own class with its default settings.
-
-    Args:
-        path: of `write_progress`.
-        chunk_size: of the policy, in frames.
-
-    Returns:
-        Frames by weight, as text: 1, 0, and those between with their mean.
-    """
-    # Here, because it is slow to import and nothing else needs it.
-    from lerobot.rewards.sarm.rabc import RABCWeights
-
-    index = pq.read_table(path, columns=["index"])["index"].to_numpy()
-    weighter = RABCWeights(path, chunk_size, device=torch.device("cpu"))
-    _, stats = weighter.compute_batch_weights({"index": index})
-    full, zero = stats["num_full_weight"], stats["num_zero_weight"]
-    between = len(index) - full - zero
-    mean = (stats["mean_weight"] * len(index) - full) / max(between, 1)
-    return {"of weight 1": full, "of weight 0": zero, f"between, {mean:.2f} on average": between}
+    # The row before the last action is left out.
+    return np.append(nearness[:-2], nearness[-1])

@@ -20,7 +20,7 @@ import numpy as np
 from lerobot.datasets.utils import INFO_PATH
 from lerobot.utils.constants import DEFAULT_FEATURES
 
-from cronos_lerobot.data.origin import Origin, check_same, create_dataset, read_origin, with_changes, write_origin
+from cronos_lerobot.data.origin import Origin, check_same, create_dataset, read_origin
 from cronos_lerobot.data.schema import Features, frame_format
 from cronos_lerobot.data.stats import DatasetStats
 from cronos_lerobot.data.storage import INCOMPLETE, GrowingDataset, truncate
@@ -203,13 +203,9 @@ class SegmentWriter:
         what = f"the dataset in {self.root}"
         meta = self._meta = open_metadata(repo_id, self.root)
         if origin is not None:
-            there = read_origin(self.root, meta.features, what)
-            check_same(there, origin, what, may_differ)
+            check_same(read_origin(self.root, meta.features, what), origin, what, may_differ)
         _check_features(meta.features, self.features, what)
-        stats = truncate(meta, meta.total_episodes if num_episodes < 0 else num_episodes)
-        if origin is not None:
-            write_origin(self.root, with_changes(there, origin, meta.total_episodes))
-        return stats
+        return truncate(meta, meta.total_episodes if num_episodes < 0 else num_episodes)
 
     def _check_alive(self) -> None:
         self._check_failure()

@@ -65,14 +65,12 @@ def read_evaluation(path: Path) -> list[dict[str, Any]]:
 
 
 def find_videos(results: Path) -> list[Path]:
-    """Return the videos beside a results.json. Paths inside the file are never followed."""
-    return videos_below(results.parent, f"{VIDEOS}/*.mp4")
+    """Return the videos beside a results.json.
 
-
-def videos_below(folder: Path, pattern: str) -> list[Path]:
-    """The videos of a pattern, without links that lead out of the folder."""
-    home = folder.resolve()
-    return sorted(path for path in folder.glob(pattern) if path.is_file() and path.resolve().is_relative_to(home))
+    Paths inside the file are never followed, and no link that leads out of the folder.
+    """
+    home, found = results.parent.resolve(), results.parent.glob(f"{VIDEOS}/*.mp4")
+    return sorted(path for path in found if path.is_file() and path.resolve().is_relative_to(home))
 
 
 def read_results(file: Path) -> dict[str, Any]:

@@ -55,7 +55,6 @@ def _read_until(folder: Path, step: int) -> TrainingRun:
     reached = {one.get("interaction_steps") for one in (*run.updates, *run.ends, *run.starts)}
     for records in (run.evaluations, run.updates, run.ends):
         records[:] = [record for record in records if record["interaction_steps"] <= step]
-    run.starts[1:] = [start for start in run.starts[1:] if (start.get("interaction_steps") or 0) < step]
     if step not in reached or not [*run.updates, *run.ends]:
         raise ValueError(
             f"{folder / METRICS} has nothing at step {step}: the run resumed from an earlier checkpoint, and "

@@ -125,7 +125,7 @@ def _about(
         "is_steered": (model / STEERING).is_file(),
         "is_reset_free": is_reset_free,
         "evaluate": {name: [name, f"--policy.path={config.repo_id}", *flags] for name in EVALUATE},
-        "flags": (changed_flags(trained) if is_reset_free else {}) | (run.changed if run else {}),
+        "flags": changed_flags(trained) if is_reset_free else {},
         "run": run,
         "counted": [kind.name.lower() for kind in COUNTED_INTERVENTIONS],
     }

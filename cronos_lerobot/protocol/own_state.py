@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable
 from copy import deepcopy
 from typing import Any
@@ -22,16 +21,10 @@ def own_states(parts: Iterable[Any]) -> dict[str, dict[str, Any]]:
 
 
 def load_own_states(parts: Iterable[Any], states: dict[str, dict[str, Any]]) -> None:
-    """Let those of `parts` that `states`, of `own_states`, has something of continue from it.
-
-    A resumed run may have other strategies than before: they begin anew, and what is of none of them is dropped.
-    """
+    """Let those of `parts` that `states`, of `own_states`, has something of continue from it."""
     named = _named(parts)
     for name, state in states.items():
-        if name in named:
-            named[name].load_state_dict(state)
-        else:
-            logging.warning(f"The checkpoint has the state of {name}, which this run does not have: dropped.")
+        named[name].load_state_dict(state)
 
 
 def _named(parts: Iterable[Any]) -> dict[str, Any]:

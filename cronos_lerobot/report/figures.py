@@ -24,30 +24,6 @@ SPLIT_LABELS = {"train": "training configurations", "held_out": "held-out config
 INK, GRID = "#333333", "#e4e4e4"
 SINGLE = 16
 """Segments since a scene reset that are drawn one by one; later ones are joined in spans that double."""
-HISTORY_COLUMNS = 12
-AGENT_PANELS = {
-    "agent/approx_kl": "KL divergence per update [nats]",
-    "agent/entropy": "entropy [nats; steering: per dimension]",
-    "agent/explained_variance": "explained variance of the value",
-    "agent/clip_fraction": "clip fraction",
-    "agent/policy_lr": "learning rate of the policy",
-    "agent/loss": "loss",
-    "agent/grad_norm": "gradient norm",
-    "agent/segments": "successful segments in memory",
-    "agent/failed_segments": "failed segments in memory",
-    "agent/frames": "frames in memory",
-    "agent/effective_share": "effective share of the weighted frames",
-    "agent/decisions": "decisions in memory",
-    "agent/critic_loss": "loss of the critics",
-    "agent/critic_grad_norm": "gradient norm of the critics",
-    "agent/value": "value of decisions in memory",
-    "agent/actor_loss": "loss of the actor",
-    "agent/actor_grad_norm": "gradient norm of the actor",
-    "agent/alpha": "alpha, the weight of the entropy",
-    "agent/choice_abs": "size of the chosen noise (1: the bound)",
-    "reward_per_segment": "reward per segment",
-}
-"""Titles of the columns of updates that have a panel."""
 
 
 class Curve(NamedTuple):
@@ -98,18 +74,14 @@ def evaluation_figure(evaluations: pd.DataFrame) -> Figure | None:
 def training_figure(updates: pd.DataFrame) -> Figure | None:
     """Success of the streams' segments, by policy update."""
     figure, (ax,) = _subplots(3.2)
-    _draw_updates(ax, updates, "success", 1.6)
+    for i, (label, some) in enumerate(updates.groupby("row", sort=False)):
+        runs = [run.dropna(subset="success") for _, run in some.groupby("folder", sort=False)]
+        curves = [(run["steps"], run["success"]) for run in runs if len(run)]
+        if curves:
+            draw_curve(ax, mean_curve(curves), i, str(label), some["folder"].nunique())
     style_axes(ax, "interaction steps, all streams")
     ax.set(ylabel="success of training segments", ylim=(0, 1.02))
     return _finished(figure)
-
-
-def _draw_updates(ax: Axes, updates: pd.DataFrame, name: str, width: float) -> None:
-    for i, (label, some) in enumerate(updates.groupby("row", sort=False)):
-        runs = [run.dropna(subset=name) for _, run in some.groupby("folder", sort=False)]
-        curves = [(run["steps"], run[name]) for run in runs if len(run)]
-        if curves:
-            draw_curve(ax, mean_curve(curves), i, str(label), some["folder"].nunique(), width=width)
 
 
 def segments_figure(segments: pd.DataFrame) -> Figure | None:
@@ -139,60 +111,6 @@ def segment_curve(segments: pd.DataFrame) -> Curve | None:
     rates = rates_by_part(late.assign(x=middle), ["x"]).sort_values("x")
     low, high = (rates[name].fillna(rates["success"]) for name in ("ci95_low", "ci95_high"))
     return Curve(*(column.to_numpy(float) for column in (rates["x"], rates["success"], low, high)))
-
-
-def segment_history_figure(segments: pd.DataFrame) -> Figure | None:
-    """Training success by segment since the last scene reset, over the run: a heat map for each row."""
-    groups = list(segments[segments["kind"] == "segment"].groupby("row", sort=False))
-    if not groups:
-        return None
-    rows = -(-len(groups) // 2)
-    figure, axes = _subplots(3.2 * rows, rows, min(2, len(groups)))
-    mesh: Any = None
-    for ax, (label, some) in zip(axes, groups, strict=False):
-        edges, rates = segment_history(some)
-        mesh = ax.pcolormesh(edges, np.arange(len(rates) + 1) + 0.5, rates, vmin=0, vmax=1, cmap="viridis")
-        style_axes(ax, "interaction steps, all streams", grid=False)
-        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
-        ax.set_ylabel("segment since the reset")
-        ax.set_title(_label(str(label), some["folder"].nunique()), fontsize=9, color=INK, loc="left")
-    figure.colorbar(mesh, ax=axes, label="success", shrink=0.9)
-    _remove(axes[len(groups) :])
-    return figure
-
-
-def segment_history(segments: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Success by segment over the run.
-
-    Returns:
-        edges (columns + 1,) in interaction steps, and rates (segments, columns), NaN where there is no episode.
-    """
-    end, cycle = int(segments["steps"].max()), int(segments["cycle"].max())
-    # A column has all segments between two scene resets.
-    columns = max(1, min(HISTORY_COLUMNS, end // cycle if cycle else HISTORY_COLUMNS))
-    place = ((segments["steps"] - 1) * columns // end).astype(int)
-    counts = np.zeros((2, int(segments["part"].max()) + 1, columns))
-    for row, name in zip(counts, ("successes", "n"), strict=True):
-        np.add.at(row, (segments["part"].to_numpy(int), place), segments[name].to_numpy(float))
-    with np.errstate(invalid="ignore"):
-        return np.linspace(0, end, columns + 1), counts[0] / counts[1]
-
-
-def agent_figure(updates: pd.DataFrame) -> Figure | None:
-    """The agents' diagnostics by policy update, one panel for each that some run has."""
-    panels = [
-        (name, title) for name, title in AGENT_PANELS.items() if name in updates and updates[name].notna().any()
-    ]
-    if not panels:
-        return None
-    rows = -(-len(panels) // 3)
-    figure, axes = _subplots(2.3 * rows, rows, 3)
-    for ax, (name, title) in zip(axes, panels, strict=False):
-        _draw_updates(ax, updates, name, 1.2)
-        style_axes(ax, "")
-        ax.set_title(title, fontsize=9, color=INK, loc="left")
-    _remove(axes[len(panels) :])
-    return _finished(figure)
 
 
 def part_figure(evaluations: pd.DataFrame, suite: str) -> Figure | None:
@@ -226,9 +144,9 @@ def _draw_parts(ax: Axes, parts: Sequence[dict[str, Any]], i: int, number: int, 
         bar.set(hatch=hatch, edgecolor="white")
 
 
-def _subplots(height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Figure, list[Axes]]:
+def _subplots(height: float, columns: int = 1, **options: Any) -> tuple[Figure, list[Axes]]:
     figure = Figure(figsize=(10, height), layout="constrained")
-    return figure, list(figure.subplots(rows, columns, squeeze=False, **options).flat)
+    return figure, list(figure.subplots(1, columns, squeeze=False, **options).flat)
 
 
 def _label(label: str, seeds: int = 1) -> str:
@@ -243,36 +161,28 @@ def style_of(i: int) -> tuple[str, Any, str]:
     return COLORS[i % len(COLORS)], LINES[turn], HATCHES[turn]
 
 
-def draw_curve(
-    ax: Axes, curve: Curve, i: int, label: str, seeds: int, *, marker: str = "", width: float = 1.6
-) -> None:
+def draw_curve(ax: Axes, curve: Curve, i: int, label: str, seeds: int, *, marker: str = "") -> None:
     """Draw the line of some seeds and its band in the style number `i`."""
     color, line, _ = style_of(i)
     text = _label(label, seeds)
-    ax.plot(curve.x, curve.y, linestyle=line, color=color, lw=width, marker=marker, ms=4, label=text)
+    ax.plot(curve.x, curve.y, linestyle=line, color=color, lw=1.6, marker=marker, ms=4, label=text)
     ax.fill_between(curve.x, curve.low, curve.high, color=color, alpha=0.18, lw=0)
 
 
-def style_axes(ax: Axes, xlabel: str, *, grid: bool = True) -> None:
+def style_axes(ax: Axes, xlabel: str) -> None:
     """Give axes the look of all figures."""
     ax.set_xlabel(xlabel)
     ax.spines[["top", "right"]].set_visible(False)
     ax.tick_params(labelsize=8, colors=INK)
     ax.xaxis.set_major_formatter(FuncFormatter(_thousands))
-    if grid:
-        ax.grid(color=GRID, lw=0.8)
-        ax.set_axisbelow(True)
+    ax.grid(color=GRID, lw=0.8)
+    ax.set_axisbelow(True)
 
 
 def _thousands(x: float, _: Any) -> str:
     if abs(x) >= 1e6:
         return f"{x / 1e6:g}M"
     return f"{x / 1e3:g}k" if abs(x) >= 1e4 else f"{x:g}"
-
-
-def _remove(axes: Sequence[Axes]) -> None:
-    for ax in axes:
-        ax.remove()
 
 
 def _finished(figure: Figure) -> Figure | None:

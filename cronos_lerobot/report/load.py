@@ -5,7 +5,6 @@ What cannot be read is left out and said. All numbers are checked here, so that 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,17 +12,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from lerobot_env_cronos.config import DEFAULT_SCENE
-from lerobot_env_cronos.scene.scenes import get_scene
 
-from cronos_lerobot.evaluation.eval_info import EVAL_INFO
-from cronos_lerobot.evaluation.results import find_results, find_videos, read_results, videos_below
-from cronos_lerobot.evaluation.suites import SUITES
+from cronos_lerobot.evaluation.results import find_results, find_videos, read_results
 from cronos_lerobot.report.runs import TrainingRun, group_runs, read_training_run
-from cronos_lerobot.statistics import cluster_interval
 from cronos_lerobot.training.run_folder import METRICS
 
-TRAIN, CRONOS_EVAL, LEROBOT_EVAL = "cronos-train", "cronos-eval", "lerobot-eval"
+TRAIN, CRONOS_EVAL = "cronos-train", "cronos-eval"
 """Values of the column `source`."""
 SETTING = (
     "scene", "environment", "benchmark", "advance", "end_effector_reset", "temperature", "obs_type", "renderer",
@@ -33,8 +27,8 @@ SETTING = (
 IDENTITY = ["experiment", "row", "seed", "run", "folder"]
 EVALUATIONS = [
     *IDENTITY, "source", "steps", "interventions", "split", "suite", "n", "success", "ci95_low", "ci95_high",
-    "found_complete", "never_grasped", "policy", "fingerprint", "path", "trained_in", "is_alike",
-    "is_budget_spent", "parts", "episodes", "setting",
+    "found_complete", "never_grasped", "policy", "fingerprint", "path", "trained_in", "is_budget_spent",
+    "parts", "episodes", "setting",
 ]  # fmt: skip
 UPDATES = [
     *IDENTITY, "steps", "interventions", "updates", "steps_per_s", "success", "segments", "reward_per_segment",
@@ -81,16 +75,15 @@ class Loaded:
 
 
 def load_evaluations(folders: Iterable[Path]) -> pd.DataFrame:
-    """Read the evaluations by cronos-train, cronos-eval and lerobot-eval in folders and below them, see `load`.
+    """Read the evaluations by cronos-train and cronos-eval in folders and below them, see `load`.
 
     Returns:
         One row per evaluation:
         source; experiment (job name of the run); row (what tells it from other runs, or the policy); seed; run and
         folder; steps and interventions of the training; split; suite; n; success, ci95_low and ci95_high;
         found_complete and never_grasped; policy; fingerprint; path; trained_in (folder of the run that made the
-        policy); is_alike (made like the last one of the run) and is_budget_spent, of cronos-train alone; parts
-        (cells by task, position or segment); episodes ((n, 4) int: seed, number, configuration, length); setting
-        (see `SETTING`).
+        policy); is_budget_spent, of cronos-train alone; parts (cells by task, position or segment); episodes
+        ((n, 4) int: seed, number, configuration, length); setting (see `SETTING`).
     """
     return load(folders).evaluations
 
@@ -105,18 +98,14 @@ def load_metrics(folders: Iterable[Path]) -> pd.DataFrame:
     return load(folders).updates
 
 
-def load(folders: Iterable[Path], scene: str | None = None) -> Loaded:
+def load(folders: Iterable[Path]) -> Loaded:
     """Read all runs and evaluations in some folders and below them, each once.
-
-    Args:
-        folders: where to look.
-        scene: of lerobot-eval's folders, which number the tasks; None for the scene of the runs, or kitchen_2x2.
 
     Raises:
         FileNotFoundError: a folder is missing or holds no run and no evaluation.
         ValueError: nothing can be read.
     """
-    metrics, results, infos = _find(folders)
+    metrics, results = _find(folders)
     left_out: list[str] = []
     read = _read_each(metrics, lambda path: tables_of(read_training_run(path.parent)), left_out)
     by_folder = {one.runs[0].folder: one for one in read}
@@ -128,11 +117,7 @@ def load(folders: Iterable[Path], scene: str | None = None) -> Loaded:
             loaded.append(one)
     runs = [one.runs[0] for one in loaded]
     left_out += [text for run in runs for text in _said_of(run)]
-    scenes = {run.config["env"].get("scene") for run in runs} - {None}
-    scene = scene or (str(scenes.pop()) if len(scenes) == 1 else DEFAULT_SCENE)
-    tasks = [task.instruction for task in get_scene(scene).tasks]
     loaded += _read_each(results, _read_results, left_out)
-    loaded += _read_each(infos, lambda path: _read_eval_info(path, tasks), left_out)
     if not loaded:
         raise ValueError("; ".join(left_out))
     whole = Loaded(runs, videos=[video for one in loaded for video in one.videos], left_out=left_out)
@@ -145,22 +130,19 @@ def load(folders: Iterable[Path], scene: str | None = None) -> Loaded:
     return whole
 
 
-def _find(folders: Iterable[Path]) -> tuple[list[Path], list[Path], list[Path]]:
-    """The files of cronos-train, cronos-eval and lerobot-eval."""
-    found: tuple[dict[Path, None], dict[Path, None], dict[Path, None]] = ({}, {}, {})
+def _find(folders: Iterable[Path]) -> tuple[list[Path], list[Path]]:
+    """The files of cronos-train and of cronos-eval."""
+    metrics: dict[Path, None] = {}
+    results: dict[Path, None] = {}
     for folder in folders:
-        results = [path.resolve() for path in find_results(folder)]
-        metrics, infos = ([path.resolve() for path in sorted(folder.rglob(name))] for name in (METRICS, EVAL_INFO))
-        # cronos-eval writes one beside its results.
-        infos = [path for path in infos if not any(path.parent in result.parents for result in results)]
-        if not metrics and not results and not infos:
+        of_runs, of_evaluations = sorted(folder.rglob(METRICS)), find_results(folder)
+        if not of_runs and not of_evaluations:
             raise FileNotFoundError(
-                f"{folder} has no {METRICS} of cronos-train, no results.json of cronos-eval and no {EVAL_INFO} of "
-                "lerobot-eval"
+                f"{folder} has no {METRICS} of cronos-train and no results.json of cronos-eval"
             )
-        for files, more in zip(found, (metrics, results, infos), strict=True):
-            files.update(dict.fromkeys(more))
-    return list(found[0]), list(found[1]), list(found[2])
+        metrics |= dict.fromkeys(path.resolve() for path in of_runs)
+        results |= dict.fromkeys(path.resolve() for path in of_evaluations)
+    return list(metrics), list(results)
 
 
 def _read_each[T](paths: Sequence[Path], read: Callable[[Path], T], left_out: list[str]) -> list[T]:
@@ -215,12 +197,12 @@ def _evaluation_cells(run: TrainingRun) -> Iterator[Cells]:
     setting = dict.fromkeys(SETTING) | {name: env.get(name) for name in ("scene", "obs_type", "renderer")}
     setting |= {name: start.get(name) for name in ("environment", "versions")}
     setting["benchmark"] = (start.get("benchmark") or {}).get("fingerprint")
-    alike, budget = run.alike, run.config["protocol"].get("reset_budget")
+    budget = run.config["protocol"].get("reset_budget")
     for one in run.evaluations:
         steps, interventions = one["interaction_steps"], one["interventions"]
         cells = {"source": TRAIN, "steps": steps, "interventions": interventions, "split": str(one["split"])}
         cells |= {"suite": "independent", "policy": run.name, "fingerprint": f"{run.folder} {steps}"}
-        cells |= {"path": str(run.folder / METRICS), "trained_in": str(run.folder), "is_alike": one in alike}
+        cells |= {"path": str(run.folder / METRICS), "trained_in": str(run.folder)}
         cells |= {"is_budget_spent": budget is not None and interventions >= budget}
         cells |= {"parts": [{"part": str(task)} | _rate(rate) for task, rate in one["per_task"].items()]}
         cells |= {"episodes": np.array(one["episodes"], int).reshape(-1, 4)}
@@ -274,15 +256,8 @@ def _rate(found: Cells) -> Cells:
 
 
 def _said_of(run: TrainingRun) -> Iterator[str]:
-    """Which evaluations of a run are not on its curve, and what that means."""
-    if not run.evaluations:
-        return
-    if others := len(run.evaluations) - len(run.alike):
-        yield (
-            f"{others} of {len(run.evaluations)} evaluations of {run.folder}: split, temperature or number of "
-            "episodes differ from the last one"
-        )
-    if first := run.alike[0]["interaction_steps"]:
+    """What the evaluations of a run do not say."""
+    if run.evaluations and (first := run.evaluations[0]["interaction_steps"]):
         yield f"success before, D and C of {run.folder}: the first evaluation is after {first:,} steps"
 
 
@@ -320,45 +295,6 @@ def _parts(results: Cells) -> Iterator[Cells]:
             yield cells | {"std": length["std"]} | dict.fromkeys(APART, 0)
     for k, segment in enumerate(results.get("by_segment", ())):
         yield {"part": f"segment {k + 1}"} | _rate(segment)
-
-
-def _read_eval_info(path: Path, tasks: Sequence[str]) -> Loaded:
-    groups: dict[str, list[tuple[int, list[bool]]]] = {}
-    for entry in json.loads(path.read_text())["per_task"]:
-        flags = [bool(flag) for flag in entry["metrics"]["successes"]]
-        groups.setdefault(entry["task_group"], []).append((int(entry["task_id"]), flags))
-    rows, videos = [], []
-    for group, entries in groups.items():
-        suite, _, split = group.partition("_")
-        if suite not in SUITES:
-            raise ValueError(f"{path} is of another environment: its task group is {group!r:.50}")
-        names = tasks if suite == "independent" else ()
-        titles = [names[i] if i < len(names) else f"{suite} {i}" for i, _ in entries]
-        # Episode i of every task has the same seed, which is unknown.
-        episodes = [(0, number, i, int(flag)) for number, flags in entries for i, flag in enumerate(flags)]
-        table = np.array(episodes, int).reshape(-1, 4)
-        cells: dict[str, Any] = {"source": LEROBOT_EVAL, "split": split, "suite": suite}
-        cells |= _flags_rate(table[:, 3], table[:, 2]) | {"fingerprint": str(path), "path": str(path)}
-        cells |= {
-            "policy": path.parent.name,
-            "episodes": table,
-            "setting": dict.fromkeys(SETTING),
-            "trained_in": "",
-            "steps": np.nan,
-        }
-        parts = [{"part": title} | _flags_rate(flags) for title, (_, flags) in zip(titles, entries, strict=True)]
-        rows.append(cells | {"parts": parts})
-        for title, (number, flags) in zip(titles, entries, strict=True):
-            for i, video in enumerate(videos_below(path.parent, f"videos/{suite}_{split}_{number}/*.mp4")):
-                outcome = f": {'success' if flags[i] else 'failure'}" if i < len(flags) else ""
-                videos.append(Video(video, title, f"{path.parent.name}, {group}, episode {i}{outcome}"))
-    return Loaded(evaluations=pd.DataFrame(rows), videos=videos)
-
-
-def _flags_rate(flags: Sequence[bool] | np.ndarray, clusters: np.ndarray | None = None) -> Cells:
-    success = np.array(flags, bool)
-    interval = cluster_interval(success, np.arange(len(success)) if clusters is None else clusters)
-    return _rate({"n": len(success), "success": success.mean(), "ci95": interval})
 
 
 def policy_name(policy: str) -> str:

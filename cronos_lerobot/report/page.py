@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from cronos_lerobot.film.sheets import to_png
 from cronos_lerobot.report import figures, tables
-from cronos_lerobot.report.load import CRONOS_EVAL, LEROBOT_EVAL, TRAIN, Loaded, Video
+from cronos_lerobot.report.load import CRONOS_EVAL, TRAIN, Loaded, Video
 
 PAGE = "index.html"
 DPI = 150
@@ -41,16 +41,11 @@ CAPTIONS = {
         "How success decays between scene resets",
         "Training segments by their number since the stream's last scene reset, in the last quarter of the run.",
     ),
-    "segment_history": (
-        "The same, over the run",
-        "Bright is success. Rows further up are longer without a reset; time runs to the right.",
-    ),
-    "agent": ("Agent's diagnostics", "One point for each policy update."),
     "sequential": ("Sequential suite", "Share of chains whose first k tasks all succeeded, with 95 % intervals."),
     "stream": ("Stream suite", "Success by segment of a stream that is never reset, with 95 % intervals."),
 }
 """Title and caption of each figure."""
-SHOWN = ("gains", "seeds", "independent", "stream", "lerobot_eval", "interventions", "speed")
+SHOWN = ("gains", "seeds", "independent", "stream", "interventions")
 NAMES = (*SHOWN, "sequential", "evaluations", "updates", "segments")
 """Of the tables: those that the page shows, and all that have a CSV file."""
 
@@ -88,25 +83,22 @@ def make_tables(report: Report) -> dict[str, pd.DataFrame]:
     """All tables of a report by name, without the empty ones."""
     loaded = report.loaded
     own = loaded.evaluations
-    measured = pd.concat([one.evaluations for one in report.folders if len(one.evaluations)] or [own])
 
     def of(suite: str, **options: bool) -> pd.DataFrame:
         some = own[(own["source"] == CRONOS_EVAL) & (own["suite"] == suite)]
         return tables.part_table(some, ["policy", "split"], **options)
 
-    trained, lerobot = own[own["source"] == TRAIN], measured[measured["source"] == LEROBOT_EVAL]
+    trained = own[own["source"] == TRAIN]
     made = {
         "gains": report.gains,
         "seeds": tables.seed_table(own),
         "independent": of("independent"),
         "sequential": of("sequential", with_all=False),
         "stream": of("stream"),
-        "lerobot_eval": tables.part_table(lerobot, ["policy", "suite", "split"]),
         "evaluations": tables.part_table(trained, ["row", "run", "seed", "steps", "interventions", "split"]),
         "updates": loaded.updates,
         "segments": loaded.segments,
         "interventions": loaded.interventions,
-        "speed": tables.speed_table(loaded.updates),
     }
     return {name: table for name, table in made.items() if len(table)}
 
@@ -117,8 +109,6 @@ def draw_figures(loaded: Loaded) -> dict[str, Figure]:
         "evaluation": figures.evaluation_figure(loaded.evaluations),
         "training": figures.training_figure(loaded.updates),
         "segments": figures.segments_figure(loaded.segments),
-        "segment_history": figures.segment_history_figure(loaded.segments),
-        "agent": figures.agent_figure(loaded.updates),
     }
     drawn |= {suite: figures.part_figure(loaded.evaluations, suite) for suite in ("sequential", "stream")}
     return {name: figure for name, figure in drawn.items() if figure is not None}

@@ -68,23 +68,6 @@ class TrainingRun:
         """The latest record, for its counters."""
         return max([*self.updates, *self.evaluations, *self.ends], key=lambda record: record["interaction_steps"])
 
-    @property
-    def changed(self) -> dict[str, str]:
-        """Flags of the protocol and the agent that a resume changed, with their values in turn."""
-        parts = [{name: start["config"].get(name) for name in ("protocol", "algorithm")} for start in self.starts]
-        values = _settings(parts)
-        several = values.loc[:, values.nunique(dropna=False) > 1]
-        return {str(name): ", then ".join(dict.fromkeys(several[name])) for name in several}
-
-    @property
-    def alike(self) -> list[Record]:
-        """The evaluations with the settings of the last one: a resume may change `--eval.*`."""
-        return [one for one in self.evaluations if _made(one) == _made(self.evaluations[-1])]
-
-
-def _made(evaluation: Record) -> tuple[Any, ...]:
-    return evaluation["split"], evaluation["temperature"], evaluation["n"]
-
 
 def read_training_run(folder: Path) -> TrainingRun:
     """Read a run folder. A line that a kill left unfinished is skipped.
@@ -171,7 +154,7 @@ def _experiment_of(run: TrainingRun) -> dict[str, Any]:
     mine = {name: value for name, value in run.config.items() if name not in NOT_THE_EXPERIMENT}
     if policy := mine.get("policy"):
         mine["policy"] = {name: value for name, value in policy.items() if name not in PUSHED}
-    return mine | {"resumed with": run.changed}
+    return mine
 
 
 def _settings(configs: list[dict[str, Any]]) -> pd.DataFrame:

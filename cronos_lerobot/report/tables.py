@@ -52,8 +52,8 @@ def seed_table(evaluations: pd.DataFrame) -> pd.DataFrame:
 
 
 def training_curves(evaluations: pd.DataFrame) -> dict[str, list[pd.DataFrame]]:
-    """The evaluations of each run that were made like its last one, by row."""
-    own = evaluations[(evaluations["source"] == TRAIN) & evaluations["is_alike"].astype(bool)]
+    """The evaluations of each run, by row."""
+    own = evaluations[evaluations["source"] == TRAIN]
     return {
         str(label): [curve for _, curve in some.groupby("folder", sort=False)]
         for label, some in own.groupby("row", sort=False)
@@ -159,20 +159,6 @@ def chain_table(parts: pd.DataFrame) -> pd.DataFrame:
     table = parts.rename(columns={"std": "success std"})
     table = merged(table).pivot(index=["policy", "split", "orderings", "n"], columns="task", values="success")
     return table.reset_index().rename_axis(columns=None)
-
-
-def speed_table(updates: pd.DataFrame) -> pd.DataFrame:
-    """Steps per second of every run, and the shares of its time, without evaluations and checkpoints."""
-    rows = []
-    shares = [name for name in updates if name.startswith("time/")]
-    for (label, run, seed), some in updates.groupby(["row", "run", "seed"], sort=False, dropna=False):
-        steps = some["steps"].diff().fillna(some["steps"])
-        seconds = steps / some["steps_per_s"]
-        row = {"runs": label, "run": run, "seed": seed, "steps_per_s": steps.sum() / seconds.sum()}
-        row |= {"minutes": seconds.sum() / 60}
-        means = (some[shares].mul(seconds, axis=0)).sum() / seconds.sum()
-        rows.append(row | {f"{name.removeprefix('time/')} share": value for name, value in means.items()})
-    return pd.DataFrame(rows)
 
 
 def rates_by_part(segments: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:

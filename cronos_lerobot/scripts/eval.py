@@ -22,6 +22,9 @@ The environment follows from the policy; --env.scene and the like set it by hand
 
 import logging
 import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import torch
 from draccus.cfgparsing import load_config
@@ -29,15 +32,22 @@ from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import init_logging
-from rich.console import Console
 
 from cronos_lerobot.command_line import parse_command_line
 from cronos_lerobot.evaluation.config import CronosEvalConfig
 from cronos_lerobot.evaluation.policy_source import find_policy, load_policy_config
 from cronos_lerobot.evaluation.runner import Evaluation
-from cronos_lerobot.evaluation.tables import make_tables
+from cronos_lerobot.evaluation.suites import INDEPENDENT, SEQUENTIAL, STREAM
 from cronos_lerobot.film.suites import draw_suite
+from cronos_lerobot.report.load import CRONOS_EVAL, load
+from cronos_lerobot.report.tables import chain_table, merged, part_table
 from cronos_lerobot.scripts.errors import error_line
+
+TITLES = {
+    INDEPENDENT: "Independent: success of single tasks",
+    SEQUENTIAL: "Sequential: chains without a reset, ± standard deviation over the orderings",
+    STREAM: "Stream: tasks in a row, nobody resets",
+}
 
 
 def read_command_line() -> CronosEvalConfig:
@@ -72,10 +82,37 @@ def evaluate(config: CronosEvalConfig) -> None:
         results = evaluation.run()
     except KeyboardInterrupt:
         sys.exit(f"\ninterrupted: the same command with --output_dir={config.output_dir} goes on")
-    console = Console(width=None if sys.stdout.isatty() else 120)
-    for table in make_tables(results):
-        console.print(table)
+    assert config.output_dir is not None
+    print_tables(config.output_dir)
+    for one in results:
+        if one["suite"] == STREAM:
+            print("\n".join(_why_stuck(one)))
     print(f"{config.output_dir}: {sum(one['seconds'] for one in results) / 60:.1f} min")
+
+
+def print_tables(folder: Path) -> None:
+    """Print the report's table of each suite in an output folder."""
+    found = load([folder]).evaluations
+    for suite, some in found[found["source"] == CRONOS_EVAL].groupby("suite", sort=False):
+        parts = part_table(some, ["policy", "split"], with_all=suite != SEQUENTIAL)
+        table = chain_table(parts) if suite == SEQUENTIAL else merged(parts)
+        print(f"{TITLES[str(suite)]} [95 % interval, clustered by configuration]")
+        print(table.drop(columns="policy").to_string(index=False), end="\n\n")
+
+
+def _why_stuck(results: dict[str, Any]) -> Iterator[str]:
+    """How often a policy succeeds in streams by how their segments began, and what streams get stuck on."""
+    if done := results["done"]:
+        yield f"{results['split']}: {done['success']:.3f} without the segments found complete"
+    for start, rate in results["by_start"].items():
+        yield f"  began {_words(start)}: success {rate['success']:.3f}, {rate['share']:.0%} of the segments"
+    yield f"  streams stuck at the end: {results['stuck']['share']:.1%}"
+    for start, count in results["stuck"]["causes"].items():
+        yield f"    {count} whose last segments mostly began {_words(start)}"
+
+
+def _words(start: str) -> str:
+    return start.replace("_", " ")
 
 
 def main() -> None:

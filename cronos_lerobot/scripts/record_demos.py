@@ -30,10 +30,6 @@ from cronos_lerobot.data.origin import DEMONSTRATIONS, flags_of, origin_of
 from cronos_lerobot.data.schema import demonstration_features, describe_observation
 from cronos_lerobot.data.writer import RecordingError, SegmentWriter
 from cronos_lerobot.dataset_metadata import check_path
-from cronos_lerobot.evaluation.actors import load_actor
-from cronos_lerobot.evaluation.config import SuitesConfig
-from cronos_lerobot.evaluation.policy_env import check_observations
-from cronos_lerobot.evaluation.policy_source import files_fingerprint, find_policy, load_policy_config
 from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.ranges import check_ranges, ranged
 from cronos_lerobot.scripts.errors import error_line, stop
@@ -110,22 +106,10 @@ def _open(cfg: RecordDemosConfig) -> tuple[SegmentWriter, DemoCollector]:
     tasks = tasks_of(cfg, scene) if task is None else [task]
     env = CronosVectorEnv(cfg.num_envs, cfg.env.scene, **cfg.env.gym_kwargs)
     check_starts(cfg.start, scene, tasks)
-    # Once: the last checkpoint of a run that goes on is soon another one.
-    source = None if cfg.start.policy is None else find_policy(cfg.start.policy).folder
-    policy = None
-    if source is not None:
-        config = load_policy_config(source, ["--device=cpu"])
-        check_observations(config, cfg.env)
-        policy = load_actor(config, cfg.env, getattr(config, "temperature", SuitesConfig.temperature))
     # Before there is a dataset: whether pictures can be drawn here.
     env.observe(np.arange(1))
-    writer = open_writer(cfg, env, source)
-    if policy is not None:
-        seed = cfg.seed + writer.num_episodes
-        policy.seed(seed)
-        policy.begin(np.arange(cfg.num_envs), [(seed, i) for i in range(cfg.num_envs)])
-    expert = ScriptedExpert(env)
-    return writer, DemoCollector(env, expert, writer, cfg, seed=cfg.seed, tasks=tasks, policy=policy)
+    writer = open_writer(cfg, env)
+    return writer, DemoCollector(env, ScriptedExpert(env), writer, cfg, seed=cfg.seed, tasks=tasks)
 
 
 def _collect(cfg: RecordDemosConfig, writer: SegmentWriter, collector: DemoCollector) -> None:
@@ -144,20 +128,19 @@ def _collect(cfg: RecordDemosConfig, writer: SegmentWriter, collector: DemoColle
     )
 
 
-def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv, source: Path | None) -> SegmentWriter:
+def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv) -> SegmentWriter:
     """A new dataset, or the one that is there if `resume` or `overwrite` says what to do with it.
 
     Args:
         cfg: of the command.
         env: to record in.
-        source: the files of `start.policy`, if there is one.
 
     Raises:
         FileExistsError: the folder exists and neither flag is set.
         FileNotFoundError: there is nothing to resume.
         FolderInUseError: another process writes to it.
-        ValueError: the dataset to resume was recorded in another scene, with other flags or after another policy;
-            or LeRobot could not read what is in a folder of this path.
+        ValueError: the dataset to resume was recorded in another scene or with other flags, or LeRobot could not
+            read what is in a folder of this path.
     """
     root = cfg.dataset.root
     assert root is not None
@@ -179,7 +162,7 @@ def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv, source: Path | Non
         features,
         int(env.metadata["render_fps"]),
         resume=-1 if cfg.resume else None,
-        origin=origin_of(env, DEMONSTRATIONS, flags_of(cfg), files_fingerprint(source) if source else None),
+        origin=origin_of(env, DEMONSTRATIONS, flags_of(cfg)),
         may_differ=MAY_DIFFER,
     )
     if writer.num_episodes > cfg.dataset.num_episodes:

@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from cronos_lerobot.report.page import Report
 
 EPILOG = """\
-DIR is a run folder of cronos-train, an output folder of cronos-eval or lerobot-eval, or any folder above such
-ones. Runs that differ only in the seed are drawn as one line, their mean and standard deviation.
+DIR is a run folder of cronos-train, an output folder of cronos-eval, or any folder above such ones.
+Runs that differ only in the seed are drawn as one line, their mean and standard deviation.
 
 examples:
   one run while it trains, or after it
       cronos-report outputs/train/eer
   episodic against reset-free, three seeds each
       cronos-report outputs/train/episodic_* outputs/train/eer_* --output=report
-  what a training gained, measured by lerobot-eval on both splits, with videos
-      cronos-report outputs/train/eer --before outputs/eval/base_* --after outputs/eval/eer_*
+  what a training gained, measured by cronos-eval, with videos
+      cronos-report outputs/train/eer --before outputs/eval/base --after outputs/eval/eer
   two policies on the same episodes: the difference, its interval and p (cronos-report compare --help)
       cronos-report compare outputs/eval/base outputs/eval/eer
 
@@ -61,10 +61,6 @@ def make_parser() -> argparse.ArgumentParser:
     add_folders("--after", "evaluations of the policy that came out")
     parser.add_argument("--videos", nargs="+", type=Path, metavar="MP4", default=[], help="more videos to show")
     parser.add_argument("--output", type=Path, default=Path("report"), help="folder to write (default: report)")
-    parser.add_argument(
-        "--scene",
-        help="names the tasks of lerobot-eval's folders (default: the scene of the runs, or kitchen_2x2)",
-    )
     parser.add_argument("--title", default="CRONOS report", help="headline of the page")
     return parser
 
@@ -86,20 +82,19 @@ def make_report(
     after: Sequence[Path] = (),
     videos: Sequence[Path] = (),
     title: str = "CRONOS report",
-    scene: str | None = None,
 ) -> Report:
     """Read the folders of a report: the flags of `cronos-report`.
 
     Raises:
         FileNotFoundError: a folder holds no run and no evaluation, or a video is missing.
-        ValueError: nothing in them can be read, or there is no such scene.
+        ValueError: nothing in them can be read.
     """
     from cronos_lerobot.report.load import Loaded, load
     from cronos_lerobot.report.page import Report
 
     if missing := [video for video in videos if not video.is_file()]:
         raise FileNotFoundError(f"no video {missing[0]}")
-    loaded = [load(folders, scene) if folders else Loaded() for folders in (runs, before, after)]
+    loaded = [load(folders) if folders else Loaded() for folders in (runs, before, after)]
     return Report(*loaded, videos, title)
 
 

@@ -24,19 +24,15 @@ examples:
   learn from the whole stream with a stock lerobot-train: a frame counts in full if its action chunk led nearer to
   a grasp or a success, not at all if it undid one, by less than half if it changed nothing
       cronos-streams weights --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams \\
-          --output=outputs/progress.parquet --chunk_size=50
+          --output=outputs/progress.parquet
       lerobot-train --policy.type=smolvla --policy.load_vlm_weights=true --policy.push_to_hub=false \\
           --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams \\
           --sample_weighting.type=rabc --sample_weighting.progress_path=outputs/progress.parquet
-  the same by PPO's advantages, from the recorded rewards and values
-      cronos-streams weights --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams \\
-          --weight_by=advantage --output=outputs/advantage.parquet
 
 `cronos-streams filter --help` has the flags of a command, docs/streams.md explains them.
 """
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,13 +40,12 @@ from typing import Any
 
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot.utils.import_utils import register_third_party_plugins
-from rich.console import Console
 
 from cronos_lerobot.data.file_check import check_dataset
 from cronos_lerobot.data.stream_check import COLUMNS, StreamCheck
 from cronos_lerobot.data.stream_filter import SCHEMAS, SegmentFilter, filter_streams
 from cronos_lerobot.data.stream_statistics import make_tables, statistics
-from cronos_lerobot.data.stream_weights import Weighting, count_weights, write_progress
+from cronos_lerobot.data.stream_weights import GAMMA, write_progress
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.ranges import check_ranges, ranged
 from cronos_lerobot.scripts.subcommands import run_subcommand
@@ -129,7 +124,7 @@ class FilterConfig(CheckConfig):
 
 
 @dataclass
-class WeightsConfig(Weighting):
+class WeightsConfig:
     """Write what `lerobot-train --sample_weighting.type=rabc` weighs frames by.
 
     LeRobot's weight of a frame is 1 if progress grows by more than kappa (0.01) over the action chunk that begins
@@ -141,17 +136,19 @@ class WeightsConfig(Weighting):
     their index."""
     output: Path | None = None
     """The parquet file, for --sample_weighting.progress_path."""
-    chunk_size: int | None = None
-    """Actions in a chunk of the policy that will be trained: prints how many frames get which weight. The file is
-    the same for every policy."""
+    gamma: float = ranged(GAMMA, minimum=0, maximum=1)
+    """Discount per control step, from 0 to 1."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
 
 
 def print_statistics(config: StatisticsConfig) -> None:
     """`cronos-streams statistics`."""
     result = statistics(config.dataset.open(streaming=True))
-    console = Console(width=None if sys.stdout.isatty() else 140)
+    print(f"{result['streams']} streams, {result['segments']} segments, {result['frames']} frames")
     for table in make_tables(result):
-        console.print(table)
+        print(table.to_string(index=False), end="\n\n")
     if config.output is not None:
         with written_whole(config.output) as file:
             json.dump(result, file, indent=2)
@@ -194,13 +191,8 @@ def write_weights(config: WeightsConfig) -> None:
     if config.output is None or config.output.is_dir():
         raise ValueError(f"--output=<file>.parquet must name a file, got {config.output}")
     streams = config.dataset.open(streaming=True)
-    made_with = write_progress(streams, config.output, config)
-    how = ", ".join(f"{name}={value}" for name, value in made_with.items() if name != "dataset")
-    print(f"{config.output}: {streams.meta.total_frames} frames of {streams.meta.total_episodes} segments, {how}")
-    if config.chunk_size is not None:
-        counts = count_weights(config.output, config.chunk_size)
-        text = ", ".join(f"{n} frames {weight}" for weight, n in counts.items())
-        print(f"weights at chunk_size={config.chunk_size}, before each batch is normalised: {text}")
+    write_progress(streams, config.output, config.gamma)
+    print(f"{config.output}: {streams.meta.total_frames} frames of {streams.meta.total_episodes} segments")
 
 
 COMMANDS: dict[str, tuple[type, Callable[[Any], None]]] = {

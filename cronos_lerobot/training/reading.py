@@ -17,17 +17,14 @@ from cronos_lerobot.training.config import AUTO, CronosTrainConfig
 from cronos_lerobot.training.run_folder import describe_environment, last_checkpoint
 
 FIXED = (
-    "seed", "num_envs", "peft", "rename_map", "env", "policy", "record.repo_id", "record.root", "record.streams",
-    "protocol.task_switch_interval", "protocol.learned_reset", "protocol.reward",
-    "algorithm.type", "algorithm.kl_base_coef", "algorithm.temperature", "algorithm.noise_std",
-    "algorithm.noise_level", "algorithm.noise_steps", "algorithm.critic_observation",
+    "seed", "num_envs", "peft", "rename_map", "env", "policy", "record", "protocol", "algorithm", "eval",
 )  # fmt: skip
 """What a resumed run keeps: flags, or groups of them. Every other flag is followed."""
 FREE = (
     "env.num_threads", "policy.device", "policy.pretrained_path", "policy.push_to_hub", "policy.repo_id",
-    "policy.private", "policy.tags", "policy.license",
+    "policy.private", "policy.tags", "policy.license", "record.flush_interval_s", "protocol.reset_budget",
 )  # fmt: skip
-"""Flags of those groups that may change: where a run computes, and where it is pushed to."""
+"""Flags of those groups that may change: where a run computes, where it is pushed to, and when it ends."""
 
 
 def load(path: str | Path, flags: Sequence[str] = ()) -> CronosTrainConfig:

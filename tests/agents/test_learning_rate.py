@@ -2,10 +2,8 @@ import logging
 
 import numpy as np
 import pytest
-from dummies import DummyPolicy
 from ppo_samples import make_ppo, reward_for_up, rollout
 
-from cronos_lerobot.agents.ppo.agent import set_optimizer
 from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.ppo.learning_rate import adapted_lr, target_kl
 
@@ -66,30 +64,3 @@ def test_an_early_stop_lowers_the_lr_below_twice_the_target_too():
     metrics = ppo.update(rollout(ppo, reward_for_up))
     assert metrics["policy_epochs"] == 0.5
     assert ppo.policy_lr == pytest.approx(1e-3 / 1.5)
-
-
-@pytest.mark.parametrize(
-    ("became", "schedule", "expected"),
-    [(8e-4, "kl_update", 5e-4), (8e-4, "fixed", 8e-4), (2e-6, "kl_step", 1e-5), (3e-4, "kl_step", 3e-4)],
-)
-def test_a_loaded_lr_lies_between_the_ends_that_are_given_now(became, schedule, expected):
-    ppo = make_ppo()
-    ppo.lr.value = became
-    now = PPOConfig(policy_lr_min=1e-5, policy_lr_max=5e-4, lr_schedule=schedule)
-    set_optimizer(ppo.optimizer, now, {"policy_lr": 5e-5, "value_lr": 1e-3}, ppo.optimizer_settings)
-    assert ppo.policy_lr == expected
-    assert [group["lr"] for group in ppo.optimizer.param_groups if group["name"] == "value"] == [1e-3]
-
-
-def test_a_loaded_optimizer_keeps_the_policys_own_settings():
-    class Own(DummyPolicy):
-        def rl_parameter_groups(self):
-            policy, value = super().rl_parameter_groups()
-            return [policy | {"weight_decay": 0.25}, value | {"betas": (0.5, 0.75)}]
-
-    ppo = make_ppo(policy=Own(), weight_decay=0.125, beta1=0.625)
-    now = make_ppo(policy=Own(), weight_decay=0.0625, beta2=0.875)
-    now.optimizer.load_state_dict(ppo.optimizer.state_dict())
-    set_optimizer(now.optimizer, now.config, {"policy_lr": 5e-5, "value_lr": 1e-3}, now.optimizer_settings)
-    seen = [(group["weight_decay"], group["betas"]) for group in now.optimizer.param_groups]
-    assert seen == [(0.25, (0.9, 0.875)), (0.0625, (0.5, 0.75))]

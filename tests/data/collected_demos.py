@@ -12,12 +12,10 @@ from cronos_lerobot.data.writer import SegmentWriter
 from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig
 
 
-def collect(env, root, config: DemoConfig, num_episodes=4, *, seed=0, tasks=None, expert=None, policy=None):
+def collect(env, root, config: DemoConfig, num_episodes=4, *, seed=0, tasks=None, expert=None):
     features = demonstration_features(env.single_observation_space, **describe_observation(env))
     with SegmentWriter("me/demos", root, features, 5) as writer:
-        collector = DemoCollector(
-            env, expert or ScriptedExpert(env), writer, config, seed=seed, tasks=tasks, policy=policy
-        )
+        collector = DemoCollector(env, expert or ScriptedExpert(env), writer, config, seed=seed, tasks=tasks)
         collector.collect(num_episodes)
     return LeRobotDataset("me/demos", root=root), collector
 

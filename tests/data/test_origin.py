@@ -11,7 +11,7 @@ from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.config import CronosEnvConfig
 from synthetic_streams import ORIGIN, record
 
-from cronos_lerobot.data.origin import Origin, check_same, flags_of, read_origin, with_changes
+from cronos_lerobot.data.origin import check_same, flags_of, read_origin
 from cronos_lerobot.data.perturbations import NoiseConfig
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.locks import FolderInUseError
@@ -57,23 +57,6 @@ def test_a_dataset_names_no_folder_of_its_makers_policy(tmp_path):
     assert flags_of(config)["pretrained_path"] == "me/on_the_hub"
 
 
-def test_streams_say_with_which_flags_their_run_was_resumed():
-    def origin(**flags):
-        return Origin("streams", "lerobot_env_cronos/kitchen_2x2-v1", "1f", flags={"seed": 1} | flags)
-
-    one, other = {"algorithm.gamma": 0.99, "protocol.curriculum": []}, {"algorithm.gamma": 0.9}
-    begun = with_changes(origin(**one), origin(**one, seed=2), 4)
-    assert begun.resumed == []
-    changed = with_changes(begun, origin(**one | other), 8)
-    assert changed.resumed == [{"episodes": 8, "flags": other}]
-    # On with the same, then back to the first; from a checkpoint before it, as if it had not been.
-    assert with_changes(changed, origin(**one | other), 12) == changed
-    back = with_changes(changed, origin(**one), 16)
-    assert back.resumed[1:] == [{"episodes": 16, "flags": {"algorithm.gamma": 0.99}}]
-    assert back.values("algorithm.gamma", None) == [0.99, 0.9, 0.99]
-    assert with_changes(back, origin(**one), 6).resumed == []
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -94,9 +77,9 @@ def test_demonstrations_are_resumed_as_they_were_begun(demos, changes, message):
 def test_a_dataset_has_one_writer(demos):
     config = command(demos, resume=True, noise=NoiseConfig(share=0.5), seed=7)
     env = CronosVectorEnv(2, obs_type=STATE)
-    with open_writer(config, env, None), pytest.raises(FolderInUseError, match="is being written by process"):
-        open_writer(config, env, None)
-    open_writer(config, env, None).finalize()
+    with open_writer(config, env), pytest.raises(FolderInUseError, match="is being written by process"):
+        open_writer(config, env)
+    open_writer(config, env).finalize()
     env.close()
 
 
@@ -122,8 +105,8 @@ def test_lerobot_does_not_merge_two_versions_or_benchmarks(tmp_path):
 @pytest.mark.parametrize(
     ("origin", "message"),
     [
-        (None, "has the format None, this version reads 2: record it anew"),
-        (replace(ORIGIN, format=1), "has the format 1, this version reads 2: record it anew"),
+        (None, "has the format None, this version reads 3: record it anew"),
+        (replace(ORIGIN, format=2), "has the format 2, this version reads 3: record it anew"),
         (replace(ORIGIN, environment="lerobot_env_cronos/kitchen_2x2-v0"), "kitchen_2x2-v0"),
     ],
     ids=["no mark", "format", "environment"],
@@ -135,7 +118,7 @@ def test_another_format_or_environment_is_refused(tmp_path, origin, message):
 
 
 @pytest.mark.parametrize(
-    "damage", ["{", "[]", '{"format": 2, "environment": "lerobot_env_cronos/kitchen_2x2-v1", "flags": 3}']
+    "damage", ["{", "[]", '{"format": 3, "environment": "lerobot_env_cronos/kitchen_2x2-v1", "flags": 3}']
 )
 def test_a_damaged_file_is_named(tmp_path, damage):
     record(tmp_path / "d", steps=4)

@@ -12,18 +12,11 @@ import pytest
 import torch
 from lerobot.rewards.sarm.rabc import RABCWeights
 from synthetic_streams import ORIGIN, record
-from weighted_streams import CHUNK, DIFFERENCES, GAMMA, PROGRESS, SOFT, WEIGHTS, record_weighted
+from weighted_streams import CHUNK, DIFFERENCES, GAMMA, PROGRESS, WEIGHTS, record_weighted
 
 from cronos_lerobot.data.stream_filter import SegmentFilter, filter_streams
 from cronos_lerobot.data.stream_statistics import statistics
-from cronos_lerobot.data.stream_weights import (
-    COLUMN,
-    Weighting,
-    count_weights,
-    reward_levels,
-    summed_advantages,
-    write_progress,
-)
+from cronos_lerobot.data.stream_weights import COLUMN, reward_levels, write_progress
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.scripts import streams as script
 
@@ -39,7 +32,7 @@ def root(tmp_path_factory) -> Path:
 
 
 def write(root: Path, output: Path, **options) -> pd.DataFrame:
-    write_progress(StreamDataset("me/stream", root, streaming=True), output, Weighting(**options))
+    write_progress(StreamDataset("me/stream", root, streaming=True), output, **options)
     return pd.read_parquet(output)
 
 
@@ -54,16 +47,6 @@ def test_what_was_found_complete_and_taken_away_has_levels():
     assert reward_levels(np.array([-0.5, 0]), never[:2], "difference") is None
 
 
-def test_discounts_of_a_run_that_changed_them_are_asked_for(tmp_path):
-    record_weighted(tmp_path / "streams")
-    streams = StreamDataset("me/stream", tmp_path / "streams", streaming=True)
-    change = {"episodes": 3, "flags": {"algorithm.gamma": 0.9}}
-    streams.origin = replace(streams.origin, flags={"algorithm.gamma": 0.99}, resumed=[change])
-    with pytest.raises(ValueError, match=r"resumed with another gamma, \[0\.99, 0\.9\]: give --gamma"):
-        write_progress(streams, tmp_path / "out.parquet", Weighting(weight_by="advantage"))
-    write_progress(streams, tmp_path / "out.parquet", Weighting(weight_by="advantage", gamma=0.9))
-
-
 def test_progress_of_every_frame(root, tmp_path):
     rows = write(root, tmp_path / "new/progress.parquet", gamma=GAMMA)
     np.testing.assert_array_equal(rows["index"], np.arange(26))
@@ -71,7 +54,7 @@ def test_progress_of_every_frame(root, tmp_path):
     np.testing.assert_array_equal(rows["frame_index"][21:], [0, 1, 2, 0, 1])
     np.testing.assert_allclose(rows[COLUMN], FLAT, atol=1e-7)
     made_with = json.loads(pq.read_metadata(tmp_path / "new/progress.parquet").metadata[b"cronos"])
-    assert made_with == {"dataset": "me/stream", "weight_by": "progress", "gamma": GAMMA}
+    assert made_with == {"dataset": "me/stream", "gamma": GAMMA}
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["progress.parquet"]
 
 
@@ -85,9 +68,6 @@ def test_lerobot_weighs_frames_as_by_hand(root, tmp_path):
     torch.testing.assert_close(weights, expected * 25 / expected.sum(), atol=1e-4, rtol=0)
     assert (stats["num_full_weight"], stats["num_zero_weight"]) == (9, 3)
     assert weighter.get_stats()["delta_mean"] == pytest.approx(np.concatenate(DIFFERENCES).mean(), abs=1e-6)
-    assert count_weights(tmp_path / "p", CHUNK) == {
-        "of weight 1": 9, "of weight 0": 3, f"between, {SOFT:.2f} on average": 14
-    }  # fmt: skip
 
 
 def test_where_the_level_is_paid_at_every_step(tmp_path):
@@ -114,25 +94,6 @@ def test_levels_of_segments_that_cannot_be_told_from_sums_alone():
     assert levels([1, 0], [0, 0]) is None
 
 
-def test_advantages_by_hand():
-    rewards, values = np.array([0, 0.1, 0.9]), np.array([0.2, 0.4, 0.6])
-    # TD errors 0 + 0.5 * 0.4 - 0.2, 0.1 + 0.5 * 0.6 - 0.4, and 0.9 + 0.5 * 0.6 - 0.6 with the last value again.
-    np.testing.assert_allclose(summed_advantages(rewards, values, 0.5, 0), [0, 0, 0.6], atol=1e-6)
-    # Returns 1.2, 0.7 and 0.35 less the values: 0.15, 0.3, 0.6.
-    np.testing.assert_allclose(summed_advantages(rewards, values, 0.5, 1), [0, 0.15, 1.05], atol=1e-6)
-    np.testing.assert_allclose(summed_advantages(rewards[2:], values[2:], 0.5, 1), [0.6], atol=1e-6)
-
-
-def test_advantages_of_a_recording_end_with_each_segment(tmp_path):
-    flags = {"algorithm.gamma": 0.5, "algorithm.gae_lambda": 0.0}
-    record_weighted(tmp_path / "d", value=lambda t: 0.2 + 1e-7 * t, origin=replace(ORIGIN, flags=flags))
-    rows = write(tmp_path / "d", tmp_path / "p", weight_by="advantage")
-    # Every action costs 0.2 - 0.5 * 0.2 = 0.1 of value besides what it is paid: in the first segment -0.1, 0,
-    # -0.1, 0.8, -0.1, -0.1; in the last one -0.2, -0.1.
-    np.testing.assert_allclose(rows[COLUMN][:6], [0, -0.1, -0.1, -0.2, 0.6, 0.4], atol=1e-5)
-    np.testing.assert_allclose(rows[COLUMN][24:], [0, -0.3], atol=1e-5)
-
-
 def test_a_filtered_dataset_has_weights_of_its_own(root, tmp_path):
     source = StreamDataset("me/stream", root, streaming=True)
     filter_streams(
@@ -155,9 +116,7 @@ def test_a_filtered_dataset_has_weights_of_its_own(root, tmp_path):
     [
         ((), "--output"),
         (("--output=.",), "--output"),
-        (("--output=p", "--weight_by=reward"), "--weight_by"),
         (("--output=p", "--gamma=1.5"), "--gamma"),
-        (("--output=p", "--gae_lambda=2"), "--gae_lambda"),
     ],
 )
 def test_wrong_flags(root, tmp_path, monkeypatch, flags, named):
@@ -171,26 +130,17 @@ def test_wrong_flags(root, tmp_path, monkeypatch, flags, named):
 
 def test_the_command(root, tmp_path, monkeypatch, capsys):
     dataset = ["--dataset.repo_id=me/stream", f"--dataset.root={root}", f"--output={tmp_path / 'p'}"]
-    monkeypatch.setattr(sys, "argv", ["cronos-streams", "weights", *dataset, "--gamma=0.5", "--chunk_size=2"])
+    monkeypatch.setattr(sys, "argv", ["cronos-streams", "weights", *dataset, "--gamma=0.5"])
     script.main()
-    out = capsys.readouterr().out
-    assert "26 frames of 6 segments, weight_by=progress, gamma=0.5\n" in out
-    assert "9 frames of weight 1, 3 frames of weight 0, 14 frames between, 0.38 on average" in out
+    assert "26 frames of 6 segments\n" in capsys.readouterr().out
+    np.testing.assert_allclose(pd.read_parquet(tmp_path / "p")[COLUMN], FLAT, atol=1e-7)
 
 
 def test_what_cannot_be_weighed_is_refused(tmp_path):
     record(tmp_path / "d", repo_id="me/stream")
     with pytest.raises(ValueError, match=r"stream 0, step 0: the rewards are not those of --protocol.reward"):
         write(tmp_path / "d", tmp_path / "p")
-    record_weighted(tmp_path / "no_critic", value=lambda t: np.nan)
-    with pytest.raises(ValueError, match=r"cronos.value is not finite in 26 of 26 frames"):
-        write(tmp_path / "no_critic", tmp_path / "p", weight_by="advantage")
-    # Of two actions a decision, whichever of them a segment begins with.
-    record_weighted(tmp_path / "chunks", value=lambda t: t // 2)
-    with pytest.raises(ValueError, match=r"cronos.value is that of the frame before"):
-        write(tmp_path / "chunks", tmp_path / "p", weight_by="advantage")
     assert not (tmp_path / "p").exists()
-    write(tmp_path / "chunks", tmp_path / "p")
 
 
 def test_progress_and_statistics_need_no_critic(root, tmp_path):
@@ -201,5 +151,3 @@ def test_progress_and_statistics_need_no_critic(root, tmp_path):
     assert statistics(streams) == statistics(StreamDataset("me/stream", root, streaming=True))
     rows = write(tmp_path / "d", tmp_path / "p", gamma=GAMMA)
     np.testing.assert_allclose(rows[COLUMN], FLAT, atol=1e-7)
-    with pytest.raises(ValueError, match=r"has no cronos\.value"):
-        write(tmp_path / "d", tmp_path / "q", weight_by="advantage")

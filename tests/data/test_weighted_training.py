@@ -10,7 +10,7 @@ import pytest
 from forked_commands import run_forked
 from weighted_streams import CHUNK, GAMMA, WEIGHTS, record_weighted
 
-from cronos_lerobot.data.stream_weights import Weighting, write_progress
+from cronos_lerobot.data.stream_weights import write_progress
 from cronos_lerobot.data.streams import StreamDataset
 
 TRAIN = """
@@ -50,7 +50,7 @@ def results(tmp_path_factory) -> dict:
     folder = tmp_path_factory.mktemp("weighted")
     record_weighted(folder / "streams")
     streams = StreamDataset("me/stream", folder / "streams", streaming=True)
-    write_progress(streams, folder / "progress.parquet", Weighting(gamma=GAMMA))
+    write_progress(streams, folder / "progress.parquet", GAMMA)
     flags = [
         *("--dataset.repo_id=me/stream", f"--dataset.root={folder / 'streams'}", "--policy.device=cpu"),
         *("--policy.push_to_hub=false", "--num_workers=0", "--batch_size=13", "--steps=2", "--wandb.enable=false"),

@@ -1,7 +1,5 @@
 """A recorded stream whose progress and weights are worked out by hand, with every kind of boundary."""
 
-from collections.abc import Callable
-
 import numpy as np
 from synthetic_segments import FPS, STATE_DIM, images, observation_space
 from synthetic_streams import ORIGIN, make_step
@@ -63,11 +61,10 @@ def record_weighted(
     root,
     *,
     reward="difference",
-    value: Callable[[int], float] = float,
     origin=ORIGIN,
     describes=("log_prob", "value"),
 ) -> None:
-    """Record one stream with pictures; `value` is that of a step, `describes` what the agent knows."""
+    """Record one stream with pictures; `describes` is what the agent knows."""
     features = stream_features(observation_space(environment_state=None), describes=describes)
     writer = SegmentWriter("me/stream", root, features, FPS, origin=origin)
     recorder = StreamRecorder(writer, num_envs=1, segment_length=K)
@@ -87,7 +84,7 @@ def record_weighted(
                 },
                 actions=np.full((1, 7), t / 10, np.float32),
                 log_prob=np.zeros(1),
-                value=np.array([value(t)]),
+                value=np.array([float(t)]),
                 reward=np.array([paid]),
                 success=np.array([levels[k + 1] == 1]),
                 preceded_by=np.array([Intervention.NONE if k else intervention]),

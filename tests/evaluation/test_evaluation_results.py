@@ -19,7 +19,7 @@ from cronos_lerobot.evaluation.results import (
     stream_results,
     success_rate,
 )
-from cronos_lerobot.evaluation.tables import make_tables
+from cronos_lerobot.scripts.eval import print_tables
 from cronos_lerobot.statistics import wilson_interval
 
 ORDERINGS = load_orderings("kitchen_2x2")
@@ -139,8 +139,8 @@ def test_stream_results_by_hand():
 def header(suite, split="train", **changes):
     return {
         "format": FORMAT, "suite": suite, "split": split, "policy": "p", "policy_fingerprint": "f",
-        "scene": "kitchen_2x2", "environment": "lerobot_env_cronos/kitchen_2x2-v1", "benchmark": {},
-        "seconds": 3.0, "advance": "window", "end_effector_reset": False,
+        "scene": "kitchen_2x2", "environment": "lerobot_env_cronos/kitchen_2x2-v1",
+        "benchmark": {"fingerprint": "b"}, "seconds": 3.0, "advance": "window", "end_effector_reset": False,
     } | changes  # fmt: skip
 
 
@@ -151,23 +151,19 @@ def write(folder, suite, split, numbers, episodes, **changes):
     return file
 
 
-def test_tables_have_a_row_for_each_number_and_a_column_for_each_split():
-    some = outcomes({0: [4, 2], 1: [1, 1]}, found=[(0, 0, 1), (0, 1, 1)], never_grasped=[(0, 0, 3)])
-    split = sequential_results(some, ORDERINGS, SCENE)
-    results = [header("sequential") | split, header("sequential", "held_out") | split]
-    results += [header("independent") | independent_results(outcomes({i: [1] for i in range(4)}), TASKS)]
-    results += [header("stream") | stream_results(streams(), cycle=2)]
-    independent, sequential, stream = make_tables(results)
-    # Tasks, all of them, found complete, never grasped; all, seen and unseen orderings of 1 + 5 rows each.
-    assert (independent.row_count, len(independent.columns)) == (4 + 1 + 2, 2)
-    assert (sequential.row_count, len(sequential.columns)) == (3 * 6 + 2, 3)
-    assert "end_effector_reset=false" in str(sequential.title)
-    cells = list(sequential.columns[1].cells)
-    assert (cells[0], cells[1][:15], cells[2][:15]) == ("n=4", "1.000 ± 0.000 [", "0.500 ± 0.707 [")
-    assert cells[-2:] == ["2", "1"]
-    # Four segments, three summaries, a heading, three starts, stuck, two causes.
-    assert stream.row_count == 4 + 3 + 1 + 3 + 1 + 2
-    assert [cell[:5] for cell in stream.columns[1].cells][4:7] == ["0.583", "0.500", "16.7%"]
+def test_tables_are_printed_in_the_tasks_order(tmp_path, capsys):
+    some = outcomes({0: [4, 2], 1: [1, 1]})
+    for split in ("train", "held_out"):
+        write(tmp_path, "sequential", split, sequential_results(some, ORDERINGS, SCENE), some)
+    single = outcomes({i: [1] for i in range(4)})
+    write(tmp_path, "independent", "train", independent_results(single, TASKS), single)
+    write(tmp_path, "stream", "train", stream_results(streams(), cycle=2), streams())
+    print_tables(tmp_path)
+    output = capsys.readouterr().out
+    places = [output.index(text) for text in ("all tasks", *(task.instruction for task in TASKS))]
+    assert places == sorted(places)
+    for text in ("chain length", "0.5 ± 0.71 [", "segment 4"):
+        assert text in output
 
 
 def test_results_are_found_by_their_folders_and_videos_by_theirs(tmp_path):

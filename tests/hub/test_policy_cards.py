@@ -100,18 +100,6 @@ def test_a_checkpoint_in_the_middle_has_what_came_before_it(tmp_path):
         find_checkpoint(run / "checkpoints/0000099")
 
 
-def test_flags_that_a_resume_changed(tmp_path):
-    run = write_run(tmp_path)
-
-    def resume(starts):
-        again = json.loads(json.dumps(starts[0])) | {"interaction_steps": 160 * 8}
-        again["config"]["protocol"]["scene_reset_interval"] = 640
-        starts.append(again)
-
-    edit_starts(run, resume)
-    assert ["--protocol.scene_reset_interval", "1280, then 640"] in rows(dry_run(run, tmp_path / "out"))
-
-
 def test_a_checkpoint_without_its_run_has_a_configuration_and_no_numbers(tmp_path):
     trained = train_config(CronosEnvConfig(**STATE), ImitationConfig())
     trained["record"]["repo_id"], trained["protocol"]["scene_reset_interval"] = "me/stream", None

@@ -144,9 +144,7 @@ def test_a_link_out_of_the_dataset_is_refused(copy, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    "change", [{"filters": [{"filter": 3}]}, {"filters": [7]}, {"resumed": [{"flags": []}]}, {"flags": 3}]
-)
+@pytest.mark.parametrize("change", [{"filters": [{"filter": 3}]}, {"filters": [7]}, {"flags": 3}])
 def test_a_damaged_origin_is_named(copy, tmp_path, change):
     file = copy / "meta/cronos.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | change))

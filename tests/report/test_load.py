@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from synthetic_evaluations import write_evaluation
-from synthetic_runs import INSTRUCTIONS, edit_lines, edit_starts, write_lerobot_eval, write_training_run
+from synthetic_runs import INSTRUCTIONS, edit_lines, edit_starts, write_training_run
 
 from cronos_lerobot.report.load import load, load_evaluations, load_metrics
 from cronos_lerobot.report.runs import describe_protocol
@@ -22,11 +22,10 @@ def test_one_row_per_evaluation(tmp_path):
     run = write_training_run(tmp_path / "runs/eer", seed=7, successes=(2, 3, 5))
     policy = f"{run}/checkpoints/0010240/pretrained_model"
     write_evaluation(tmp_path / "eval", policy, tasks=["11000000", "10000000"])
-    write_lerobot_eval(tmp_path / "lerobot", "independent_held_out", successes=(1, 2, 3, 4))
     # Each once, however often it is named.
     table = load_evaluations([tmp_path, run])
     columns = ["source", "experiment", "row", "seed", "steps", "interventions", "split", "suite", "n", "success"]
-    (*own, cronos, lerobot) = table[columns].itertuples(index=False, name=None)
+    (*own, cronos) = table[columns].itertuples(index=False, name=None)
     head = ("cronos-train", "kitchen", "eer", 7)
     assert own == [
         (*head, 0, 0, "train", "independent", 32, 0.25),
@@ -35,11 +34,10 @@ def test_one_row_per_evaluation(tmp_path):
     ]
     # The checkpoint is that run's: its row, seed and interventions.
     assert cronos == ("cronos-eval", *head[1:], 10240, 32, "held_out", "independent", 16, 3 / 16)
-    assert lerobot[-4:] == ("held_out", "independent", 32, 10 / 32)
     assert table["parts"].iloc[3][0] | {"n": 8, "success": 0.25} == table["parts"].iloc[3][0]
-    assert [part["part"] for part in table["parts"].iloc[4]] == INSTRUCTIONS
-    ends = [table["parts"].iloc[4][3][name] for name in ("ci95_low", "ci95_high")]
-    assert ends == pytest.approx(wilson_interval(4, 8))
+    assert [part["part"] for part in table["parts"].iloc[3]] == INSTRUCTIONS[:2]
+    ends = [table["parts"].iloc[3][0][name] for name in ("ci95_low", "ci95_high")]
+    assert ends == pytest.approx(wilson_interval(2, 8))
     assert table["episodes"].iloc[0].shape == (32, 4)
 
 
@@ -51,12 +49,6 @@ def test_one_row_per_update_without_an_unfinished_last_line(tmp_path):
     assert table["steps"].tolist() == [1280 * i for i in range(1, 9)]
     assert table["agent/loss"].iloc[1:].tolist() == [1 / i for i in range(2, 9)]
     assert np.isnan(table["agent/loss"].iloc[0])
-
-
-def test_an_eval_info_beside_results_of_cronos_eval_is_the_same_evaluation(tmp_path):
-    write_evaluation(tmp_path, "me/a", tasks=["1100"])
-    write_lerobot_eval(tmp_path)
-    assert load_evaluations([tmp_path])["source"].tolist() == ["cronos-eval"]
 
 
 def test_two_evaluations_of_one_policy_are_told_apart_by_their_folders(tmp_path):
@@ -124,28 +116,9 @@ def test_damaged_results_are_left_out_and_said(tmp_path, content):
     assert set(loaded.evaluations["source"]) == {"cronos-train"}
 
 
-@pytest.mark.parametrize("group", ["libero_spatial", 3])
-def test_evaluations_of_another_environment_are_left_out_and_said(tmp_path, group):
-    write_training_run(tmp_path / "whole")
-    other = write_lerobot_eval(tmp_path / "other", "pusht") / "eval_info.json"
-    content = json.loads(other.read_text())
-    content["per_task"][0]["task_group"] = group
-    other.write_text(json.dumps(content))
-    assert [str(other) in text for text in load([tmp_path]).left_out] == [True]
-
-
 def test_a_folder_without_anything_is_an_error(tmp_path):
     with pytest.raises(FileNotFoundError, match="nothing"):
         load([tmp_path / "nothing"])
-
-
-def test_tasks_of_lerobot_eval_are_those_of_the_scene(tmp_path):
-    write_lerobot_eval(tmp_path)
-    (parts,) = load([tmp_path], scene="playroom_2x2").evaluations["parts"]
-    assert len(parts) == 4
-    assert not {part["part"] for part in parts} & set(INSTRUCTIONS)
-    with pytest.raises(ValueError, match="nowhere"):
-        load([tmp_path], scene="nowhere")
 
 
 def test_runs_are_named_by_the_settings_in_which_they_differ(tmp_path):
@@ -188,37 +161,18 @@ def test_of_two_runs_of_one_seed_the_longer_counts(tmp_path):
     assert len(load([tmp_path]).runs) == 3
 
 
-def resume(run, steps, **protocol):
-    def edit(starts):
-        start = json.loads(json.dumps(starts[0])) | {"interaction_steps": steps}
-        start["config"]["protocol"] |= protocol
+def test_a_resumed_run_is_a_seed_of_the_others(tmp_path):
+    for seed in (1, 2):
+        config = {"policy": {"pretrained_path": "base"}}
+        write_training_run(tmp_path / str(seed), seed=seed, interval=320, config=config)
+
+    def resume(starts):
+        start = json.loads(json.dumps(starts[0])) | {"interaction_steps": 2560}
         start["config"]["policy"] = {"pretrained_path": "its own checkpoint"}
         starts.append(start)
 
-    edit_starts(run, edit)
-
-
-def test_a_resumed_run_is_a_seed_of_the_others_unless_its_protocol_changed(tmp_path):
-    for seed in (1, 2, 3):
-        config = {"policy": {"pretrained_path": "base"}}
-        write_training_run(tmp_path / str(seed), seed=seed, interval=320, config=config)
-    resume(tmp_path / "2", 2560)
-    resume(tmp_path / "3", 5120, scene_reset_interval=1280)
-    assert rows_of(tmp_path) == {"T = 320": [1, 2], "T = 1280, scene_reset_interval=320, then 1280": [3]}
-    # The resume is undone: the run went on from an earlier checkpoint with its own settings.
-    resume(tmp_path / "3", 2560)
-    assert rows_of(tmp_path) == {"T = 320": [1, 2, 3]}
-
-
-@pytest.mark.parametrize("settings", [{"split": "held_out"}, {"temperature": 0.0}, {"n": 64}])
-def test_evaluations_made_otherwise_than_the_last_are_not_on_the_curve_and_said(tmp_path, settings):
-    run = write_training_run(tmp_path / "run", successes=(2, 4, 6))
-    edit_lines(run, lambda lines: lines[0].update(settings))
-    loaded = load([run])
-    assert loaded.evaluations["is_alike"].tolist() == [False, True, True]
-    assert len(loaded.left_out) == 2
-    assert "1 of 3 evaluations" in loaded.left_out[0]
-    assert "D and C" in loaded.left_out[1]
+    edit_starts(tmp_path / "2", resume)
+    assert rows_of(tmp_path) == {"T = 320": [1, 2]}
 
 
 @pytest.mark.parametrize(

@@ -7,13 +7,13 @@ import re
 import sys
 
 import pytest
-from synthetic_evaluations import write_evaluation
-from synthetic_runs import INSTRUCTIONS, edit_lines, write_lerobot_eval, write_training_run
+from synthetic_evaluations import AFTER, BEFORE, write_evaluation
+from synthetic_runs import INSTRUCTIONS, edit_lines, write_training_run
 
 from cronos_lerobot.report.page import write_report
 from cronos_lerobot.scripts.report import main, make_report
 
-FIGURES = ("evaluation", "training", "segments", "segment_history", "agent")
+FIGURES = ("evaluation", "training", "segments")
 
 
 def page_of(tmp_path, *folders, **options):
@@ -30,15 +30,15 @@ def report(tmp_path_factory):
     """The folder of a report of a training run and evaluations before and after, and its page."""
     folder = tmp_path_factory.mktemp("inputs")
     write_training_run(folder / "run", successes=(2, 3, 5))
-    write_lerobot_eval(folder / "before", successes=(1, 2, 3, 4), video=b"old video")
-    write_lerobot_eval(folder / "after", successes=(8, 6, 7, 5), video=b"new video")
+    write_evaluation(folder / "before", "me/a", tasks=BEFORE, video=b"old video")
+    write_evaluation(folder / "after", "me/b", tasks=AFTER, video=b"new video")
     sides = {"before": [folder / "before"], "after": [folder / "after"]}
     return folder / "report", page_of(folder, folder / "run", **sides)
 
 
 def test_page_shows_the_inputs_numbers(report):
     _, page = report
-    # lerobot-eval: 10/32 -> 26/32.
+    # 10/32 -> 26/32.
     assert "31.2 &rarr; 81.2 %" in page
     assert "n = 32, 1 seed" in page
     cells = re.findall(r"<td>(.*?)</td>", page)
@@ -52,10 +52,10 @@ def test_page_shows_the_inputs_numbers(report):
 def test_page_is_self_contained(report):
     folder, page = report
     sources = re.findall(r'(?:src|href)="(.*?)"', page)
-    assert len(sources) == 5 + 8
+    assert len(sources) == len(FIGURES) + 2
     assert all(source.startswith("data:") for source in sources)
     videos = [base64.b64decode(s.split(",")[1]) for s in sources if s.startswith("data:video")]
-    assert videos == [b"old video"] * 4 + [b"new video"] * 4
+    assert videos == [b"old video", b"new video"]
     for name in FIGURES:
         content = base64.b64encode((folder / f"{name}.png").read_bytes()).decode()
         assert f"data:image/png;base64,{content}" in page
@@ -64,7 +64,7 @@ def test_page_is_self_contained(report):
 def test_csv_files_hold_every_number(report):
     folder, _ = report
     gains = {(row["suite"], row["task"]): row for row in read_csv(folder / "gains.csv")}
-    overall = gains["independent_train", "all tasks"]
+    overall = gains["independent_held_out", "all tasks"]
     assert (overall["before"], overall["after"], overall["gain"]) == ("0.3125", "0.8125", "0.5")
     assert len(read_csv(folder / "evaluations.csv")) == 3 * 5
     assert {row["seed"] for row in read_csv(folder / "evaluations.csv")} == {"0"}
@@ -89,14 +89,14 @@ def test_suites_of_cronos_eval_have_tables_and_figures(tmp_path):
 
 
 def test_what_another_report_left_is_removed(tmp_path):
-    write_lerobot_eval(tmp_path / "eval")
+    write_evaluation(tmp_path / "eval", "me/a", tasks=BEFORE)
     (tmp_path / "report").mkdir()
     for name in ("gains.csv", "evaluation.png", "mine.txt"):
         (tmp_path / "report" / name).touch()
     page_of(tmp_path, tmp_path / "eval")
     assert {path.name for path in (tmp_path / "report").iterdir()} == {
         "index.html",
-        "lerobot_eval.csv",
+        "independent.csv",
         "mine.txt",
     }
 
@@ -111,15 +111,9 @@ def test_only_videos_below_the_folders_are_embedded(tmp_path):
     (evaluation / "videos").mkdir()
     (evaluation / "videos/own.mp4").write_bytes(b"own video")
     (evaluation / "videos/link.mp4").symlink_to(secret)
-    other = write_lerobot_eval(tmp_path / "lerobot", video=b"own video") / "eval_info.json"
-    content = json.loads(other.read_text())
-    content["per_task"][0]["metrics"]["video_paths"] = ["/etc/passwd", "../../secret.mp4"]
-    content["per_task"][1]["task_id"] = "../.."
-    other.write_text(json.dumps(content))
-    elsewhere = write_lerobot_eval(tmp_path / "linked") / "videos"
-    elsewhere.mkdir()
-    (elsewhere / "independent_train_0").symlink_to(tmp_path)
-    page = page_of(tmp_path, evaluation.parent, tmp_path / "lerobot", tmp_path / "linked")
+    elsewhere = write_evaluation(tmp_path / "linked", "me/b", tasks=["1100"]) / "independent_held_out/videos"
+    elsewhere.symlink_to(tmp_path)
+    page = page_of(tmp_path, evaluation.parent, tmp_path / "linked")
     videos = re.findall(r'src="data:video/mp4;base64,(.*?)"', page)
     assert {base64.b64decode(video) for video in videos} == {b"own video"}
     assert "secret" not in page.replace("/secret.mp4 ", "")
@@ -137,15 +131,15 @@ def test_names_from_files_are_escaped(tmp_path):
 
 def test_large_videos_are_linked(tmp_path, monkeypatch):
     monkeypatch.setattr("cronos_lerobot.report.page.MAX_VIDEO_BYTES", 4)
-    write_lerobot_eval(tmp_path / "eval #1", video=b"large")
+    write_evaluation(tmp_path / "eval #1", "me/a", tasks=BEFORE, video=b"large")
     page = page_of(tmp_path, tmp_path / "eval #1")
     # A browser takes what follows a bare # for a place on the page.
-    assert 'href="../eval%20%231/videos/independent_train_0/eval_episode_0.mp4"' in page
+    assert 'href="../eval%20%231/independent_held_out/videos/own.mp4"' in page
     assert "data:video" not in page
 
 
 def test_more_videos_are_shown(tmp_path):
-    run = write_lerobot_eval(tmp_path / "run")
+    run = write_evaluation(tmp_path / "run", "me/a", tasks=BEFORE)
     (tmp_path / "film.mp4").write_bytes(b"film")
     assert base64.b64encode(b"film").decode() in page_of(tmp_path, run, videos=[tmp_path / "film.mp4"])
     with pytest.raises(FileNotFoundError, match="none"):
@@ -153,7 +147,7 @@ def test_more_videos_are_shown(tmp_path):
 
 
 def test_command_line(tmp_path, monkeypatch, capsys):
-    write_lerobot_eval(tmp_path / "eval")
+    write_evaluation(tmp_path / "eval", "me/a", tasks=BEFORE)
     write_training_run(tmp_path / "damaged")
     (tmp_path / "damaged/metrics.jsonl").write_text("")
     sides = ["--before", str(tmp_path / "eval"), "--after", str(tmp_path / "eval")]

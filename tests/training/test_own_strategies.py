@@ -1,7 +1,6 @@
 """Task orders and reset strategies that remember something of their own: it is in the checkpoint."""
 
 from collections import deque
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -83,10 +82,3 @@ def test_an_agent_that_no_checkpoint_can_hold_is_refused_before_the_run_begins(t
     monkeypatch.setattr(PPOAgent, "state_dict", lambda self: {"last": deque([1.0])})
     with pytest.raises(ValueError, match="PPOAgent"):
         make_trainer(config(tmp_path))
-
-
-def test_a_run_may_go_on_with_others(tmp_path, caplog):
-    train(config(tmp_path, 2 * STEPS_PER_UPDATE, protocol=PROTOCOL))
-    trainer = train(resumed(tmp_path, protocol=replace(PROTOCOL, task_order="heuristic")))
-    assert trainer.loop.n == 4 * STEPS_PER_UPDATE
-    assert "has the state of CountingOrder, which this run does not have" in caplog.text

@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.optim import Optimizer
 
 from cronos_lerobot.agents.adapters.privileged import PrivilegedCritic
 from cronos_lerobot.agents.adapters.registry import Adapter, AdapterOptions, make_trainable
 from cronos_lerobot.agents.base import Columns, decision_steps
 from cronos_lerobot.agents.decisions import DecidingAgent, Decision
-from cronos_lerobot.agents.ppo.config import PPOConfig
 from cronos_lerobot.agents.ppo.ppo import PPO
 from cronos_lerobot.agents.ppo.rollout_buffer import RolloutBuffer
 from cronos_lerobot.agents.processing import observation_columns
@@ -117,7 +115,6 @@ class PPOAgent(DecidingAgent):
         ppo = self.ppo
         return {
             "num_updates": ppo.num_updates,
-            "config": {"policy_lr": ppo.config.policy_lr, "value_lr": ppo.config.value_lr},
             "base_policy": {} if ppo.base_policy is None else ppo.base_policy.parameters,
             "adapter": {} if self._adapter is None else self._adapter.own_parameters(),
             "rollout": join_rollouts(self.buffer.state_dict(), ppo.ranks),
@@ -126,7 +123,6 @@ class PPOAgent(DecidingAgent):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from `state_dict`, with the streams of this process."""
         self.ppo.num_updates = state["num_updates"]
-        set_optimizer(self.ppo.optimizer, self.ppo.config, state["config"], self.ppo.optimizer_settings)
         if self.ppo.base_policy is not None:
             self.ppo.base_policy.load(state["base_policy"])
         if self._adapter is not None:
@@ -180,30 +176,3 @@ def join_rollouts(rollout: dict[str, Any], ranks: Ranks) -> dict[str, Any]:
     numbers = np.array([texts.index(text) for text in rollout["instructions"]])
     rollout = rollout | {"instruction_ids": numbers[rollout["instruction_ids"]]}
     return map_leaves(rollout, np.ndarray, ranks.collect) | {"instructions": texts}
-
-
-def set_optimizer(
-    optimizer: Optimizer, config: PPOConfig, saved: dict[str, float], settings: list[dict[str, Any]]
-) -> None:
-    """Give a loaded optimizer what `config` changes; other learning rates stay as they have become.
-
-    An adaptive one that is beyond the ends that `config` has now goes on from the nearer one.
-
-    Args:
-        optimizer: with groups named `policy` and `value`.
-        config: to go on with.
-        saved: `policy_lr` and `value_lr` of the config that it was saved with.
-        settings: what each group has of the config or of the policy, besides its learning rate.
-
-    Raises:
-        ValueError: a learning rate that it is given is beyond the ends.
-    """
-    if config.policy_lr != saved["policy_lr"]:
-        config.check_start()
-    for group, setting in zip(optimizer.param_groups, settings, strict=True):
-        name = f"{group['name']}_lr"
-        if getattr(config, name) != saved[name]:
-            group["lr"] = getattr(config, name)
-        if group["name"] == "policy" and config.lr_schedule != "fixed":
-            group["lr"] = min(max(group["lr"], config.policy_lr_min), config.policy_lr_max)
-        group |= setting

@@ -103,11 +103,6 @@ class PPO:
         # Without `fused`, a small network's step on a CPU costs as much as a tenth of its backward pass.
         fused = True if processors.device.type == "cpu" else None
         self.optimizer = torch.optim.AdamW(groups, betas=betas, weight_decay=config.weight_decay, fused=fused)
-        of_config = ("betas", "weight_decay")
-        self.optimizer_settings = [
-            {name: group[name] for name in of_config} for group in self.optimizer.param_groups
-        ]
-        """Of each group: the config's, or the policy's own."""
         self.lr = AdaptiveLR(self.optimizer, config)
         self.base_policy = BasePolicy(policy, self._params["policy"]) if config.kl_base_coef else None
 

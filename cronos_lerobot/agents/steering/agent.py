@@ -159,19 +159,10 @@ class SteeringAgent(DecidingAgent):
             "new": self._new * self._ranks.count,
             "sac": self.sac.state_dict(),
             "memory": map_leaves(self.memory.state_dict(), np.ndarray, self._ranks.collect),
-            "gamma": self.gamma,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from `state_dict`, with this process's share of the memory.
-
-        Raises:
-            ValueError: what is remembered was discounted otherwise.
-        """
-        if (gamma := state["gamma"]) != self.gamma:
-            raise ValueError(
-                f"--algorithm.gamma={self.gamma}: the decisions that the run remembers are discounted by {gamma}."
-            )
+        """Go on from `state_dict`, with this process's share of the memory."""
         self.num_steps = state["num_steps"]
         self._new = state["new"] // self._ranks.count
         self.sac.load_state_dict(state["sac"])
