@@ -120,7 +120,8 @@ def train_rate(num_envs: int, scene: str, flags: tuple[str, ...], updates: int) 
             Path(sys.executable).with_name("cronos-train"), "--env.type=cronos", f"--env.scene={scene}",
             "--policy.type=pocketvla", "--policy.device=cpu", "--policy.push_to_hub=false",
             f"--num_envs={num_envs}", f"--steps={(1 + updates) * 160 * num_envs}", "--eval_freq=0",
-            "--save_checkpoint=false", "--tensorboard=false", f"--output_dir={folder}/run", *flags,
+            "--save_checkpoint=false", "--tensorboard=false", "--algorithm.value_warmup_updates=0",
+            f"--output_dir={folder}/run", *flags,
         ]  # fmt: skip
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         lines = [json.loads(line) for line in Path(folder, "run/metrics.jsonl").read_text().splitlines()]

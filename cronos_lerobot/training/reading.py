@@ -23,8 +23,10 @@ FIXED = (
 FREE = (
     "env.num_threads", "policy.device", "policy.pretrained_path", "policy.push_to_hub", "policy.repo_id",
     "policy.private", "policy.tags", "policy.license", "record.flush_interval_s", "protocol.reset_budget",
+    "eval.batch_size",
 )  # fmt: skip
-"""Flags of those groups that may change: where a run computes, where it is pushed to, and when it ends."""
+"""Flags of those groups that may change: where and how much at once a run computes, where it is pushed to, and when
+it ends."""
 
 
 def load(path: str | Path, flags: Sequence[str] = ()) -> CronosTrainConfig:
