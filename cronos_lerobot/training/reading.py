@@ -25,8 +25,8 @@ FREE = (
     "policy.private", "policy.tags", "policy.license", "record.flush_interval_s", "protocol.reset_budget",
     "eval.batch_size",
 )  # fmt: skip
-"""Flags of those groups that may change: where and how much at once a run computes, where it is pushed to, and when
-it ends."""
+"""Flags of those groups that may change: where a run computes and how much at once, where it is pushed to, and
+when it ends."""
 
 
 def load(path: str | Path, flags: Sequence[str] = ()) -> CronosTrainConfig:
