@@ -1,4 +1,4 @@
-"""`cronos-demo`: the whole of CRONOS in one command, in about 15 minutes on two CPU cores.
+"""`cronos-demo`: the whole of CRONOS in one command, in about five minutes on two CPU cores.
 
 The scripted expert demonstrates four tasks in a shared kitchen scene, and a small policy is cloned from it. The
 policy then learns by itself in 64 streams that are hardly ever reset. It is evaluated before and after, on
