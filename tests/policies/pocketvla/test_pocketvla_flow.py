@@ -128,6 +128,8 @@ def test_saved_and_loaded_it_acts_the_same_and_within_its_bounds(tmp_path):
         ({"head": "flow", "chunk_size": 4, "n_action_steps": 5}, "n_action_steps"),
         ({"head": "gaussian", "chunk_size": 4}, "chunk_size"),
         ({"sigma_init": 0.9}, "sigma_init"),
+        # Wider than sigma_min, which is 0.05.
+        ({"num_bins": 39}, "num_bins"),
     ],
 )
 def test_settings_that_do_not_go_together_are_refused(options, flag):

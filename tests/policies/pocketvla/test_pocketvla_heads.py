@@ -57,12 +57,12 @@ def test_bins_have_the_probabilities_of_a_normal_distribution_that_is_cut_off(me
     tokens = torch.arange(256)[:, None]
     got = distribution.log_prob(tokens, temperature).exp().numpy()
     likely = of_bins > 1e-4 * of_bins.max()
-    np.testing.assert_allclose(got[likely], of_bins[likely], rtol=0.08)
-    # Of normal distributions that lie beyond the bins, all but a tail is cut off.
-    tolerance = 2e-3 if abs(mean) < 1 else 0.08
+    # Of a normal distribution that lies beyond the bins, all but a tail is cut off.
+    tolerance = 2e-3 if abs(mean) < 1 else 0.05
+    np.testing.assert_allclose(got[likely], of_bins[likely], rtol=0.03 + tolerance)
     assert got.sum() == pytest.approx(1, abs=tolerance)
     entropy = -(of_bins[of_bins > 0] * np.log(of_bins[of_bins > 0])).sum()
-    assert distribution.entropy(temperature).item() == pytest.approx(entropy, abs=10 * tolerance)
+    assert distribution.entropy(temperature).item() == pytest.approx(entropy, abs=tolerance)
     assert distribution.mode().item() == of_bins.argmax()
 
 

@@ -118,6 +118,17 @@ def test_cloning_teaches_the_encoder_the_poses_alone():
     torch.testing.assert_close(loss, actor_alone + taught.mean(), atol=1e-3, rtol=1e-3)
 
 
+def test_the_mean_picture_is_that_of_cloning_with_or_without_labels():
+    for policy in (PocketVLAPolicy(labelled_config()), PocketVLAPolicy(make_config())):
+        batch = labelled_batch(2)
+        for level in (60, 80):
+            policy.forward(batch | {CAMERA: torch.full((2, 3, 64, 64), level, dtype=torch.uint8)})
+        policy.eval()
+        policy.forward(batch)
+        policy.select_action(batch)
+        torch.testing.assert_close(policy.encoder.mean_picture, torch.full((3, 64, 64), 70.0))
+
+
 def test_padding_teaches_nothing():
     policy = PocketVLAPolicy(labelled_config(dtype="float32")).eval()
     batch = labelled_batch(4)

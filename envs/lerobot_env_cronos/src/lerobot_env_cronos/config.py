@@ -72,7 +72,7 @@ class CronosEnvConfig(EnvConfig):
     """one_hot appends which object and which receptacle is meant to observation.state, for policies that read no
     instructions (ACT, Diffusion); none does not."""
     privileged_state: bool = False
-    """Add observation.environment_state to pixel observations, for an asymmetric critic."""
+    """Add observation.environment_state to pixel observations: labels for cloning, or for an asymmetric critic."""
     observation_height: int = 64
     """Height of the observed image [px]."""
     observation_width: int = 64

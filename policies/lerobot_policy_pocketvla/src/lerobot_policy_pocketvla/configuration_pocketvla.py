@@ -1,5 +1,6 @@
 """Configuration of the PocketVLA policy."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -107,8 +108,6 @@ class PocketVLAConfig(PreTrainedConfig):
 
     optimizer_lr: float = 3e-3
     """Peak learning rate of behaviour cloning."""
-    optimizer_encoder_lr: float = 3e-3
-    """Peak learning rate of the picture encoder."""
     optimizer_sigma_lr: float = 1e-2
     """Peak learning rate of the raw sigmas, which have far to go and see every sample."""
     optimizer_weight_decay: float = 1e-4
@@ -160,6 +159,11 @@ class PocketVLAConfig(PreTrainedConfig):
             raise ValueError(
                 "0 < sigma_min < sigma_init < sigma_max is needed, got "
                 f"{self.sigma_min}, {self.sigma_init}, {self.sigma_max}"
+            )
+        if self.head == "gaussian" and 2 / self.num_bins > self.sigma_min:
+            raise ValueError(
+                f"num_bins={self.num_bins}: bins must not be wider than sigma_min={self.sigma_min}, so at least "
+                f"{math.ceil(2 / self.sigma_min)}"
             )
         for name, least in LEAST.items():
             if not getattr(self, name) >= least:

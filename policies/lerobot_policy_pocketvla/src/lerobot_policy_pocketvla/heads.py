@@ -57,8 +57,8 @@ class NormalBins:
     """Independent normal distributions, cut off at -1 and 1, whose samples fall into bins.
 
     A bin's probability is the density at its centre times its width, so that no number is needed for every bin.
-    Bins are much narrower than sigma: this is right to a thousandth, and to a few hundredths where the mean lies
-    far beyond them. The gripper takes the first or the last bin.
+    Bins are narrower than sigma, so this is right to a few hundredths even where the mean lies beyond them. The
+    gripper takes the first or the last bin.
     """
 
     mean: Tensor
@@ -100,8 +100,8 @@ class NormalBins:
 
     def entropy(self, temperature: float) -> Tensor:
         """See `CategoricalBins`."""
-        scale, inside = self._scale(temperature), self._inside(self._scale(temperature))
-        low, high = self._ends(scale)
+        scale = self._scale(temperature)
+        inside, (low, high) = self._inside(scale), self._ends(scale)
         cut = (low * _density(low) - high * _density(high)) / (2 * inside)
         normal = 0.5 + LOG_SQRT_2PI + scale.log() + inside.log() + cut - math.log(2 / self.num_bins)
         logit = self.gripper_logit / temperature

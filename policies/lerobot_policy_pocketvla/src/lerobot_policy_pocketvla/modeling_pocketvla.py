@@ -173,7 +173,7 @@ class PocketVLAPolicy(PreTrainedPolicy):
         if sigmas:
             groups.append({"params": sigmas, "weight_decay": 0.0, "lr": self.config.optimizer_sigma_lr})
         if self.encoder:
-            groups.append({"params": list(self.encoder.parameters()), "lr": self.config.optimizer_encoder_lr})
+            groups.append({"params": list(self.encoder.parameters())})
         return [group | {"fused": True} for group in groups]
 
     # What an actor-critic trainer needs (structurally; nothing is imported from it).

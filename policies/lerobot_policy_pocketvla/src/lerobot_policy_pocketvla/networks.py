@@ -82,7 +82,8 @@ class FilmMLP(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in sizes)
         self.films = nn.Linear(task_width, depth * 2 * width)
         nn.init.zeros_(self.films.weight)
-        nn.init.zeros_(self.films.bias)
+        with torch.no_grad():
+            self.films.bias.view(depth, 2, width)[:] = torch.tensor([[1.0], [0.0]])
 
     def forward(self, x: Tensor, task: TaskEmbedding) -> Tensor:
         """Map x (B, inputs) under the task to (B, width)."""
@@ -91,8 +92,7 @@ class FilmMLP(nn.Module):
         films = task.spread(self.films(task.unique)).unflatten(-1, (len(self.linears), 2, -1)).unbind(1)
         for layer, (linear, norm, film) in enumerate(zip(self.linears, self.norms, films, strict=True)):
             scale, shift = film.unbind(1)
-            hidden = norm(linear(x))
-            hidden = F.silu(torch.addcmul(hidden + shift, hidden, scale))
+            hidden = F.silu(torch.addcmul(shift, norm(linear(x)), scale))
             x = hidden if layer == 0 else x + hidden
         return x
 

@@ -152,8 +152,7 @@ class PoseEncoder(nn.Module):
 
     def _look(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Maps (B, maps, h, w) and features (B, 64, h, w), float32."""
-        scale = 1.0 if images.dtype == torch.uint8 else 255.0
-        x = (images.float() * scale).sub(self.mean_picture).div_(PICTURE_UNIT)
+        x = _grey_levels(images).sub_(self.mean_picture).div_(PICTURE_UNIT)
         x = x.contiguous(memory_format=torch.channels_last)
         with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=self.use_bfloat16):
             x = F.relu(self.conv1(x))
@@ -205,8 +204,12 @@ class PoseEncoder(nn.Module):
         """Let the mean picture be that of the first batches up to this one."""
         if self.mean_batches < MEAN_BATCHES:
             self.mean_batches += 1
-            scale = 1.0 if images.dtype == torch.uint8 else 255.0
-            self.mean_picture += (images.float().mean(0) * scale - self.mean_picture) / self.mean_batches
+            self.mean_picture += (_grey_levels(images).mean(0) - self.mean_picture) / self.mean_batches
+
+
+def _grey_levels(images: Tensor) -> Tensor:
+    """Images, uint8 or in [0, 1], as new floats in [0, 255]."""
+    return images.float() if images.dtype == torch.uint8 else 255.0 * images.float()
 
 
 def _smooth(error: Tensor) -> Tensor:

@@ -96,23 +96,24 @@ class PocketVLATokenPolicy(PocketVLAPolicy, heads=("gaussian", "categorical")):
         """
         temperature = self.config.temperature if temperature is None else temperature
         with self._full_precision():
-            tokens = self._draw(self.head(self._features(batch)), temperature, generator)
+            tokens = self._draw(self._features(batch), temperature, generator)[0]
         return tokens_to_actions(tokens, self.config.num_bins)
 
-    @staticmethod
     def _draw(
-        distribution: Bins,
+        self,
+        features: Tensor,
         temperature: float,
         generator: torch.Generator | None,
         uniform: Tensor | None = None,
-    ) -> Tensor:
-        """Bins (B, D): the likeliest at temperature 0, else at the quantiles `uniform` or at drawn ones."""
-        mode = distribution.mode()
+    ) -> tuple[Tensor, Bins]:
+        """Bins (B, D) and their distribution: the likeliest at temperature 0, else at the quantiles `uniform`."""
+        distribution: Bins = self.head(features)
         if temperature == 0:
-            return mode
+            return distribution.mode(), distribution
         if uniform is None:
-            uniform = torch.rand(mode.shape, generator=generator, device=mode.device)
-        return distribution.sample(temperature, uniform)
+            shape = (len(features), self.config.action_dim)
+            uniform = torch.rand(shape, generator=generator, device=features.device)
+        return distribution.sample(temperature, uniform), distribution
 
     def predict_action_chunk(self, batch: Batch, **kwargs: Any) -> Tensor:
         """`select_action` as a chunk of one action, (B, 1, D)."""
@@ -147,8 +148,7 @@ class PocketVLATokenPolicy(PocketVLAPolicy, heads=("gaussian", "categorical")):
         """
         with self._full_precision():
             batch = self._with_encoding(batch)
-            distribution: Bins = self.head(self._features(batch))
-            tokens = self._draw(distribution, temperature, generator, uniform)
+            tokens, distribution = self._draw(self._features(batch), temperature, generator, uniform)
             log_prob = (
                 distribution.log_prob(tokens, temperature)
                 if temperature
