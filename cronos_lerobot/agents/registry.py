@@ -58,9 +58,6 @@ class AgentConfig(RLAlgorithmConfig):
     def check_reward(self, reward: str) -> None:
         """Raise a ValueError, if the agent makes no sense of this `--protocol.reward`."""
 
-    def check_start(self) -> None:
-        """Raise a ValueError, if a run cannot begin so; one that is resumed goes on from what it has become."""
-
     @classmethod
     def from_policy_config(cls, policy_cfg: Any) -> Self:
         """Return the defaults: what depends on the policy is asked of it when the agent is made."""

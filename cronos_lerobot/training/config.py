@@ -256,8 +256,6 @@ def check(config: CronosTrainConfig) -> None:
     AGENTS.check(config.algorithm.type)
     assert isinstance(config.algorithm, AgentConfig)
     config.algorithm.check_reward(config.protocol.reward)
-    if not config.checkpoint_path:
-        config.algorithm.check_start()
     _check_configurations(config, load_benchmark(env.benchmark, env.scene))
     config.record.check(config.num_envs, env, config.protocol.task_switch_interval)
 

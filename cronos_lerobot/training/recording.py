@@ -28,14 +28,14 @@ class StreamObserver:
     Args:
         run: whose streams they are.
         state: of `state_dict` in the checkpoint that the run resumes from; None begins the dataset.
-        report: called with the name and the reason when the recording ends early.
+        report: called with the reason when the recording ends early.
 
     Raises:
         ValueError: the recording is of another run, or shorter than the checkpoint left it.
         OSError: it cannot be written, or another process has it.
     """
 
-    def __init__(self, run: Run, state: dict[str, Any] | None, report: Callable[[dict[str, str]], None]) -> None:
+    def __init__(self, run: Run, state: dict[str, Any] | None, report: Callable[[str], None]) -> None:
         record, state = run.config.record, state or {}
         self._recorder: StreamRecorder | None = None
         self._stopped: str = state.get("stopped", "")
@@ -82,5 +82,5 @@ class StreamObserver:
             self._stopped = f"{error}; {self._recorder.writer.num_episodes} segments are safe"
             self._recorder = None
             logging.warning(f"RECORDING STOPPED, the training goes on without it: {self._stopped}")
-            self._report({"recording": STREAMS, "reason": self._stopped})
+            self._report(self._stopped)
             return None

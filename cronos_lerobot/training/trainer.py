@@ -66,7 +66,7 @@ class Trainer:
         self._num_recorded = record.count(self.config.num_envs) if record.repo_id is not None else 0
         # First what may be refused: the logger cuts the metrics to where the checkpoint left them.
         self.recorder = StreamObserver(
-            run, observers.get("recorder"), lambda why: self.logger.log("recording", why)
+            run, observers.get("recorder"), lambda why: self.logger.log("recording", {"reason": why})
         )
         self.logger: RunLogger | SilentLogger = SilentLogger()
         if run.ranks.is_main:

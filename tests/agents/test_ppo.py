@@ -178,6 +178,8 @@ def test_the_values_inputs_are_made_once_an_update():
         (PPOConfig, {"target_kl": None}, "target_kl"),
         (PPOConfig, {"value_lr": math.nan}, "value_lr"),
         (PaperPPOConfig, {"minibatch_size": 0}, "minibatch_size"),
+        (PPOConfig, {"policy_lr": 2e-3}, "policy_lr"),
+        (PPOConfig, {"policy_lr": 1e-7, "lr_schedule": "kl_step"}, "policy_lr"),
         (PPOConfig, {"denoising_discount": 0.5, "noise_steps": 2}, "noise_steps"),
         (SteeringConfig, {"num_target_critics": 9}, "num_target_critics"),
         (ImitationConfig, {"demos_share": 0.5}, "demos_share"),
@@ -186,9 +188,3 @@ def test_the_values_inputs_are_made_once_an_update():
 def test_settings_that_would_learn_something_else_are_refused(config, options, flag):
     with pytest.raises(ValueError, match=rf"--algorithm\.{flag}"):
         config(**options)
-
-
-@pytest.mark.parametrize("options", [{"policy_lr": 2e-3}, {"policy_lr": 1e-7, "lr_schedule": "kl_step"}])
-def test_no_run_begins_with_a_rate_beyond_its_ends(options):
-    with pytest.raises(ValueError, match=r"--algorithm\.policy_lr"):
-        PPOConfig(**options).check_start()

@@ -105,8 +105,8 @@ def test_lerobot_does_not_merge_two_versions_or_benchmarks(tmp_path):
 @pytest.mark.parametrize(
     ("origin", "message"),
     [
-        (None, "has the format None, this version reads 3: record it anew"),
-        (replace(ORIGIN, format=2), "has the format 2, this version reads 3: record it anew"),
+        (None, "format None"),
+        (replace(ORIGIN, format=2), "format 2"),
         (replace(ORIGIN, environment="lerobot_env_cronos/kitchen_2x2-v0"), "kitchen_2x2-v0"),
     ],
     ids=["no mark", "format", "environment"],

@@ -242,14 +242,10 @@ def test_what_cannot_be_is_one_line(tmp_path, monkeypatch):
     assert len(starts(run)) == 1
 
     refused(f"{run} exists", *SMALL, *OBSERVATIONS["state"], f"--output_dir={run}")
-    size = ("--env.observation_height=96", "--env.observation_width=96")
     scratch = (
-        "--env.type=cronos",
-        *size,
-        "--num_envs=2",
-        f"--output_dir={tmp_path / 'new'}",
-        "--policy.device=cpu",
-    )
+        "--env.type=cronos", "--env.observation_height=96", "--env.observation_width=96", "--num_envs=2",
+        f"--output_dir={tmp_path / 'new'}", "--policy.device=cpu",
+    )  # fmt: skip
     refused(
         "--algorithm.type=imitation", *scratch, "--policy.type=vqbet", "--policy.pretrained_backbone_weights=null"
     )

@@ -36,7 +36,7 @@ def test_a_failed_recording_keeps_what_was_flushed_and_is_not_resumed(tmp_path, 
     streams = StreamDataset("me/stream", tmp_path / "run/streams", streaming=True)
     streams.check()
     assert [len(streams.segments_of(i)) for i in range(STREAMS)] == [2] * STREAMS
-    assert [line["recording"] for line in metrics(tmp_path / "run", "recording")] == ["streams"]
+    assert len(metrics(tmp_path / "run", "recording")) == 1
     train(config(tmp_path / "whole", record=RecordConfig()), env=DummyEnv(STREAMS))
     assert_same_weights(tmp_path / "whole", tmp_path / "run")
 

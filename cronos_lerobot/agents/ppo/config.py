@@ -105,9 +105,6 @@ class PPOConfig(AgentConfig):
             )
         if self.target_kl is None and self.lr_schedule != "fixed":
             raise ValueError(f"--algorithm.lr_schedule={self.lr_schedule} needs --algorithm.target_kl.")
-
-    def check_start(self) -> None:
-        """Raise a ValueError if an adaptive learning rate begins beyond its ends, to which it would leap."""
         if self.lr_schedule != "fixed" and not self.policy_lr_min <= self.policy_lr <= self.policy_lr_max:
             raise ValueError(
                 f"--algorithm.policy_lr must be policy_lr_min={self.policy_lr_min} to policy_lr_max="
