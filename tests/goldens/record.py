@@ -35,13 +35,6 @@ import pyarrow.parquet as pq
 import torch
 from safetensors.numpy import load_file
 
-RENAMED: dict[str, str] = {
-    "takeovers": "helped",
-    "takeover": "help",
-    "cronos.intervention": "cronos.event",
-    "cronos.position": "cronos.segments_since_reset",
-}
-"""Columns, metrics and other names that changed on purpose since the goldens were recorded: old to new."""
 GOLDENS, COMMANDS = (Path(__file__).with_name(name) for name in ("goldens.json", "commands.toml"))
 VOLATILE = {
     "time", "steps_per_s", "time_share", "date", "seconds", "commit", "made_by", "versions", "config", "policy",
@@ -89,7 +82,7 @@ def read_dataset(root: Path) -> dict[str, Any]:
 
 def read_interventions(root: Path) -> list[str]:
     """`stream:step:intervention`, those other than none."""
-    names = [RENAMED.get(name, name) for name in ("cronos.stream_id", "cronos.step", "cronos.intervention")]
+    names = ["cronos.stream_id", "cronos.step", "cronos.event"]
     tables = [pq.read_table(path, columns=names) for path in (root / "data").rglob("*.parquet")]
     rows = [row for table in tables for row in zip(*(table[name].to_pylist() for name in names), strict=True)]
     return [":".join(map(str, row)) for row in sorted(rows) if row[2]]
@@ -182,12 +175,6 @@ def make(work: Path, sections: list[str]) -> dict[str, dict[str, Any]]:
     return made
 
 
-def rename(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {RENAMED.get(key, key): rename(item) for key, item in value.items()}
-    return [rename(item) for item in value] if isinstance(value, list) else value
-
-
 def differences(old: Any, new: Any, path: str = "") -> Iterator[str]:
     """Each place where they differ, with both values."""
     pairs = {type(old), type(new)}
@@ -205,7 +192,7 @@ def compare(golden: dict[str, Any], made: dict[str, Any]) -> int:
     """Print what held and what changed; the number of things that changed."""
     changed = 0
     for section, parts in made.items():
-        before = rename(golden.get(section, {}))
+        before = golden.get(section, {})
         for name in [*before, *(name for name in parts if name not in before)]:
             found = list(differences(before.get(name, "nothing"), parts.get(name, "nothing")))
             changed += bool(found)
