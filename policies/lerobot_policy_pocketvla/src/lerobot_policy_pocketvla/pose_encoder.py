@@ -22,6 +22,8 @@ PICTURE_UNIT = 38.0
 """Grey levels that 1 stands for after the mean picture is subtracted."""
 RESIDUAL_M = 0.03
 """Length that 1 stands for in what is added to a body's place on the table [m]."""
+FEATURES = 32
+"""Of each cell of the maps."""
 FREE_MAPS = 8
 """Maps that nobody supervises."""
 HIDDEN_WIDTH = 256
@@ -77,16 +79,16 @@ class PoseEncoder(nn.Module):
         self.use_bfloat16 = bfloat16
         self.num_bodies = len(view.keypoints) if view else 0
         points = sum(len(points) for points in view.keypoints) if view else 0
-        self.conv1 = nn.Conv2d(3, 32, 4, stride=2, padding=1)
-        self.conv2 = nn.Conv2d(32, 64, 3, stride=2, padding=1)
-        self.conv3 = nn.Conv2d(64, 64, 3, padding=1)
+        self.conv1 = nn.Conv2d(3, 16, 4, stride=2, padding=1)
+        self.conv2 = nn.Conv2d(16, FEATURES, 3, stride=2, padding=1)
+        self.conv3 = nn.Conv2d(FEATURES, FEATURES, 3, padding=1)
         for convolution in (self.conv1, self.conv2, self.conv3):
             nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
         self.maps = points + FREE_MAPS
-        self.to_maps = nn.Conv2d(64, self.maps, 1)
+        self.to_maps = nn.Conv2d(FEATURES, self.maps, 1)
         # The features at every body, or, where none is known, at every map.
         self.read_at = self._centres(view) if view else list(range(self.maps))
-        inputs = 2 * self.maps + 64 * len(self.read_at) + state_width
+        inputs = 2 * self.maps + FEATURES * len(self.read_at) + state_width
         self.readout = nn.Sequential(
             nn.Linear(inputs, HIDDEN_WIDTH), nn.SiLU(), nn.Linear(HIDDEN_WIDTH, HIDDEN_WIDTH), nn.SiLU()
         )
@@ -151,7 +153,7 @@ class PoseEncoder(nn.Module):
         return self._described(poses, state), loss, (distance.detach() * RESIDUAL_M).norm(dim=-1)
 
     def _look(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Maps (B, maps, h, w) and features (B, 64, h, w), float32."""
+        """Maps (B, maps, h, w) and features (B, FEATURES, h, w), float32."""
         x = _grey_levels(images).sub_(self.mean_picture).div_(PICTURE_UNIT)
         x = x.contiguous(memory_format=torch.channels_last)
         with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=self.use_bfloat16):
