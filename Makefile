@@ -26,7 +26,7 @@ setup: system $(UV) ## Install the system packages and the locked Python environ
 system: ## Install EGL, software OpenGL, and FFmpeg to read videos
 	@sh .ci/system-packages
 
-demo: setup ## Record, clone, learn with a reset for every fourth task, evaluate, report: 5 minutes on 2 cores
+demo: setup ## Learn with a reset for every fourth task, evaluate before and after, report: 4 minutes on 2 cores
 	$(RUN) cronos-demo
 
 test: setup ## Run the whole test suite, one worker a core

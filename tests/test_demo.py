@@ -21,3 +21,10 @@ def test_each_command_reads_what_an_earlier_one_makes():
         "cronos-eval",
         "cronos-report",
     ]
+
+
+def test_the_quick_demo_begins_with_the_official_base():
+    full, quick = (make_commands(scale, Path("out")) for scale in ("full", "quick"))
+    assert [command.words[0] for command in quick] == [command.words[0] for command in full[2:]]
+    for command in quick[:2]:
+        assert "--policy.path=kitchen_2x2_state" in command.words

@@ -17,9 +17,10 @@ from httpx import HTTPError
 from huggingface_hub import HfApi, snapshot_download
 from huggingface_hub.constants import CONFIG_NAME
 from huggingface_hub.errors import HFValidationError
-from huggingface_hub.utils import validate_repo_id
 from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import LAST_CHECKPOINT_LINK
+
+from cronos_lerobot.bases import official_base, official_bases
 
 FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 """What a policy is loaded from: configs, weights, tokenizers."""
@@ -40,8 +41,8 @@ class PolicySource:
     """A checkpoint as it was when it was looked up."""
 
     name: str
-    """As it was given: a folder, or `<owner>/<repository>[@<revision>]` on the Hub. A run's last checkpoint has
-    the name that it had then."""
+    """As it was given: a folder, an official base, or `<owner>/<repository>[@<revision>]` on the Hub. A run's last
+    checkpoint has the name that it had then."""
     folder: Path
     """Its files; those of the Hub in the cache, all of one commit."""
     revision: str | None = None
@@ -55,6 +56,8 @@ def find_policy(name: str) -> PolicySource:
         ValueError: it is neither a folder with a config.json nor a repository's name.
         OSError: the Hub has no such repository, or cannot be reached.
     """
+    if (official := official_base(name)) != name:
+        return PolicySource(name, Path(official))
     folder = Path(name)
     if folder.is_dir():
         if not (folder / CONFIG_NAME).is_file():
@@ -62,10 +65,11 @@ def find_policy(name: str) -> PolicySource:
         followed = follow_last(folder)
         return PolicySource(name if followed == folder else str(followed), followed)
     repository, _, revision = name.partition("@")
-    try:
-        validate_repo_id(repository)
-    except HFValidationError:
-        raise ValueError(f"{name} is neither a folder nor <owner>/<repository> on the Hub") from None
+    if "/" not in repository:
+        raise ValueError(
+            f"{name} is neither a folder, nor <owner>/<repository> on the Hub, nor an official base: "
+            f"{official_bases()}"
+        )
     snapshot = Path(snapshot_download(repository, revision=revision or None, allow_patterns=list(FILES)))
     return PolicySource(name, snapshot, snapshot.name)
 
@@ -82,15 +86,16 @@ def pin_policy(name: str, given: str | None) -> tuple[str, str | None]:
     """Hold a policy of the Hub at the commit that it is at now, or at the revision that is given.
 
     Args:
-        name: a folder, which has no revision, or `<owner>/<repository>[@<revision>]`.
+        name: a folder or an official base, which have no revision, or `<owner>/<repository>[@<revision>]`.
         given: the revision that `--policy.pretrained_revision` says.
 
     Returns:
-        The name without its revision, and the commit.
+        The folder, or the name without its revision, and the commit.
 
     Raises:
         ValueError: two revisions are given.
     """
+    name = official_base(name)
     if Path(name).is_dir():
         return str(follow_last(Path(name))), None
     repository, _, revision = name.partition("@")
@@ -128,7 +133,10 @@ def load_policy_config(path: str | Path, overrides: list[str], revision: str | N
         why = error.__cause__ or error
         raise ValueError(f"{folder / CONFIG_NAME} is damaged, or --policy.* does not fit it: {why}") from error
     except (OSError, ValueError) as error:
-        nowhere = f"no such folder, and no such policy on the Hub ({type(error).__name__})."
+        nowhere = (
+            f"no such folder, no such policy on the Hub ({type(error).__name__}), and none of the official bases, "
+            f"{official_bases()}."
+        )
         raise ValueError(f"--policy.path={path}: {error if folder.is_dir() else nowhere}") from error
     sys.stderr.write(said.getvalue())
     config.pretrained_path = folder

@@ -7,7 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cronos_lerobot.experiments.definitions import Experiment, Row
+from cronos_lerobot.bases import official_bases
+from cronos_lerobot.experiments.definitions import WIDE, Experiment, Row
 from cronos_lerobot.experiments.pipeline import Command, Pipeline
 from cronos_lerobot.experiments.scales import (
     BASE_FLAGS,
@@ -20,8 +21,6 @@ from cronos_lerobot.experiments.scales import (
 )
 
 POLICY = Path("checkpoints", "last", "pretrained_model")
-PIXEL_FLAGS = ("--algorithm.policy_lr=1e-4",)
-"""Of `cronos-train` with PPO and PocketVLA."""
 
 
 @dataclass(frozen=True)
@@ -72,16 +71,28 @@ class Run:
         return self.options.root / "runs" / self.name
 
     @property
+    def base(self) -> str:
+        """Which base policy it begins with: from pixels `wide`, for an encoder knows only what it has seen."""
+        return WIDE if self.options.obs == "pixels" else self.row.base
+
+    @property
     def base_folder(self) -> Path:
-        """Holds demonstrations and clone of the base policy that it begins with."""
+        """Holds demonstrations and clone of that base policy."""
         options = self.options
         smoke = "_smoke" if options.scale.smoke else ""
-        return options.root / "base" / f"{self.experiment.scene}_{options.obs}_{self.row.base}{smoke}"
+        return options.root / "base" / f"{self.experiment.scene}_{options.obs}_{self.base}{smoke}"
 
     @property
     def base_policy(self) -> str:
         """`--policy.path` of the run."""
-        return self.options.policy_path or str(self.base_folder / "clone" / POLICY)
+        return self.options.policy_path or self.official_base or str(self.base_folder / "clone" / POLICY)
+
+    @property
+    def official_base(self) -> str | None:
+        """The official base policy that it begins with, if there is one."""
+        name = f"{self.experiment.scene}_{self.options.obs}"
+        is_official = self.base == WIDE and not self.options.scale.smoke and name in official_bases()
+        return name if is_official else None
 
 
 def make_runs(experiment: Experiment, rows: Iterable[Row], seeds: Iterable[int], options: Options) -> list[Run]:
@@ -94,7 +105,7 @@ def make_pipelines(runs: Iterable[Run]) -> list[Pipeline]:
     """The pipelines of some runs. Runs of one name are one run, with the evaluations of all."""
     commands: dict[str, dict[Path, Command]] = {}
     for run in runs:
-        base = [] if run.options.policy_path else base_commands(run)
+        base = [] if run.options.policy_path or run.official_base else base_commands(run)
         made = [*base, train_command(run), *evaluation_commands(run)]
         commands.setdefault(run.name, {}).update({command.output: command for command in made})
     return [Pipeline(name, tuple(made.values())) for name, made in commands.items()]
@@ -104,7 +115,7 @@ def base_commands(run: Run) -> list[Command]:
     """Demonstrations of the expert, and their cloning."""
     folder, options, scene = run.base_folder, run.options, run.experiment.scene
     obs_type = OBS_TYPES[options.obs]
-    recipe = base_recipe(options.scale, scene, obs_type, run.row.base)
+    recipe = base_recipe(options.scale, scene, obs_type, run.base)
     demos, clone = folder / "demos", folder / "clone"
     dataset = (f"--dataset.repo_id=local/{folder.name}", f"--dataset.root={demos}")
     record = (
@@ -115,7 +126,7 @@ def base_commands(run: Run) -> list[Command]:
         *dataset,
         f"--dataset.num_episodes={recipe.demos}",
         "--seed=1",
-        *BASE_FLAGS[run.row.base],
+        *BASE_FLAGS[run.base],
         *DIVERSE_FLAGS,
     )
     train = (
@@ -133,10 +144,9 @@ def base_commands(run: Run) -> list[Command]:
         f"--output_dir={clone}",
     )
     if obs_type == PIXELS:
-        # PNG images, and one worker that decodes them. The privileged state teaches encoder and critic.
+        # PNG images, and one worker that decodes them. The privileged state teaches the encoder.
         record += ("--env.privileged_state=true", "--dataset.video=false", "--num_envs=64")
-        train += ("--policy.observation=image", "--policy.critic_observation=environment_state")
-        train += ("--num_workers=1", "--dataloader_multiprocessing_context=fork")
+        train += ("--policy.observation=image", "--num_workers=1", "--dataloader_multiprocessing_context=fork")
     else:
         train += ("--num_workers=0",)
     return [Command(record, demos), Command(train, clone)]
@@ -165,8 +175,6 @@ def train_command(run: Run) -> Command:
         "--resume=auto",
         f"--output_dir={output}",
     ]
-    if options.obs == "pixels" and not options.policy_path:
-        flags += PIXEL_FLAGS
     for more in (run.row.flags, options.extra):
         more = [
             re.sub(r"\{([\d.]+)\}", lambda share: str(int(float(share[1]) * run.steps)), flag) for flag in more
@@ -202,6 +210,7 @@ def _evaluation(run: Run, policy: str, step: int, suites: str, splits: str) -> C
         f"--policy.path={policy}",
         "--env.type=cronos",
         f"--env.scene={run.experiment.scene}",
+        f"--env.obs_type={OBS_TYPES[run.options.obs]}",
         f"--eval.suites=[{suites}]",
         f"--eval.splits=[{splits}]",
         "--eval.videos=0",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from cronos_lerobot.experiments.definitions import LONG, ONE, PAPER, SHORT, WIDE
 
@@ -84,10 +84,8 @@ NUM_TASKS = {"kitchen_2x2": 4, "kitchen_3x3": 9, "playroom_2x2": 4}
 RECIPES = {
     (PAPER, STATE): BaseRecipe(400, 320),
     (ONE, STATE): BaseRecipe(400, 320),
-    (WIDE, STATE): BaseRecipe(1200, 1920),
-    (PAPER, PIXELS): BaseRecipe(3200, 1600),
-    (ONE, PIXELS): BaseRecipe(3200, 1600),
-    (WIDE, PIXELS): BaseRecipe(3200, 2400),
+    (WIDE, STATE): BaseRecipe(1200, 640),
+    (WIDE, PIXELS): BaseRecipe(2400, 1200, batch=128),
 }
 """For the four tasks of `kitchen_2x2`; another scene has as much for each of its tasks."""
 PLAYROOM = BaseRecipe(400, 480)
@@ -101,4 +99,4 @@ def base_recipe(scale: Scale, scene: str, obs_type: str, base: str) -> BaseRecip
     if (scene, obs_type) == ("playroom_2x2", STATE) and base != WIDE:
         return PLAYROOM
     recipe, tasks = RECIPES[base, obs_type], NUM_TASKS.get(scene, 4)
-    return BaseRecipe(recipe.demos * tasks // 4, recipe.clone_steps * tasks // 4)
+    return replace(recipe, demos=recipe.demos * tasks // 4, clone_steps=recipe.clone_steps * tasks // 4)

@@ -11,8 +11,14 @@ from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.utils import flatten_dict
 
+from cronos_lerobot.bases import official_base
 from cronos_lerobot.command_line import parse_command_line
-from cronos_lerobot.evaluation.policy_source import PINNED, follow_last, load_policy_config, pin_policy
+from cronos_lerobot.evaluation.policy_source import (
+    PINNED,
+    follow_last,
+    load_policy_config,
+    pin_policy,
+)
 from cronos_lerobot.training.config import AUTO, CronosTrainConfig
 from cronos_lerobot.training.run_folder import describe_environment, last_checkpoint
 
@@ -117,7 +123,7 @@ def _resumed(checkpoint: Path, arguments: list[str]) -> CronosTrainConfig:
         arguments = parser.filter_arg(flag, arguments)
     config = load(checkpoint / PRETRAINED_MODEL_DIR, arguments)
     began_with = None if config.policy is None else config.policy.pretrained_path
-    if path is not None and follow_last(Path(path.partition("@")[0])) != Path(began_with or ""):
+    if path is not None and follow_last(Path(official_base(path).partition("@")[0])) != Path(began_with or ""):
         raise ValueError(
             f"--policy.path={path}, but the run that is resumed began with {began_with} and keeps it."
         )

@@ -7,7 +7,8 @@ import pytest
 from lerobot.configs import PreTrainedConfig
 from tiny_checkpoints import STATE, save_policy
 
-from cronos_lerobot.evaluation.policy_source import files_fingerprint, find_policy, fingerprint
+from cronos_lerobot.bases import official_bases
+from cronos_lerobot.evaluation.policy_source import files_fingerprint, find_policy, fingerprint, pin_policy
 
 
 @pytest.fixture
@@ -66,3 +67,23 @@ def test_the_last_checkpoint_is_the_one_that_was_last_when_it_was_looked_up(pock
     # Other links are the user's own names.
     (tmp_path / "mine").symlink_to(checkpoints / "000100/pretrained_model")
     assert find_policy(str(tmp_path / "mine")).name == str(tmp_path / "mine")
+
+
+@pytest.mark.parametrize("name", ["kitchen_2x2_state", "kitchen_2x2_pixels"])
+def test_an_official_base_is_found_by_its_name_and_is_what_its_card_says(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert name in official_bases()
+    source = find_policy(name)
+    assert (source.name, pin_policy(name, None)) == (name, (str(source.folder), None))
+    config = PreTrainedConfig.from_pretrained(source.folder)
+    config.pretrained_path = source.folder
+    assert f"Fingerprint: `{fingerprint(config)}`" in (source.folder / "README.md").read_text()
+    # A folder of that name is what it is everywhere else: a folder.
+    (tmp_path / name).mkdir()
+    with pytest.raises(ValueError, match="no checkpoint"):
+        find_policy(name)
+
+
+def test_a_name_that_is_nowhere_is_an_error_that_names_the_official_bases():
+    with pytest.raises(ValueError, match="kitchen_2x2_state"):
+        find_policy("kitchen_5x5_state")

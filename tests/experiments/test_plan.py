@@ -70,6 +70,27 @@ def test_experiments_share_runs_and_base_policies():
     assert len(bases) == 1
 
 
+@pytest.mark.parametrize(
+    ("experiment", "row", "obs", "base"),
+    [
+        ("baselines", "t80_wide", "state", "kitchen_2x2_state"),
+        ("table1", "t80", "pixels", "kitchen_2x2_pixels"),
+    ],
+)
+def test_runs_begin_with_the_official_base_where_there_is_one(experiment, row, obs, base):
+    (pipeline,) = plan(experiment, [row], obs=obs)
+    train, evaluate = pipeline.commands
+    assert flags(train)["--policy.path"] == base
+    assert flags(evaluate)["--env.obs_type"] == flags(train)["--env.obs_type"]
+
+
+def test_from_pixels_every_base_has_seen_the_whole_reach():
+    (pipeline,) = plan("figure7", ["t80"], obs="pixels")
+    record = flags(pipeline.commands[0])
+    # Nine tasks, 600 demonstrations each.
+    assert (record["--dataset.num_episodes"], record["--start.layouts"]) == ("5400", "reach")
+
+
 def test_every_checkpoint_of_a_held_out_curve_is_evaluated():
     (pipeline,) = plan("figure2", ["t1280_eer_cl_hsr"], scale="small")
     evaluated = [int(command.output.name) for command in pipeline.commands[3:]]
