@@ -33,6 +33,8 @@ env.reset(seed=0)
 env.step(np.zeros((2, 7)))
 import cronos_lerobot
 print(cronos_lerobot.__file__)
+from cronos_lerobot.bases import official_bases
+assert official_bases() == ["kitchen_2x2_pixels", "kitchen_2x2_state"]
 for script in entry_points(group="console_scripts"):
     if script.name.startswith("cronos-"):
         print(script.name)
