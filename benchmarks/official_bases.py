@@ -1,6 +1,6 @@
 """Make the official base policies again: the same bits on the same kind of machine.
 
-    python benchmarks/official_bases.py [--output_dir=outputs/bases] [--kinds state pixels]
+    python benchmarks/official_bases.py [--output_dir=outputs/bases]
 
 The scripted expert demonstrates, `lerobot-train` clones, and `cronos-eval` evaluates. The checkpoint goes to
 `cronos_lerobot/bases/<name>`, with a card. What is done already is not done again.
@@ -13,9 +13,8 @@ from pathlib import Path
 
 from cronos_lerobot.bases import OFFICIAL
 from cronos_lerobot.evaluation.policy_source import FILES
-from cronos_lerobot.experiments.definitions import EXPERIMENTS
 from cronos_lerobot.experiments.pipeline import Command, Runner, interrupt_on_signals
-from cronos_lerobot.experiments.plan import POLICY, Options, base_commands, make_runs
+from cronos_lerobot.experiments.plan import POLICY, Options, base_commands, official_run
 from cronos_lerobot.experiments.scales import OBS_TYPES, SCALES
 
 SUITES = ("independent", "sequential")
@@ -45,18 +44,16 @@ def main() -> None:
     """Make them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/bases"), help="demonstrations and clones")
-    parser.add_argument("--kinds", nargs="*", default=list(OBS_TYPES), choices=OBS_TYPES)
     args = parser.parse_args()
     interrupt_on_signals()
-    for kind in args.kinds:
+    for kind in OBS_TYPES:
         make(kind, args.output_dir)
 
 
 def make(kind: str, folder: Path) -> None:
     """Make the base that sees `kind`; what comes in between lies in `folder`."""
-    experiment = EXPERIMENTS["baselines"]
-    (run,) = make_runs(experiment, experiment.rows[:1], [1], Options(SCALES["small"], kind, folder))
-    commands, name = base_commands(run), f"{experiment.scene}_{kind}"
+    run = official_run(Options(SCALES["small"], kind, folder))
+    commands, name = base_commands(run), f"{run.experiment.scene}_{kind}"
     policy, evaluation = commands[-1].output / POLICY, folder / "eval" / name
     flag = f"--env.obs_type={OBS_TYPES[kind]}"
     words = ("cronos-eval", f"--policy.path={policy}", flag, "--eval.videos=0", f"--output_dir={evaluation}")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cronos_lerobot.bases import official_bases
-from cronos_lerobot.experiments.definitions import WIDE, Experiment, Row
+from cronos_lerobot.experiments.definitions import EXPERIMENTS, WIDE, Experiment, Row
 from cronos_lerobot.experiments.pipeline import Command, Pipeline
 from cronos_lerobot.experiments.scales import (
     BASE_FLAGS,
@@ -99,6 +99,12 @@ def make_runs(experiment: Experiment, rows: Iterable[Row], seeds: Iterable[int],
     """The runs of an experiment: one seed of every row first, then the next seed."""
     rows = tuple(rows)
     return [Run(experiment, row, seed, options) for seed in seeds for row in rows]
+
+
+def official_run(options: Options) -> Run:
+    """A run that begins with the base policy that is, or would be, the official one."""
+    experiment = EXPERIMENTS["baselines"]
+    return Run(experiment, experiment.rows[0], 1, options)
 
 
 def make_pipelines(runs: Iterable[Run]) -> list[Pipeline]:

@@ -14,12 +14,10 @@ import time
 from pathlib import Path
 
 from cronos_lerobot.experiments.pipeline import Command, CommandFailedError, Runner, interrupt_on_signals
-from cronos_lerobot.experiments.scales import DIVERSE_FLAGS, WIDE_FLAGS
-
-BASE = "kitchen_2x2_state"
+from cronos_lerobot.experiments.plan import POLICY, Options, base_commands, official_run
+from cronos_lerobot.experiments.scales import SCALES as EXPERIMENT_SCALES
 
 ENV = ("--env.type=cronos", "--env.obs_type=environment_state_agent_pos")
-DATASET = "local/cronos_demos"
 LEARNS = {
     "train": "--num_envs=64 --steps=204800 --eval_freq=102400 --eval.n_episodes=32 --save_freq=102400",
     "evaluate": "",
@@ -27,19 +25,16 @@ LEARNS = {
 }
 SCALES = {
     "quick": LEARNS,
-    "full": LEARNS
-    | {"record": "--dataset.num_episodes=1200", "clone": "--batch_size=256 --steps=640 --save_freq=640"},
+    "full": LEARNS,
     "smoke": {
-        "record": "--dataset.num_episodes=8",
-        "clone": "--batch_size=32 --steps=5 --save_freq=5",
         "train": "--num_envs=4 --steps=640 --protocol.update_interval=80 --eval.n_episodes=1",
         "evaluate": "--eval.n_episodes=1",
         "film": "--env.render_size=[120,160]",
     },
 }
-"""Flags that depend on the scale. One that records clones a base policy of its own."""
-CLONE = "--policy.type=pocketvla --policy.device=cpu --policy.push_to_hub=false"
-CLONE_RUN = "--log_freq=40 --num_workers=0 --wandb.enable=false --seed=1"
+"""Flags that depend on the scale."""
+BASES = {"full": "small", "smoke": "smoke"}
+"""Scales that clone a base policy of their own, and the scale of the experiments whose recipe they follow."""
 RESETS = "--protocol.scene_reset_interval=320 --protocol.reset_phase=staggered --protocol.end_effector_reset=true"
 SINGLE_TASKS = "--eval.suites=[independent] --eval.videos=0"
 ONE_STREAM = "--eval.suites=[stream] --eval.splits=[train] --eval.n_episodes=1 --end_effector_reset=true"
@@ -49,16 +44,12 @@ RECORD = "--record.repo_id=local/cronos_demo_streams --record.streams=1"
 def make_commands(scale: str, folder: Path) -> list[Command]:
     """The commands of the demo; their outputs lie in `folder`."""
     more = {name: flags.split() for name, flags in SCALES[scale].items()}
-    policy = Path("checkpoints/last/pretrained_model")
-    demos, clone, tuned = folder / "demos", folder / "base", folder / "finetune"
+    tuned = folder / "finetune"
     before, after, film = folder / "eval_before", folder / "eval_after", folder / "film"
-    base, making = BASE, []
-    if "record" in more:
-        base = str(clone / policy)
-        dataset = (f"--dataset.repo_id={DATASET}", f"--dataset.root={demos}")
-        record = ("cronos-record-demos", *ENV, *dataset, *more["record"], "--seed=1", *WIDE_FLAGS, *DIVERSE_FLAGS)
-        words = ("lerobot-train", *CLONE.split(), *dataset, *more["clone"], *CLONE_RUN.split())
-        making = [Command(record, demos), Command((*words, f"--output_dir={clone}"), clone)]
+    base, making = "kitchen_2x2_state", []
+    if scale in BASES:
+        making = base_commands(official_run(Options(EXPERIMENT_SCALES[BASES[scale]], "state", folder)))
+        base = str(making[-1].output / POLICY)
     train = ("cronos-train", f"--policy.path={base}", *ENV, "--seed=1", *RESETS.split())
     train += (*RECORD.split(), *more["train"], "--resume=auto")
     report = ("cronos-report", str(tuned), "--before", str(before), "--after", str(after), str(film))
@@ -66,8 +57,8 @@ def make_commands(scale: str, folder: Path) -> list[Command]:
         *making,
         _evaluation(base, before, [*ENV, *SINGLE_TASKS.split(), *more["evaluate"]]),
         Command((*train, f"--output_dir={tuned}"), tuned, resumes=True),
-        _evaluation(str(tuned / policy), after, [*SINGLE_TASKS.split(), *more["evaluate"]]),
-        _evaluation(str(tuned / policy), film, [*ONE_STREAM.split(), *more["film"]]),
+        _evaluation(str(tuned / POLICY), after, [*SINGLE_TASKS.split(), *more["evaluate"]]),
+        _evaluation(str(tuned / POLICY), film, [*ONE_STREAM.split(), *more["film"]]),
         Command((*report, f"--output={folder / 'report'}", "--title=CRONOS demo"), folder / "report"),
     ]
 
