@@ -61,8 +61,8 @@ class Experiment:
     """Numbers of interventions, of a run with the paper's steps, at which success is measured."""
     held_out_curve: bool = False
     """Evaluate every checkpoint on held-out configurations, or the last one alone."""
-    sequential: bool = False
-    """Evaluate the last checkpoint on sequences of tasks."""
+    suites: tuple[str, ...] = ("independent",)
+    """Suites of `cronos-eval` for the last checkpoint."""
     paper: tuple[tuple[float, float], ...] = ()
     """The paper's success at the end of each row: mean and standard deviation over five seeds."""
 
@@ -149,7 +149,7 @@ for _experiment in (
         "Figure 3, Section 6.5; by task: Figure 11",
         steps=LONG,
         budgets=(1000, 2000, 4000, 8000),
-        sequential=True,
+        suites=("independent", "sequential"),
     ),
     Experiment(
         "figure4",
@@ -168,7 +168,7 @@ for _experiment in (
         "Robustness to OOD task sequences",
         (EPISODIC, PERIODIC),
         "Figure 5, Section 6.6",
-        sequential=True,
+        suites=("independent", "sequential"),
     ),
     Experiment(
         "figure7",
@@ -189,16 +189,15 @@ for _experiment in (
     ),
     Experiment(
         "baselines",
-        "What a method with few resets must beat",
+        "The benchmark's baselines, from the official base policy",
         (
-            _row("t80_wide", 80, eer=False, base=WIDE),
-            _row("t1280_wide", 1280, eer=False, base=WIDE),
-            _row("t1280_eer_wide", 1280, base=WIDE),
-            _row("t1280_eer_cl_hsr_wide", 1280, CL, HSR, base=WIDE),
-            _row("few_resets_wide", 4400, *FEW_RESETS, base=WIDE),
+            _row("t80", 80, eer=False, base=WIDE),
+            _row("t1280", 1280, eer=False, base=WIDE),
+            _row("t1280_eer", 1280, base=WIDE),
+            _row("t1280_eer_cl_hsr", 1280, CL, HSR, base=WIDE),
+            _row("few_resets", 4400, *FEW_RESETS, base=WIDE),
         ),
-        budgets=(1000, 2000, 6000),
-        sequential=True,
+        suites=("independent", "sequential", "stream"),
     ),
 ):
     register_experiment(_experiment)

@@ -31,6 +31,7 @@ def write_outputs(experiment: Experiment, runs: Sequence[Run], folder: Path) -> 
         "": main,
         "Success after so many interventions": tables.budget_table(experiment, found, budgets),
         "Sequences of tasks": tables.sequential_table(experiment, found),
+        "Streams without a reset": tables.stream_table(experiment, found),
     }
     where = f"{experiment.source} of the paper. " if experiment.source else ""
     lines = [f"# {experiment.title}", ""]

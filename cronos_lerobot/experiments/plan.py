@@ -62,8 +62,8 @@ class Run:
     @property
     def name(self) -> str:
         """Its folder below `runs/`, and its pipeline's name."""
-        scene = f"{self.experiment.scene}_{self.options.obs}_{self.options.scale.name}"
-        return f"{scene}/{self.row.name}_{self.steps // 1000}k/seed{self.seed}"
+        group = f"{self.experiment.scene}_{self.options.obs}_{self.base}_{self.options.scale.name}"
+        return f"{group}/{self.row.name}_{self.steps // 1000}k/seed{self.seed}"
 
     @property
     def folder(self) -> Path:
@@ -161,7 +161,6 @@ def base_commands(run: Run) -> list[Command]:
 def train_command(run: Run) -> Command:
     """The training run."""
     options, scale, experiment = run.options, run.options.scale, run.experiment
-    budgets = [scale.scaled(budget, experiment.steps) for budget in experiment.budgets]
     output = run.folder / "train"
     flags = [
         f"--policy.path={run.base_policy}",
@@ -173,7 +172,6 @@ def train_command(run: Run) -> Command:
         f"--num_envs={scale.num_envs}",
         f"--protocol.update_interval={UPDATE_INTERVAL}",
         f"--eval_freq={scale.eval_freq}",
-        f"--eval_at_interventions={[budget for budget in budgets if budget]}",
         f"--save_freq={scale.eval_freq}",
         f"--eval.n_episodes={1 if scale.smoke else 64}",
         *options.thread_flags,
@@ -200,8 +198,9 @@ def evaluation_commands(run: Run) -> list[Command]:
         for step in before:
             policy = train / "checkpoints" / get_step_identifier(step, last) / "pretrained_model"
             commands.append(_evaluation(run, str(policy), step, "independent", "held_out"))
-    suites = ("independent,sequential", "train,held_out") if experiment.sequential else ("independent", "held_out")
-    return [*commands, _evaluation(run, str(train / POLICY), last, *suites)]
+    # The run itself has the independent suite on the training configurations.
+    splits = "held_out" if experiment.suites == ("independent",) else "train,held_out"
+    return [*commands, _evaluation(run, str(train / POLICY), last, ",".join(experiment.suites), splits)]
 
 
 def get_step_identifier(step: int, total_steps: int) -> str:

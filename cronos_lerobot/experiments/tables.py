@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from math import isnan
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from cronos_lerobot.experiments.definitions import Experiment, Row
@@ -103,6 +104,25 @@ def sequential_table(experiment: Experiment, found: pd.DataFrame) -> pd.DataFram
             means = {name: show(summarise([one[name] for one in parts])) for name in parts[0]}
             rows.append(
                 {"row": row.label, "split": split, "seeds": len(parts), "n": int(runs["n"].iloc[0])} | means
+            )
+    return pd.DataFrame(rows)
+
+
+def stream_table(experiment: Experiment, found: pd.DataFrame) -> pd.DataFrame:
+    """Success in streams without a reset, of every row and split, over its finished seeds.
+
+    All segments, the first one, and the second half; n counts streams.
+    """
+    chosen = found[(found["suite"] == "stream") & found["finished"].astype(bool)]
+    rows = []
+    for row in experiment.rows:
+        for split, runs in chosen[chosen["row"] == row.name].groupby("split", sort=False):
+            segments = np.array([[part["success"] for part in parts] for parts in runs["parts"]])
+            shares = {"all": segments, "first segment": segments[:, :1]}
+            shares["second half"] = segments[:, segments.shape[1] // 2 :]
+            means = {name: show(summarise(values.mean(axis=1), (0, 1))) for name, values in shares.items()}
+            rows.append(
+                {"row": row.label, "split": split, "seeds": len(runs), "n": int(runs["n"].iloc[0])} | means
             )
     return pd.DataFrame(rows)
 

@@ -26,7 +26,7 @@ def test_rows_are_means_over_finished_seeds(tmp_path):
         if run.seed < 3:
             (train / ".done").touch()
     page = write_outputs(experiment, runs, tmp_path / "out")
-    assert "Not finished: kitchen_2x2_state_smoke/t1280_eer_cl_hsr_2k/seed3." in page
+    assert "Not finished: kitchen_2x2_state_paper_smoke/t1280_eer_cl_hsr_2k/seed3." in page
     (row,) = pd.read_csv(tmp_path / "out/figure2.csv").to_dict("records")
     assert (row["row"], row["seeds"], row["n"], row["interventions"]) == ("T = 1280, EER, CL, HSR", 2, 32, 32)
     # .25 at the start, .5 after half of the run, .5 and .625 at its end: gaps (.75 / 2 + .5 + .5 / 2) / 2 = .5625
@@ -41,3 +41,17 @@ def test_rows_are_means_over_finished_seeds(tmp_path):
     assert held_out["interventions"].tolist() == [0, 32] * 3
     assert {path.name for path in (tmp_path / "out").glob("*.png")} == {"figure2.png", "figure2_by_task.png"}
     assert pytest.approx([0.25, 0.5]) == held_out["success"].tolist()[:2]
+
+
+def test_streams_are_read_by_segment(tmp_path):
+    experiment = EXPERIMENTS["baselines"]
+    runs = make_runs(experiment, experiment.rows[:1], (1, 2), Options(SCALES["smoke"], "state", tmp_path))
+    for run, streams in zip(runs, (("1100", "1000"), ("1111", "1000")), strict=True):
+        train = write_training_run(run.folder / "train", seed=run.seed, successes=(2, 4, 4))
+        policy = str(train / "checkpoints/0010240/pretrained_model")
+        write_evaluation(run.folder / "eval/0010240", policy, stream=streams)
+        (train / ".done").touch()
+    page = write_outputs(experiment, runs, tmp_path / "out")
+    # 3 and 5 of 8 segments; the first is always done, of the second half 0 and 2 of 4.
+    line = "| T = 80 | held_out | 2 | 2 | 0.500 ± 0.177 | 1.000 ± 0.000 | 0.250 ± 0.354 |"
+    assert line in [" ".join(one.split()) for one in page.splitlines()]

@@ -51,7 +51,6 @@ def test_table1_at_the_papers_scale_is_the_papers_setting():
     # Half of 1.3 M interaction steps, Section 6.3.
     assert given["--protocol.curriculum"] == "[[650000,320]]"
     assert given["--protocol.heuristic_reset"] == "true"
-    assert given["--eval_at_interventions"] == "[1000, 1600, 2000, 6000]"
     assert given["--policy.path"].startswith(str(clone.output))
     assert flags(clone)["--dataset.root"] == str(record.output)
     assert flags(evaluate)["--policy.path"].startswith(str(train.output))
@@ -60,12 +59,15 @@ def test_table1_at_the_papers_scale_is_the_papers_setting():
 def test_a_scale_shortens_steps_and_budgets_alike():
     (pipeline,) = plan("figure3", ["t80"], scale="small")
     # 614,400 of 2.9 M steps; 1000 interventions of the paper's are 211 here.
-    assert flags(pipeline.commands[2])["--eval_at_interventions"] == "[211, 423, 847, 1694]"
+    assert flags(pipeline.commands[2])["--steps"] == "614400"
+    assert SCALES["small"].scaled(1000, EXPERIMENTS["figure3"].steps) == 211
 
 
 def test_experiments_share_runs_and_base_policies():
-    shared = {p.name for p in plan("table1")} & {p.name for p in plan("figure2")}
-    assert shared == {"kitchen_2x2_state_paper/t1280_eer_cl_hsr_1300k/seed1"}
+    (one,) = [p for p in plan("table1") if p.name == "kitchen_2x2_state_paper_paper/t1280_eer_cl_hsr_1300k/seed1"]
+    (other,) = [p for p in plan("figure2") if p.name == one.name]
+    # The same training, or the second experiment could not use the first one's folder.
+    assert one.commands[2] == other.commands[2]
     bases = {pipeline.commands[1].output for pipeline in plan("table1", seeds=(1, 2))}
     assert len(bases) == 1
 
@@ -73,13 +75,14 @@ def test_experiments_share_runs_and_base_policies():
 @pytest.mark.parametrize(
     ("experiment", "row", "obs", "base"),
     [
-        ("baselines", "t80_wide", "state", "kitchen_2x2_state"),
+        ("baselines", "t80", "state", "kitchen_2x2_state"),
         ("table1", "t80", "pixels", "kitchen_2x2_pixels"),
     ],
 )
 def test_runs_begin_with_the_official_base_where_there_is_one(experiment, row, obs, base):
     (pipeline,) = plan(experiment, [row], obs=obs)
     train, evaluate = pipeline.commands
+    assert "_wide_" in pipeline.name
     assert flags(train)["--policy.path"] == base
     assert flags(evaluate)["--env.obs_type"] == flags(train)["--env.obs_type"]
 
