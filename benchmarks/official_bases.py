@@ -77,7 +77,7 @@ def make(kind: str, folder: Path) -> None:
         )
         success = f"{single['success']:.3f} [{', '.join(f'{limit:.3f}' for limit in single['ci95'])}]"
         rows.append(f"| {title} | {success} | {chains['average_chain_length']['mean']:.2f} |")
-        fingerprint = single["policy_fingerprint"]
+        fingerprint = single["policy_files"]
     demos = json.loads((commands[0].output / "meta/info.json").read_text())["total_episodes"]
     table = "\n".join(rows)
     origin = ORIGIN.format(seen=SEEN[kind], demos=demos)

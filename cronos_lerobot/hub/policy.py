@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from cronos_lerobot.hub.cards import changed_flags, render_card
 from cronos_lerobot.hub.checkpoint import environment_flags, find_checkpoint, is_repository
 from cronos_lerobot.hub.config import PolicyConfig, check_name
 from cronos_lerobot.hub.push import matching
-from cronos_lerobot.hub.results import describe_setting, differences
+from cronos_lerobot.hub.results import TRAINING, describe_setting, differences
 from cronos_lerobot.hub.stage import read_json, readable, stage, write_text
 from cronos_lerobot.protocol.interventions import COUNTED_INTERVENTIONS
 from cronos_lerobot.report.runs import TrainingRun
@@ -40,9 +41,9 @@ FILES = (
     ),
     "generation_config.json", "preprocessor_config.json", "processor_config.json", "tokenizer.json",
     "tokenizer.model", "tokenizer_config.json", "special_tokens_map.json", "added_tokens.json", "merges.txt",
-    "vocab.json", "vocab.txt",
+    "vocab.json", "vocab.txt", TRAINING,
 )  # fmt: skip
-"""What makes a policy. Nothing else is pushed. A new policy removes what an older one has left of these: an actor
+"""What makes a policy, and how it was trained. Nothing else is pushed. A new policy removes what an older one has left of these: an actor
 that steers, or adapters, would be loaded with it."""
 EVALUATE = ("cronos-eval", "lerobot-eval")
 LICENSE = "apache-2.0"
@@ -78,6 +79,8 @@ def write_policy_repository(config: PolicyConfig, folder: Path) -> str:
         about["differences"] = list(dict.fromkeys(text for one in results for text in differences(one, policy)))
         card = render_card("policy", results=results, is_adapter=base is not None, **about)
     write_text(folder / "README.md", card)
+    if run:
+        write_text(folder / TRAINING, json.dumps(_training(run), indent=4))
     steps = f" after {run.last['interaction_steps']} interaction steps" if run else ""
     return f"{policy['type']} policy{steps}"
 
@@ -129,6 +132,14 @@ def _about(
         "run": run,
         "counted": [kind.name.lower() for kind in COUNTED_INTERVENTIONS],
     }
+
+
+def _training(run: TrainingRun) -> dict[str, Any]:
+    """What an entry of the leaderboard says of the training."""
+    names = ("interaction_steps", "interventions", "interventions_by_kind")
+    base = (run.config.get("policy") or {}).get("pretrained_path")
+    own = {"num_envs": run.config["num_envs"], "seed": run.seed, "base_fingerprint": run.base}
+    return {name: run.last[name] for name in names} | own | {"base": Path(base).name if base else None}
 
 
 def _began_with(trained: dict[str, Any], run: TrainingRun | None) -> str | None:

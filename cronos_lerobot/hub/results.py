@@ -26,6 +26,8 @@ from cronos_lerobot.hub.push import PublishError, explained
 from cronos_lerobot.hub.stage import clean_json, read_json, readable
 
 FILE = ".eval_results/cronos.yaml"
+TRAINING = "cronos_training.json"
+"""Steps, interventions, seed and base of a policy's training, which `cronos-publish policy` pushes with it."""
 DECISIVE = (CONFIG_NAME, "*.safetensors", "policy_*.json", ADAPTER_CONFIG)
 """Files that make a policy."""
 STANDARD = {"advance": "window", "end_effector_reset": False}
@@ -87,14 +89,28 @@ def write_results(
                 "policy now: evaluate again, with a new --output_dir"
             )
         policy = read_json(Path(HfApi().hf_hub_download(config.repo_id, CONFIG_NAME, revision=evaluated)))
+        training = _describe_training(config.repo_id, evaluated)
     benchmark = _load(config, results[0])
-    entries = make_entries(results, policy, benchmark, config)
+    entries = make_entries(results, policy, benchmark, config, training)
     content = merge(_published(config, commit), clean_json(eval_result_entries_to_yaml(entries)))
     path = folder / FILE
     path.parent.mkdir(parents=True)
     path.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=110))
     values = ", ".join(f"{entry.task_id} {entry.value:g}" for entry in entries)
     return f"results on {describe_source(benchmark.source)}: {values}"
+
+
+def _describe_training(repo_id: str, revision: str) -> str:
+    """What a policy's repository says of its training; nothing if it has no record of one."""
+    try:
+        file = Path(HfApi().hf_hub_download(repo_id, TRAINING, revision=revision))
+    except RemoteEntryNotFoundError:
+        return ""
+    with readable(file):
+        told = read_json(file)
+        counts = f"{told['interaction_steps']:,} steps, {told['interventions']:,} interventions"
+        base = f"base {told['base']} {told['base_fingerprint']}" if told["base"] else "from scratch"
+        return f"trained for {counts}, seed {told['seed']}, {base}"
 
 
 def _policy_files(repo_id: str, revision: str | None) -> dict[str, str]:
@@ -124,7 +140,11 @@ def _load(config: ResultsConfig, results: Mapping[str, Any]) -> Benchmark:
 
 
 def make_entries(
-    results: Sequence[Mapping[str, Any]], policy: Mapping[str, Any], benchmark: Benchmark, config: ResultsConfig
+    results: Sequence[Mapping[str, Any]],
+    policy: Mapping[str, Any],
+    benchmark: Benchmark,
+    config: ResultsConfig,
+    training: str = "",
 ) -> list[EvalResultEntry]:
     """An entry for each suite and split to publish.
 
@@ -133,6 +153,7 @@ def make_entries(
         policy: config.json of the policy that was evaluated.
         benchmark: that it was evaluated on.
         config: what to publish.
+        training: of the policy, in words.
     """
     suites = [suite.strip() for suite in config.suites.split(",")]
     if unknown := set(suites) - set(SUITES):
@@ -144,16 +165,20 @@ def make_entries(
     for one in chosen:
         with readable(config.results or Path("results.json")):
             caveat = "; ".join(differences(one, policy, benchmark.size(one["suite"], one["split"])))
-            entry = _entry(one, caveat, benchmark.source, config.source_url)
+            entry = _entry(one, caveat, benchmark.source, config.source_url, training)
         if caveat and not config.partial:
             raise ValueError(f"{entry.task_id}: {caveat}; --partial=true publishes it all the same")
         entries.append(entry)
     return entries
 
 
-def _entry(results: Mapping[str, Any], caveat: str, source: str, source_url: str | None) -> EvalResultEntry:
+def _entry(
+    results: Mapping[str, Any], caveat: str, source: str, source_url: str | None, training: str
+) -> EvalResultEntry:
     dataset_id, _, revision = source.partition("@")
     value, notes = _score(results)
+    told = [f"PARTIAL: {caveat}"] * bool(caveat) + [f"n={results['n']}", notes]
+    told += [training] * bool(training) + [_setting(results)]
     return EvalResultEntry(
         dataset_id=dataset_id,
         dataset_revision=revision or None,
@@ -161,7 +186,7 @@ def _entry(results: Mapping[str, Any], caveat: str, source: str, source_url: str
         value=round(value, 4),
         date=results["date"],
         source_url=source_url,
-        notes="; ".join([f"PARTIAL: {caveat}"] * bool(caveat) + [f"n={results['n']}", notes, _setting(results)]),
+        notes="; ".join(told),
     )
 
 

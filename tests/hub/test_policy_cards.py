@@ -90,6 +90,19 @@ def test_the_numbers_and_the_configuration_of_a_run(tmp_path):
     assert [row[0] for row in cells if len(row) == 6 and row[0].isdigit()] == ["0", str(STEPS // 2), str(STEPS)]
 
 
+def test_a_training_is_pushed_with_its_policy(tmp_path):
+    run = write_run(tmp_path)
+    config = train_config(CronosEnvConfig(**STATE), seed=3, num_envs=8)
+    config["policy"] = {"pretrained_path": "/somewhere/bases/kitchen_2x2_state"}
+    edit_starts(run, lambda starts: starts[0].update(config=config, policy_fingerprint="bbfc"))
+    dry_run(run, tmp_path / "out")
+    training = json.loads((tmp_path / "out/cronos_training.json").read_text())
+    assert training["interventions_by_kind"]["scene_reset"] == 32
+    del training["interventions_by_kind"]
+    assert training == {"interaction_steps": STEPS, "interventions": 32, "num_envs": 8, "seed": 3,
+                        "base": "kitchen_2x2_state", "base_fingerprint": "bbfc"}  # fmt: skip
+
+
 def test_a_checkpoint_in_the_middle_has_what_came_before_it(tmp_path):
     run = write_run(tmp_path, step=STEPS // 2)
     edit_starts(run, lambda starts: starts.append(starts[0] | {"interaction_steps": STEPS // 2}))
@@ -225,7 +238,7 @@ def test_nothing_private_or_foreign_is_pushed(tmp_path, monkeypatch, capsys):
     (folder / "train_config.json").write_text(json.dumps(trained))
     card = dry_run(run, tmp_path / "out")
     names = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*") if path.is_file()}
-    assert names == {"README.md", "config.json", "train_config.json", "model.safetensors"}
+    assert names == {"README.md", "config.json", "train_config.json", "model.safetensors", "cronos_training.json"}
     pushed = b"".join((tmp_path / "out" / name).read_bytes() for name in names)
     for secret in (TOKEN, "melanie", "grant", "KEY"):
         assert secret.encode() not in pushed

@@ -133,7 +133,7 @@ def test_a_policy_is_loaded_back_as_its_card_says(hub, run, policy, commands, tm
                  f"--output_dir={tmp_path / 'dry'}")  # fmt: skip
     assert hub.tree("models", policy) == tree(tmp_path / "dry")
     model = tree(run / "checkpoints/last/pretrained_model")
-    assert hub.tree("models", policy).keys() == model.keys() | {"README.md"}
+    assert hub.tree("models", policy).keys() == model.keys() | {"README.md", "cronos_training.json"}
     for name in model.keys() - {"train_config.json"}:
         assert hub.tree("models", policy)[name] == model[name]
     card = (tmp_path / "dry/README.md").read_text()
@@ -187,6 +187,7 @@ def test_results_join_those_of_others(hub, policy, evaluation, commands, tmp_pat
         assert entries[i]["value"] == pytest.approx(100 * written["success"])
         assert entries[i]["dataset"]["revision"] == hub.repositories["datasets", "me/bench"].branches["main"]
         assert "n=8" in entries[i]["notes"]
+        assert "; trained for 32 steps, 4 interventions, seed 1000, from scratch; " in entries[i]["notes"]
 
 
 def test_a_training_begins_with_one_commit_of_a_policy(hub, run, commands, tmp_path):
