@@ -3,6 +3,7 @@
 import re
 import shlex
 import sys
+from importlib import import_module
 from itertools import chain
 from pathlib import Path
 
@@ -33,7 +34,6 @@ CONFIGS = {
     **{f"cronos-publish {name}": config for name, (config, _) in publish.COMMANDS.items()},
     **{f"cronos-streams {name}": config for name, (config, _) in streams.COMMANDS.items()},
 }
-OWN = re.compile(r'register_subclass\("(\w+)"\)')
 TYPES = {"--algorithm": "ppo", "--env": "cronos"}
 """What the commands take where none is given."""
 PACKAGE = ".discover_packages_path="
@@ -51,14 +51,13 @@ def command_lines(text):
                 yield line, CONFIGS[name], [word for word in words if word.startswith("--")]
 
 
-def readable(flags, text):
+def readable(flags):
     """The flags but for those of which the line does not say all.
 
     Which flags a policy at a path has, its files say; a config file, a benchmark, its repository and a package are
-    somebody's own, and so are choices that the page itself registers.
+    somebody's own.
     """
     groups = [flag.split(".")[0] for flag in flags if re.match(r"--\w+\.path=", flag)]
-    groups += [flag.split(".type=")[0] for flag in flags for name in OWN.findall(text) if f".type={name}" in flag]
     elsewhere = ["--config_path=", "--env.benchmark=", "--env.hub_path=", "--env.type=cronos_hub"]
     elsewhere += [f"{group}." for group in groups]
     if any(PACKAGE in flag for flag in flags):
@@ -71,12 +70,15 @@ def readable(flags, text):
 
 @pytest.mark.parametrize("page", PAGES)
 def test_command_lines_are_read(page, monkeypatch):
+    for folder in ("examples", "examples/lerobot_policy_mine"):
+        monkeypatch.syspath_prepend(ROOT / folder)
     # LeRobot's configs look at it.
     monkeypatch.setattr(sys, "argv", ["command"])
-    text = PAGES[page].read_text()
-    for line, config_class, flags in command_lines(text):
+    for plugin in ("lerobot_policy_mine", "rewarded"):
+        import_module(plugin)
+    for line, config_class, flags in command_lines(PAGES[page].read_text()):
         try:
-            parse_flags(config_class, readable(flags, text))
+            parse_flags(config_class, readable(flags))
         except (Exception, SystemExit) as error:
             pytest.fail(f"{page}: {line}\n{error.__cause__ or error}")
 
@@ -85,9 +87,9 @@ def test_there_are_command_lines():
     """Of every command, and flags that are not there are found."""
     shown = [found for page in PAGES.values() for found in command_lines(page.read_text())]
     assert {config_class for _, config_class, _ in shown} == set(CONFIGS.values())
-    assert sum(len(readable(flags, "")) for _, _, flags in shown) > 300
+    assert sum(len(readable(flags)) for _, _, flags in shown) > 300
     with pytest.raises(SystemExit):
-        parse_flags(CronosTrainConfig, readable(["--policy.path=<>", "--protocol.scene_resets=1"], ""))
+        parse_flags(CronosTrainConfig, readable(["--policy.path=<>", "--protocol.scene_resets=1"]))
 
 
 LINKED = ("*.md", "docs/*.md", "docs/results/**/*.md", "envs/**/README.md", "policies/**/README.md")

@@ -60,10 +60,9 @@ def _draw(experiment: Experiment, found: pd.DataFrame, folder: Path) -> list[str
     name = experiment.name
     figures = {
         name: plots.curves_figure(experiment, found),
+        f"{name}_ends": plots.ends_figure(experiment, found),
         f"{name}_by_task": plots.by_task_figure(experiment, found),
     }
-    if experiment.paper:
-        figures[f"{name}_bars"] = plots.bars_figure(experiment, found)
     for file, figure in figures.items():
         figure.savefig(folder / f"{file}.png", dpi=120)
     return [f"{file}.png" for file in figures]

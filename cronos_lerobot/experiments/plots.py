@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from cronos_lerobot.experiments.definitions import Experiment
 from cronos_lerobot.experiments.tables import curves
 from cronos_lerobot.report.figures import COLORS, INK, SPLIT_LABELS, draw_curve, mean_curve, style_axes
+from cronos_lerobot.statistics import summarise
 
 AXES = {"steps": "interaction steps, all streams", "interventions": "interventions, all streams"}
 
@@ -43,24 +44,31 @@ def by_task_figure(experiment: Experiment, found: pd.DataFrame) -> Figure:
     return figure
 
 
-def bars_figure(experiment: Experiment, found: pd.DataFrame) -> Figure:
-    """Success at the end of every row beside the paper's: mean and standard deviation over the seeds."""
-    figure = Figure(figsize=(10, 0.55 * len(experiment.rows) + 1.2), layout="constrained")
-    ax = figure.subplots()
-    y = np.arange(len(experiment.rows))
-    ends = [[one["success"].iloc[-1] for one in curves(found, row, "train")] for row in experiment.rows]
-    ours = [(np.mean(end), np.std(end, ddof=1) if len(end) > 1 else 0) if end else (np.nan, 0) for end in ends]
-    for shift, color, label, numbers in (
-        (-0.2, COLORS[0], "here", ours),
-        (0.2, "#bbbbbb", "paper", experiment.paper),
-    ):
-        means, spreads = zip(*numbers, strict=True)
-        ax.barh(y + shift, means, 0.36, xerr=spreads, color=color, label=label, ecolor=INK)
-    ax.set_yticks(y, [row.label for row in experiment.rows], fontsize=9)
-    ax.invert_yaxis()
-    style_axes(ax, "success at the end, training configurations")
-    ax.set_xlim(0, 1)
-    figure.legend(loc="outside right upper", fontsize=8, frameon=False)
+def ends_figure(experiment: Experiment, found: pd.DataFrame) -> Figure:
+    """Success at the end of every row: a dot for each seed, their mean and its 95 % interval; the paper's mean."""
+    figure = Figure(figsize=(8, 0.62 * len(experiment.rows) + 1.1), layout="constrained")
+    ax, labels = figure.subplots(), []
+    for y, row in enumerate(experiment.rows):
+        for shift, color, (split, title) in zip((-0.16, 0.16), COLORS, SPLIT_LABELS.items(), strict=False):
+            ends = [one["success"].iloc[-1] for one in curves(found, row, split)]
+            if ends:
+                summary, place = summarise(ends, (0, 1)), y + shift
+                ax.plot(summary.ci95 or ends[:1], [place] * (2 if summary.ci95 else 1), "-", color=color, lw=2)
+                ax.plot(ends, [place] * len(ends), "o", color=color, ms=4, alpha=0.5, mew=0)
+                ax.plot(summary.mean, place, "D", color=color, ms=6, label=title)
+        spent = [one["interventions"].iloc[-1] for one in curves(found, row, "train")]
+        labels.append(f"{row.label}\n{np.mean(spent):,.0f} interventions" if spent else row.label)
+        if experiment.paper:
+            ax.plot(experiment.paper[y][0], y, "|", color="#888888", ms=18, mew=2, label="the paper, training")
+    bases = [one["success"].iloc[0] for row in experiment.rows for one in curves(found, row, "train")]
+    ax.axvline(float(np.mean(bases)), color=INK, ls=":", lw=1, label="base, training")
+    ax.set_yticks(range(len(labels)), labels, fontsize=8)
+    style_axes(ax, "success at the end")
+    ax.margins(x=0.04)
+    ax.set_ylim(len(labels) - 0.5, -0.5)
+    handles, names = ax.get_legend_handles_labels()
+    unique = dict(zip(names, handles, strict=True))
+    figure.legend(unique.values(), unique.keys(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     return figure
 
 

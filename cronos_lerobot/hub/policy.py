@@ -43,8 +43,8 @@ FILES = (
     "tokenizer.model", "tokenizer_config.json", "special_tokens_map.json", "added_tokens.json", "merges.txt",
     "vocab.json", "vocab.txt", TRAINING,
 )  # fmt: skip
-"""What makes a policy, and how it was trained. Nothing else is pushed. A new policy removes what an older one has left of these: an actor
-that steers, or adapters, would be loaded with it."""
+"""What makes a policy, and how it was trained. Nothing else is pushed. A new policy removes what an older one has
+left of these: an actor that steers, or adapters, would be loaded with it."""
 EVALUATE = ("cronos-eval", "lerobot-eval")
 LICENSE = "apache-2.0"
 """Of a policy that names none, as in LeRobot."""

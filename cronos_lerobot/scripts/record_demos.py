@@ -52,7 +52,7 @@ class DemoDatasetConfig:
     """Episodes to have in the end, all tasks together."""
     video: bool = True
     """Store pixels as mp4; with `false` as PNG in the data files: exact, about twice as large, and faster for
-    `lerobot-train` to read at random (docs/data.md)."""
+    `lerobot-train` to read at random (docs/datasets.md)."""
     overwrite: bool = False
     """Delete a dataset that is already there."""
 

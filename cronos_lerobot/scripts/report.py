@@ -40,7 +40,7 @@ examples:
   two rows of a table, all seeds of each
       cronos-report compare outputs/reproduce/table1/t80 outputs/reproduce/table1/t1280_eer
 
-docs/evaluation.md says how the intervals and p-values are computed.
+docs/evaluate.md says how the intervals and p-values are computed.
 """
 
 

@@ -29,7 +29,7 @@ examples:
           --dataset.repo_id=me/stream --dataset.root=outputs/train/eer/streams \\
           --sample_weighting.type=rabc --sample_weighting.progress_path=outputs/progress.parquet
 
-`cronos-streams filter --help` has the flags of a command, docs/streams.md explains them.
+`cronos-streams filter --help` has the flags of a command, docs/datasets.md explains them.
 """
 
 import json
@@ -128,7 +128,7 @@ class WeightsConfig:
     """Write what `lerobot-train --sample_weighting.type=rabc` weighs frames by.
 
     LeRobot's weight of a frame is 1 if progress grows by more than kappa (0.01) over the action chunk that begins
-    there, 0 if it falls, and in between by how the difference compares with those of all frames: docs/streams.md.
+    there, 0 if it falls, and in between by how the difference compares with those of all frames: docs/datasets.md.
     """
 
     dataset: SourceConfig = field(default_factory=SourceConfig)

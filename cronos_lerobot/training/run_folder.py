@@ -107,7 +107,7 @@ def note_start(config: CronosTrainConfig, num_processes: int = 1, interaction_st
     if was not in (None, instructions):
         logging.warning(
             f"This run computed with {was} and resumes with {instructions}, whose last bits differ: it becomes "
-            "another run, as with another seed. docs/experiments.md has the variables that hold a command to AVX2."
+            "another run, as with another seed. docs/reproduce.md has the variables that hold a command to AVX2."
         )
     _write(config, {"starts": [*manifest["starts"], start]})
 

@@ -39,7 +39,9 @@ def test_rows_are_means_over_finished_seeds(tmp_path):
     held_out = evaluations[evaluations["split"] == "held_out"]
     assert held_out["steps"].tolist() == [0, 10240] * 3
     assert held_out["interventions"].tolist() == [0, 32] * 3
-    assert {path.name for path in (tmp_path / "out").glob("*.png")} == {"figure2.png", "figure2_by_task.png"}
+    assert {path.name for path in (tmp_path / "out").glob("*.png")} == {
+        "figure2.png", "figure2_ends.png", "figure2_by_task.png",
+    }  # fmt: skip
     assert pytest.approx([0.25, 0.5]) == held_out["success"].tolist()[:2]
 
 

@@ -164,22 +164,21 @@ def test_a_run_of_a_gpu_resumes_on_a_cpu(tmp_path, monkeypatch, capsys):
     assert all(group["fused"] for group in optimizer["param_groups"])
 
 
-def code_of_the_docs(pattern, package):
-    """An example of docs/extending.md, word for word, as a package of a user's; returns the environment."""
-    docs = (Path(__file__).parents[2] / "docs/extending.md").read_text()
-    code = re.search(rf"```python\n({pattern}.*?)```", docs, re.DOTALL)
-    assert code is not None
+def test_strategy_of_the_readme_and_order_of_the_docs(tmp_path):
+    """Word for word, as a package of a user's."""
+    root, package = Path(__file__).parents[2], tmp_path / "my_protocol"
     package.mkdir()
-    (package / "__init__.py").write_text(code[1])
-    return os.environ | {"PYTHONPATH": os.pathsep.join([str(package.parent), os.environ.get("PYTHONPATH", "")])}
-
-
-def test_strategy_and_order_of_the_docs(tmp_path):
-    env = code_of_the_docs("import numpy.*?register_reset", tmp_path / "my_protocol")
+    code = []
+    for page, pattern in (("README.md", "register_reset"), ("docs/extend.md", "register_task_order")):
+        blocks = re.findall(r"```python\n(.*?)```", (root / page).read_text(), re.DOTALL)
+        (block,) = (block for block in blocks if f"@{pattern}" in block)
+        code.append(block)
+    (package / "__init__.py").write_text("\n".join(code))
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
     output = tmp_path / "run"
     command = [
         "cronos-train", *SMALL, *OBSERVATIONS["state"], "--protocol.discover_packages_path=my_protocol",
-        "--protocol.extra_resets=[stuck]", "--protocol.task_order=weaker_more_often",
+        "--protocol.extra_resets=[after_failures]", "--protocol.task_order=weaker_more_often",
         "--protocol.scene_reset_interval=null", "--protocol.heuristic_reset=true", f"--output_dir={output}",
         "--steps=48",
     ]  # fmt: skip
@@ -189,32 +188,6 @@ def test_strategy_and_order_of_the_docs(tmp_path):
     assert last["interventions_by_kind"]["scene_reset"] == 2
     assert last["interventions_by_stream"] == [last["interventions"] // 2] * 2
     assert last["interventions_by_kind"]["task_switch"] == 12
-
-
-def test_agent_of_the_docs(tmp_path):
-    """It learns, and a resumed run is the unbroken one."""
-    env = code_of_the_docs(
-        r"from dataclasses import dataclass\n\nimport torch.*?register_agent", tmp_path / "my_agent"
-    )
-    plugin = "--discover_packages_path=my_agent"
-
-    def run(*flags):
-        run_forked(["cronos-train", plugin, *flags], check=True, env=env)
-
-    small = [flag for flag in SMALL if not flag.startswith("--algorithm.")]
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    # Every action is cloned: no task is complete so early.
-    run(
-        *small, *OBSERVATIONS["state"], "--algorithm.type=rewarded", "--algorithm.threshold=-9",
-        f"--output_dir={whole}",
-    )  # fmt: skip
-    shutil.copytree(whole, broken, symlinks=True)
-    first = broken / "checkpoints/000016/pretrained_model"
-    run("--resume=true", f"--config_path={first}/train_config.json")
-    assert moved(first, whole / "checkpoints/last/pretrained_model")
-    assert_same_weights(whole, broken)
-    # Two streams, 8 steps an update.
-    assert [line["agent"]["frames"] for line in metrics(whole)] == [16, 16]
 
 
 def test_what_cannot_be_is_one_line(tmp_path, monkeypatch):

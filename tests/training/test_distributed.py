@@ -269,7 +269,7 @@ def test_the_command_in_two_processes(tmp_path):
 
 
 def test_accelerate_launch_says_what_the_processes_join_by():
-    """The command of docs/distributed.md, with `env` in place of `cronos-train`: it says what `Together` does."""
+    """The command of docs/scale.md, with `env` in place of `cronos-train`: it says what `Together` does."""
     launch = [
         sys.executable, "-m", "accelerate.commands.launch", "--multi_gpu", "--num_processes=2", "--num_machines=1",
         "--main_process_port=0", "--mixed_precision=no", "--dynamo_backend=no", "--no_python", "env",

@@ -2,7 +2,7 @@
 
 An object is placed on a receptacle when the hand, having carried it, has let go of it there, and at two readings
 in a row it lies still, neither hand nor table touches it, and the receptacle carries at least half of its weight.
-It stays placed for as long as the receptacle carries it. The reasons are in docs/protocol.md.
+It stays placed for as long as the receptacle carries it. The reasons are in docs/design.md.
 """
 
 import mujoco
