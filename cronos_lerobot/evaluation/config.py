@@ -22,6 +22,7 @@ from cronos_lerobot.evaluation.chains import Chain
 from cronos_lerobot.evaluation.policy_env import (
     check_observations,
     reads_privileged_state,
+    task_observation_of,
     trained_observations,
     trained_scene,
 )
@@ -118,6 +119,8 @@ class CronosEvalConfig:
         for name, value in self._derived(given).items():
             if name not in given:
                 setattr(env, name, value)
+        if self.policy is not None and "task_observation" not in given:
+            env.task_observation = task_observation_of(self.policy.input_features or {}, env)
         env.__post_init__()
         if self.eval.videos:
             check_video_size("--env.render_size", env.render_size)

@@ -37,7 +37,8 @@ class Row:
         others = [
             f"{name.rpartition('.')[2]}={value}" for name, value in given.items() if name.startswith("algorithm.")
         ]
-        return ", ".join([describe_protocol({"task_switch_interval": 80} | own), *others])
+        defaults = {"task_switch_interval": 80, "scene_reset_interval": 1280, "end_effector_reset": True}
+        return ", ".join([describe_protocol(defaults | own), *others])
 
 
 def _value(text: str) -> Any:

@@ -4,7 +4,7 @@ independent: every task from every configuration. sequential: chains of all task
 ten orderings. stream: 16 tasks in a row, nobody resets. Each runs on training and on held-out configurations.
 
 examples:
-  everything (about 10 minutes on two cores for a small policy from pixels)
+  everything (5 to 10 minutes on two cores for a small policy)
       cronos-eval --policy.path=outputs/train/eer/checkpoints/last/pretrained_model --output_dir=outputs/eval/eer
   a first impression (under 2 minutes)
       cronos-eval --policy.path=<checkpoint> --quick=true

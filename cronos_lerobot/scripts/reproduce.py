@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from cronos_lerobot.experiments.definitions import EXPERIMENTS, Experiment, find_rows
 from cronos_lerobot.experiments.pipeline import Command, Pipeline, await_all, interrupt_on_signals, run_here
@@ -86,18 +87,19 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def read_slurm_flags(words: Sequence[str]) -> dict[str, str | int]:
+def read_slurm_flags(words: Sequence[str]) -> dict[str, Any]:
     """`--slurm.NAME=VALUE` as parameters of submitit's executor.
 
     Raises:
         ValueError: a word is no such flag.
     """
-    found: dict[str, str | int] = {}
+    found: dict[str, Any] = {}
     for word in words:
         name, sign, value = word.removeprefix("--slurm.").partition("=")
         if not (word.startswith("--slurm.") and sign):
             raise ValueError(f"there is no flag {word}; flags of cronos-train follow after --")
-        found[name] = int(value) if value.isdigit() else value
+        # A list, as of commands in `setup`, is JSON.
+        found[name] = json.loads(value) if value.isdigit() or value.startswith("[") else value
     return found
 
 
@@ -127,7 +129,7 @@ def steps_done(run: Run) -> int:
     return 0
 
 
-def run_all(runs: Sequence[Run], args: argparse.Namespace, slurm: dict[str, str | int]) -> list[str]:
+def run_all(runs: Sequence[Run], args: argparse.Namespace, slurm: dict[str, Any]) -> list[str]:
     """Run what is not done; returns why pipelines failed, a line each."""
     from tqdm import tqdm
 
@@ -170,9 +172,10 @@ def choose(args: argparse.Namespace, extra: Sequence[str]) -> dict[Experiment, l
 def main() -> None:
     """Entry point of `cronos-reproduce`."""
     split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
-    for word in sys.argv[1:split]:
-        if word.startswith("--discover_packages_path="):
-            import_module(word.split("=", 1)[1])
+    plugins = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    plugins.add_argument("--discover_packages_path", action="append", default=[])
+    for module in plugins.parse_known_args(sys.argv[1:split])[0].discover_packages_path:
+        import_module(module)
     args, others = make_parser().parse_known_args(sys.argv[1:split])
     if args.experiment == "list":
         print_list()

@@ -9,7 +9,7 @@ from lerobot.envs.utils import env_to_policy_features
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot_env_cronos import CronosEnvConfig
 from lerobot_policy_pocketvla import PocketVLAConfig
-from tiny_checkpoints import STATE, record_one, save_policy, write_train_config
+from tiny_checkpoints import STATE, TINY_ACT, TOLD, record_one, save_policy, write_train_config
 
 from cronos_lerobot.evaluation.config import CronosEvalConfig
 from cronos_lerobot.evaluation.policy_env import reads_privileged_state, trained_observations
@@ -96,6 +96,15 @@ def test_what_flags_and_file_leave_open_follows_from_the_policy(
     assert (config.env.scene, config.env.observation_height) == (scene, height)
     assert (config.env.observation_width, config.env.renderer) == (96, renderer)
     assert config.seed == (1000 if flag else 3)
+
+
+def test_a_policy_that_was_told_its_task_is_told_it_again(tmp_path, monkeypatch):
+    folder = save_policy(tmp_path, "act", TOLD, **TINY_ACT)
+    monkeypatch.setattr(sys, "argv", ["cronos-eval", f"--policy.path={folder}"])
+    assert read_command_line().env.task_observation == "one_hot"
+    monkeypatch.setattr(sys, "argv", [*sys.argv, "--env.type=cronos", "--env.task_observation=none"])
+    with pytest.raises(ValueError, match="--env.task_observation=one_hot"):
+        read_command_line()
 
 
 def test_an_environment_given_in_python_is_kept_and_flags_of_another_program_are_not_read(

@@ -32,6 +32,8 @@ def test_labels_say_what_the_paper_calls_a_row():
     ]
     assert EXPERIMENTS["figure2"].rows[1].label == "T = 1280, EER, CL, HSR, random order"
     assert EXPERIMENTS["figure4"].rows[3].label == "T = 320, EER, 1 configuration(s)"
+    # What cronos-train does without a flag.
+    assert Row("mine", ("--protocol.scene_reset_interval=640",)).label == "T = 640, EER"
     assert EXPERIMENTS["baselines"].rows[-1].label == "T = 4400, staggered, EER, CL, kl_decay_updates=10"
 
 

@@ -90,7 +90,7 @@ class PPOConfig(AgentConfig):
     1 draws all of the noise anew that the forward process would have added."""
     noise_steps: int | None = ranged(None, minimum=1)
     """At how many steps of a flow policy's denoising there is noise, drawn for each decision; an update evaluates
-    the network at these alone. null is all of them."""
+    the network at these alone. null is all but the last, which has none."""
     critic_observation: str = ranged("policy", choices=("policy", "environment_state"))
     """What the critic beside a policy that has none of its own (ACT, Diffusion, SmolVLA, pi0) reads: what the
     `policy` makes of its observation, or the privileged `environment_state`, the robot's state and the

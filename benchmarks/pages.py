@@ -1,0 +1,109 @@
+"""Run the commands of the documentation, page by page, in a new folder.
+
+    python benchmarks/pages.py README.md docs/quickstart.md [--whole]
+
+Files that a page asks for are written, and its commands run in their order. By default they are shortened: a few
+steps, episodes and demonstrations show that a page holds together. `--whole` runs them as they are. Commands that
+need the Hub, a GPU, an installation or something of your own (`<...>`) are printed as skipped.
+"""
+
+import argparse
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+BLOCK = re.compile(r"(?:`([\w/]+\.py)`[^\n]*:\n\n)?```(bash|python)\n(.*?)```", re.DOTALL)
+"""A block of code, and the file that the line before it names."""
+OURS = re.compile(r"(cronos|lerobot)-[\w-]+|python ")
+SKIPPED = re.compile(
+    r"<|\.\.\.|=cuda|smolvla|openvla|launcher=slurm|me/(policy|eer|my_|clone|lora|cronos_kitchen)|^python|-reproduce"
+)
+SHORT = (
+    # Command, flag, value that a quick run has.
+    ("cronos-demo", "--scale", "smoke"),
+    ("cronos-train", "--steps", "20480"),
+    ("cronos-train", "--eval.n_episodes", "1"),
+    ("lerobot-train", "--steps", "4"),
+    ("lerobot-train", "--save_freq", "4"),
+    ("lerobot-train", "--batch_size", "8"),
+    ("cronos-record-demos", "--dataset.num_episodes", "8"),
+    ("cronos-eval", "--eval.n_episodes", "1"),
+    ("cronos-eval", "--eval.orderings", "1"),
+    ("lerobot-eval", "--eval.n_episodes", "1"),
+    ("lerobot-eval", "--eval.batch_size", "1"),
+)
+
+
+def main() -> None:
+    """Run the pages; ends with the number of commands that failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("pages", nargs="+", type=Path)
+    parser.add_argument("--whole", action="store_true", help="run the commands as they are")
+    args = parser.parse_args()
+    failed = sum(run_page(page.resolve(), args.whole) for page in args.pages)
+    sys.exit(f"{failed} commands failed" if failed else 0)
+
+
+def run_page(page: Path, whole: bool) -> int:
+    """Run the commands of a page; returns how many failed."""
+    failed = 0
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("examples", "benchmarks", "policies", "cronos_lerobot"):
+            (Path(folder) / name).symlink_to(ROOT / name)
+        for file, language, code in BLOCK.findall(page.read_text()):
+            if language == "python" and file:
+                path = Path(folder) / file
+                path.parent.mkdir(exist_ok=True)
+                path.write_text(code)
+            for command in commands(code) if language == "bash" else ():
+                failed += not run(command if whole else shorten(command), folder)
+    return failed
+
+
+def commands(code: str) -> list[str]:
+    """The commands of a block, with what their variables stand for."""
+    variables, found = {}, []
+    for line in code.replace("\\\n", " ").splitlines():
+        if assigned := re.match(r'(\w+)="(.*)"$', line):
+            variables[f"${assigned[1]}"] = assigned[2]
+        for name, value in variables.items():
+            line = line.replace(name, value) if line.startswith(name) else line
+        if OURS.match(re.sub(r"^\w+=\S+ ", "", line)):
+            found.append(line.split(" # ")[0].strip())
+    return found
+
+
+def shorten(command: str) -> str:
+    """The command with a quick run's values."""
+    for name, flag, value in SHORT:
+        if re.search(rf"(^| ){name}( |$)", command):
+            command = re.sub(rf" {re.escape(flag)}=\S+", "", command) + f" {flag}={value}"
+    return command.replace(" --quick=true", "")
+
+
+def run(command: str, folder: str) -> bool:
+    """Run it, and say how it went."""
+    if SKIPPED.search(command):
+        print(f"skipped  {command[:110]}")
+        return True
+    start = time.perf_counter()
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    python_path = os.pathsep.join([folder, str(Path(folder, "examples/lerobot_policy_mine"))])
+    env = os.environ | {"PATH": path, "PYTHONPATH": python_path, "HF_HUB_OFFLINE": "1"}
+    words = ["bash", "-c", command]
+    ended = subprocess.run(words, cwd=folder, env=env, capture_output=True, text=True, check=False)
+    state = "failed  " if ended.returncode else "done    "
+    print(f"{state} {time.perf_counter() - start:5.0f} s  {shlex.quote(command)[:100]}", flush=True)
+    if ended.returncode:
+        print("\n".join((ended.stdout + ended.stderr).splitlines()[-8:]))
+    return not ended.returncode
+
+
+if __name__ == "__main__":
+    main()
