@@ -103,7 +103,7 @@ def test_a_policy_that_was_told_its_task_is_told_it_again(tmp_path, monkeypatch)
     monkeypatch.setattr(sys, "argv", ["cronos-eval", f"--policy.path={folder}"])
     assert read_command_line().env.task_observation == "one_hot"
     monkeypatch.setattr(sys, "argv", [*sys.argv, "--env.type=cronos", "--env.task_observation=none"])
-    with pytest.raises(ValueError, match="--env.task_observation=one_hot"):
+    with pytest.raises(ValueError, match=r"--env\.task_observation=one_hot"):
         read_command_line()
 
 
