@@ -1,4 +1,4 @@
-"""One writer for a folder: a run or a dataset that a process writes to is refused to every other one."""
+"""One writer for a folder: a second process that wants to write to a run or a dataset gets an error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scene resets for streams that are stuck, as many as a budget has by then, in place of periodic ones.
+"""Scene resets for streams that are stuck, as many as a budget has by then, instead of periodic ones.
 
     PYTHONPATH=examples cronos-train --protocol.discover_packages_path=asked_reset \
         --protocol.extra_resets='[asked]' --protocol.scene_reset_interval=null --protocol.reset_budget=1000 \

@@ -45,7 +45,7 @@ class TrainablePolicy(Protocol):
 
     A policy whose first layers are frozen may also have `encode_observation(batch) -> Batch` (or None there),
     which replaces inputs by what those layers make of them. It is called once for each observation; what it
-    returns is kept until the update and handed to the other methods in place of the batch.
+    returns is kept until the update and handed to the other methods instead of the batch.
 
     A policy whose attribute `takes_uint8_images` is true gets camera frames as they are, uint8 in 0..255, and
     scales them itself. Without it, or if its preprocessor normalises images, they are floats in [0, 1].
@@ -54,7 +54,7 @@ class TrainablePolicy(Protocol):
     first parameter of the group `value`. It is called once for each observation in an update, after the policy's
     training; the passes that train the value alone then call `predict_values` with what it returned.
 
-    `sample_actions` may also take `uniform`, numbers (B, A) in [0, 1) that are its randomness in place of a
+    `sample_actions` may also take `uniform`, numbers (B, A) in [0, 1) that are its randomness instead of a
     generator. An evaluation then draws them for each episode and step, and an episode's actions do not depend on
     which others share its batch.
     """
@@ -260,7 +260,7 @@ class LearningAgent(Agent):
 
         All processes call it, once before the run as well, and the first one's answer, which covers all streams,
         is kept: nested dicts, lists and tuples of tensors, NumPy arrays, numbers, strings and None. They come back
-        as they were, tensors on the CPU; anything else is refused.
+        as they were, tensors on the CPU; anything else is an error.
         """
         return {}
 

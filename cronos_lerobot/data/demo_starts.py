@@ -35,7 +35,7 @@ class StartConfig:
     earlier_tasks: int = ranged(1, minimum=1)
     """Where a demonstration begins after another task: after 1 to N of them, with equal chances. The last one is
     as above, those before it are any others. From two on all objects may lie on receptacles, and two on one, as
-    in a stream that goes on without a scene reset."""
+    in a stream that continues without a scene reset."""
     share: float = ranged(1.0, minimum=0, maximum=1)
     """Share of the episodes that `arm_pose`, `occupied_receptacles`, `misplaced_objects` and `earlier_tasks` apply
     to; the others start at home, with every object on the table."""

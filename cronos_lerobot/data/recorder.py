@@ -215,7 +215,7 @@ class StreamRecorder:
         self._lengths[stream] += 1
 
     def _write_segment(self, stream: int) -> None:
-        # The writer keeps the arrays until they are encoded, so the stream goes on in another buffer.
+        # The writer keeps the arrays until they are encoded, so the stream continues in another buffer.
         length, whole = self._lengths[stream], self._buffers[stream]
         frames = {key: buffer[:length] for key, buffer in whole.items()}
         self.writer.add_segment(

@@ -23,7 +23,7 @@ from cronos_lerobot.agents.processing import VECTOR_KEYS
 from cronos_lerobot.data.video import check_video_size
 
 FORMAT = 3
-"""Of the columns below and of `meta/cronos.json`. Any other number is refused."""
+"""Of the columns below and of `meta/cronos.json`. Any other number is an error."""
 ROBOT_TYPE = "widowx"
 """`robot_type` of demonstrations and streams: LeRobot merges only datasets of one robot."""
 

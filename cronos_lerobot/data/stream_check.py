@@ -89,7 +89,7 @@ class StreamCheck:
         if is_finished and steps[shortest] < steps[longest]:
             raise StreamError(
                 f"stream {shortest} ends after {steps[shortest]} steps, stream {longest} after {steps[longest]}:"
-                " the recording broke off, goes on or was filtered"
+                " the recording broke off, continues or was filtered"
             )
 
 

@@ -117,7 +117,7 @@ def _lowest_start(gained: np.ndarray) -> float:
 
 
 def progress(levels: np.ndarray, gamma: float) -> np.ndarray:
-    """How near a segment's frames are to what it goes on to reach: max over u >= t of gamma^(u - t) levels[u].
+    """How near a segment's frames are to what it reaches later: max over u >= t of gamma^(u - t) levels[u].
 
     Args:
         levels: (T + 1,) of `reward_levels`.

@@ -273,7 +273,7 @@ class StreamDataset:
 
         Args:
             is_finished: also that all streams end at the same step, which those of a recording that was killed,
-                or goes on, need not.
+                or continues, need not.
 
         Raises:
             StreamError: a step is missing or there twice, or an annotation is wrong.

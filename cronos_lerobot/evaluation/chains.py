@@ -30,7 +30,7 @@ class Chain:
 
 @dataclass(frozen=True)
 class Rules:
-    """How a chain goes on."""
+    """How a chain continues."""
 
     window: int = STEPS_PER_TASK
     """Control steps for each task."""

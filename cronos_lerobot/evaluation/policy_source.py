@@ -75,7 +75,7 @@ def find_policy(name: str) -> PolicySource:
 
 
 def follow_last(folder: Path) -> Path:
-    """`folder` below the checkpoint that is the last one now: a run that goes on has another one soon."""
+    """`folder` below the checkpoint that is the last one now: a run that continues has another one soon."""
     for link in (folder, *folder.parents):
         if link.name == LAST_CHECKPOINT_LINK and link.is_symlink():
             return link.parent / link.readlink() / folder.relative_to(link)

@@ -49,7 +49,7 @@ def _from(tasks: tuple[Any, ...], first: int) -> tuple[Any, ...]:
 
 
 def rules_of(suite: str, advance: str, end_effector_reset: bool) -> Rules:
-    """The rules of a suite's chains; a stream goes on whatever happens, window by window."""
+    """The rules of a suite's chains; a stream continues whatever happens, window by window."""
     if suite == STREAM:
         return Rules(end_effector_reset=end_effector_reset, stops=False)
     return Rules(advance=advance, end_effector_reset=end_effector_reset)

@@ -1,4 +1,4 @@
-"""Lists of commands that can be run again: what is done is skipped, what was stopped goes on.
+"""Lists of commands that can be run again: what is done is skipped, what was stopped resumes.
 
 Each command makes one folder. `<folder>/.done` holds the command that made it, `<folder>.log` what it printed, and
 whoever makes it holds the lock `<folder>.lock`: a folder that many pipelines need is made by the first to come.

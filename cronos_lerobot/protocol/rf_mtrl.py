@@ -75,7 +75,7 @@ def rf_mtrl(
 
 
 def _executed(a_t: ActionSample, info: dict[str, Any]) -> ActionSample:
-    """What was done in place of what was chosen, and who was helped, as far as the environment says it."""
+    """What was done instead of what was chosen, and who was helped, as far as the environment says it."""
     return replace(a_t, action=info.get("executed_action", a_t.action), intervened=info.get("intervened"))
 
 

@@ -16,7 +16,7 @@ examples:
   the ceiling
       cronos-eval --expert=true
 
-A suite and split that has its results.json in --output_dir is done: the same command goes on with the next one.
+A suite and split that has its results.json in --output_dir is done: the same command continues with the next one.
 The environment follows from the policy; --env.scene and the like set it by hand.
 """
 
@@ -81,7 +81,7 @@ def evaluate(config: CronosEvalConfig) -> None:
     try:
         results = evaluation.run()
     except KeyboardInterrupt:
-        sys.exit(f"\ninterrupted: the same command with --output_dir={config.output_dir} goes on")
+        sys.exit(f"\ninterrupted: to continue, run the same command with --output_dir={config.output_dir}")
     assert config.output_dir is not None
     print_tables(config.output_dir)
     for one in results:

@@ -1,9 +1,8 @@
 """`cronos-record-demos`: let the scripted expert demonstrate every task, into a LeRobotDataset.
 
-```bash
-cronos-record-demos --env.type=cronos --env.scene=kitchen_2x2 \\
-    --dataset.repo_id=me/kitchen_demos --dataset.num_episodes=500
-```
+Example:
+    cronos-record-demos --env.type=cronos --env.scene=kitchen_2x2 \\
+        --dataset.repo_id=me/kitchen_demos --dataset.num_episodes=500
 """
 
 import logging

@@ -48,7 +48,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "cronos-reproduce",
         usage="%(prog)s EXPERIMENT [flags] [-- flags of cronos-train]",
-        description=(__doc__ or "").split("`: ")[1].capitalize(),
+        description=__doc__,
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 STATE = "state.pt"
 FORMAT = 1
-"""Of state.pt; another one is refused."""
+"""Of state.pt; another one is an error."""
 PARTIAL = ".partial_"
 """Prefix of folders that a kill may leave behind; the next checkpoint removes them."""
 DAMAGE = (RuntimeError, ValueError, KeyError, TypeError, AttributeError, EOFError, OSError, UnpicklingError)

@@ -106,7 +106,7 @@ class RunLogger:
 
     def _say(self, line: str) -> None:
         """Print a line, above the bar where there is one."""
-        # A run whose terminal or pipe is gone goes on, and saves.
+        # A run whose terminal or pipe is gone continues, and saves.
         with suppress(OSError), self._bar.external_write_mode():
             print(line, flush=True)
 

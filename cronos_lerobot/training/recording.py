@@ -23,7 +23,7 @@ MADE_WITH = ("env", "num_envs", "seed", "protocol", "algorithm", "policy")
 class StreamObserver:
     """Records the streams of a run, in its first process, or nothing at all.
 
-    When writing fails (a full disk, say) the recording ends where it was last flushed, and the run goes on.
+    When writing fails (a full disk, say) the recording ends where it was last flushed, and the run continues.
 
     Args:
         run: whose streams they are.
@@ -81,6 +81,6 @@ class StreamObserver:
         except RecordingError as error:
             self._stopped = f"{error}; {self._recorder.writer.num_episodes} segments are safe"
             self._recorder = None
-            logging.warning(f"RECORDING STOPPED, the training goes on without it: {self._stopped}")
+            logging.warning(f"RECORDING STOPPED, the training continues without it: {self._stopped}")
             self._report(self._stopped)
             return None

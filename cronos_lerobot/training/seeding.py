@@ -52,7 +52,7 @@ class NamedGenerators:
 
         Args:
             state: of `state_dict`.
-            step: that the run goes on from.
+            step: that the run continues from.
         """
         for name, rng in self._numpy.items():
             if name in state["numpy"]:

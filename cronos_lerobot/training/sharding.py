@@ -87,7 +87,7 @@ class ShardedEnv:
         return self._concatenate(self._env.unsuitable_bodies())
 
     def put_back(self, stream: int, body: str, rng: np.random.Generator) -> None:
-        """Put one body of a stream at a free place; `rng` goes on alike in all processes."""
+        """Put one body of a stream at a free place; `rng` continues alike in all processes."""
         owner = stream // self._env.num_envs
         if owner == self._ranks.rank:
             self._env.put_back(stream - self.mine.start, body, rng)

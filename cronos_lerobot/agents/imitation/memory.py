@@ -173,7 +173,7 @@ class SegmentMemory:
 
 
 def own_share(memories: list[list[Any]], rank: int, count: int) -> list[Any]:
-    """What process `rank` of `count` goes on with of the memories of all processes that made a checkpoint."""
+    """What process `rank` of `count` continues with of the memories of all processes that made a checkpoint."""
     if len(memories) == count:
         return memories[rank]
     return [segment for memory in memories for segment in memory][rank::count]
@@ -218,7 +218,7 @@ def by_return(returns: np.ndarray, beta: float) -> np.ndarray:
 def by_advantage(returns: np.ndarray, instructions: np.ndarray, beta: float, max_weight: float) -> np.ndarray:
     """min(exp(A / beta), max_weight), (segments,): advantage-weighted regression (Peng et al., 2019).
 
-    A is the return less the mean return of all segments under the same instruction, in place of a critic's value.
+    A is the return less the mean return of all segments under the same instruction, instead of a critic's value.
     """
     _, tasks = np.unique(instructions, return_inverse=True)
     means = np.bincount(tasks, weights=returns) / np.bincount(tasks)

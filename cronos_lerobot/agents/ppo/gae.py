@@ -5,7 +5,7 @@ of the action under the same instruction. What the trace is bootstrapped from th
 
 | boundary                       | trace | bootstrapped from                                             |
 |--------------------------------|-------|---------------------------------------------------------------|
-| none (also a success)          | goes on | V(o_{t+1}, tau), the next row                               |
+| none (also a success)          | whole | V(o_{t+1}, tau), the next row                                 |
 | policy update (every U)        | cut   | V(o_{t+1}, tau)                                               |
 | task switch (every K)          | cut   | V(o_{t+1}, tau) under the OLD instruction                     |
 | end-effector reset             | cut   | V(o_{t+1}, tau) BEFORE the arm goes home, OLD instruction     |

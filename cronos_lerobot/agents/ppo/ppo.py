@@ -207,8 +207,8 @@ class PPO:
     ) -> float:
         """Backpropagate the mean loss over a group of minibatches.
 
-        Returns the KL divergence over the minibatches of all processes, of as many as were looked at: none is
-        negative, so the first ones may do to exceed `kl_limit`, and there are no gradients then.
+        Returns the KL divergence over the minibatches of all processes. None is negative, so the sum may exceed
+        `kl_limit` after the first ones: it stops there, without gradients.
         """
         self.optimizer.zero_grad(set_to_none=True)
         size = sum(len(minibatch.indices) for minibatch in group)

@@ -207,7 +207,7 @@ class RolloutBuffer:
         Args:
             batch_size: decisions in one.
             rng: draws the order.
-            observations: columns (rows, num_streams, ...) in place of the stored ones.
+            observations: columns (rows, num_streams, ...) instead of the stored ones.
             limit: of so many decisions only, the first ones of that order.
         """
         observations = self.observations if observations is None else observations

@@ -62,12 +62,12 @@ class CronosEnvConfig(EnvConfig):
     """A benchmark of its author's own configurations and chains: <owner>/<repository>[@<revision>] of a dataset on
     the Hub, or a folder; null for this package's."""
     advance: str = "window"
-    """When a chain (--env.suite=sequential) goes on to its next task: window (when the 80 steps are over) or
+    """When a chain (--env.suite=sequential) continues to its next task: window (when the 80 steps are over) or
     on_success (at once)."""
     end_effector_reset: bool = False
     """Send the arm home between the tasks of a chain (--env.suite=sequential)."""
     obs_type: str = "pixels_agent_pos"
-    """pixels_agent_pos, or environment_state_agent_pos for the privileged state in place of pixels."""
+    """pixels_agent_pos, or environment_state_agent_pos for the privileged state instead of pixels."""
     task_observation: str = "none"
     """one_hot appends which object and which receptacle is meant to observation.state, for policies that read no
     instructions (ACT, Diffusion); none does not."""

@@ -311,7 +311,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             array[:] = state[name]
 
     def __getstate__(self) -> dict[str, Any]:
-        """For pickle and `copy.deepcopy`: a copy goes on bit for bit, without the renderers and the timer."""
+        """For pickle and `copy.deepcopy`: a copy continues bit for bit, without the renderers and the timer."""
         kept = {name: value for name, value in self.__dict__.items() if name not in ("simulation", "timer")}
         return kept | {"simulation": self.simulation.get_state()}
 

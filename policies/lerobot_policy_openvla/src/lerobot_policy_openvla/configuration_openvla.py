@@ -30,7 +30,7 @@ class OpenVLAConfig(PreTrainedConfig):
     adapter: str | None = None
     """Trained LoRA adapter in PEFT's format, a Hub repository or folder, that goes onto the checkpoint."""
     merge_adapter: bool = False
-    """Add `adapter` to the weights. False keeps it apart, and training goes on with it."""
+    """Add `adapter` to the weights. False keeps it apart, and training continues with it."""
     unnorm_key: str | None = None
     """Data set whose action quantiles the bins span: of dataset_statistics.json beside the adapter or the
     checkpoint, or else of the checkpoint's config.json. null: the only one. `dataset`: the quantiles of the
@@ -47,7 +47,7 @@ class OpenVLAConfig(PreTrainedConfig):
     """What LoRA adapts, all linear layers of `vision`, `projector` and `language`. Without `vision`, the vision
     towers' features of an observation are computed once, while acting, and kept for the update."""
     lora_targets: list[str] = field(default_factory=list)
-    """Names of the very layers to adapt in place of `lora_modules`; set when `adapter` is loaded."""
+    """Names of the very layers to adapt instead of `lora_modules`; set when `adapter` is loaded."""
 
     image_key: str | None = None
     """Which camera, e.g. `observation.images.front`. null: the only one there is."""

@@ -53,7 +53,7 @@ class OpenVLAPolicy(PreTrainedPolicy):
         Args:
             config: its `architecture` and `action_statistics` are filled in.
             **kwargs: `dataset_stats` of LeRobot, for `unnorm_key=dataset`; `parts`, a network and a prompt
-                tokenizer to use in place of the checkpoint's; LeRobot's others do not matter.
+                tokenizer to use instead of the checkpoint's; LeRobot's others do not matter.
         """
         super().__init__(config)
         config.resolve(kwargs.get("dataset_stats"))
@@ -243,7 +243,7 @@ class OpenVLAPolicy(PreTrainedPolicy):
 
     @property
     def encode_observation(self) -> Callable[[Batch], Batch] | None:
-        """If the vision towers are frozen, the function that puts their features in place of the image."""
+        """If the vision towers are frozen, the function that puts their features instead of the image."""
         return None if self._trains_vision else self._with_features
 
     @torch.no_grad()
@@ -270,7 +270,7 @@ class OpenVLAPolicy(PreTrainedPolicy):
             batch: image, or kept features, and `task`.
             temperature: of the sampling, 0 is greedy.
             generator: random source; None is torch's global one.
-            uniform: the randomness itself, (B, A) in [0, 1), in place of a generator: a sample then does not
+            uniform: the randomness itself, (B, A) in [0, 1), instead of a generator: a sample then does not
                 depend on the others of its batch.
 
         Returns:

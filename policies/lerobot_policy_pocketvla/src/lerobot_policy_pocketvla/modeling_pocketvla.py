@@ -180,7 +180,7 @@ class PocketVLAPolicy(PreTrainedPolicy):
 
     @property
     def encode_observation(self) -> Callable[[Batch], Batch] | None:
-        """With `freeze_encoder`, the function that puts encodings in place of a batch's images; else None."""
+        """With `freeze_encoder`, the function that replaces a batch's images by encodings; else None."""
         return self._encoded if self.encoder and self.config.freeze_encoder else None
 
     @torch.no_grad()

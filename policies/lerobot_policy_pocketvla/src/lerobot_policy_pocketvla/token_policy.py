@@ -139,7 +139,7 @@ class PocketVLATokenPolicy(PocketVLAPolicy, heads=("gaussian", "categorical")):
             batch: observations and `task`.
             temperature: of the sampling, 0 is greedy.
             generator: random source; None is torch's global one.
-            uniform: the randomness itself, (B, D) in [0, 1), in place of a generator: a sample then does not
+            uniform: the randomness itself, (B, D) in [0, 1), instead of a generator: a sample then does not
                 depend on the others of its batch.
 
         Returns:

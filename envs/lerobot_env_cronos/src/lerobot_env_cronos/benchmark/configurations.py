@@ -213,7 +213,7 @@ def sample_configurations(scene: Scene, number: int, rng: np.random.Generator) -
 
 
 def redraw_shared(scene: Scene, held_out: np.ndarray, train: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The held-out configurations (n, bodies, 7), others in place of those that are training configurations.
+    """The held-out configurations (n, bodies, 7), others instead of those that are training configurations.
 
     Raises:
         ValueError: there are hardly any others.

@@ -48,8 +48,8 @@ class Judge:
             on what it lay, untouched by the hand; or NOTHING.
         pose: (n, objects, 7) its pose then.
         confirmed: (n, objects) where it was at the last two readings, and still if it lay; NOTHING if neither.
-        rests: (n, objects) what it was last confirmed to lie on, for as long as that goes on carrying it, whether
-            the hand touches it or not; else NOTHING.
+        rests: (n, objects) what it was last confirmed to lie on, for as long as that carries it, whether the hand
+            touches it or not; else NOTHING.
         held: (n, objects) readings in a row, at most CARRY_READINGS, at which it was IN_HAND.
         carried_to: (n, objects) what bore the object first since the hand let go of it; IN_HAND since the hand has
             carried it at CARRY_READINGS readings; NOTHING when something else has borne it since.

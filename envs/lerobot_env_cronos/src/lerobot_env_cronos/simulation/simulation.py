@@ -298,7 +298,7 @@ class Simulation:
         """Everything that decides the future, as arrays with a leading dimension n.
 
         Bodies that MuJoCo put to sleep are woken by this call, exactly as `set_state` wakes them, so that a
-        simulation that goes on and one that was loaded stay bit-identical.
+        simulation that continues and one that was loaded stay bit-identical.
         """
         state = {name: array.copy() for name, array in self._state_arrays().items()}
         state["scene"] = self._scene_number.copy()
