@@ -210,7 +210,7 @@ def _setting(results: Mapping[str, Any]) -> str:
     seen = results["obs_type"] + " with the privileged state" * bool(results["reads_privileged_state"])
     seen += " and the task" * (results["observation"]["task_observation"] != "none")
     return "; ".join(
-        [describe_sampling(results["temperature"]), f"seed {results['seed']}", seen, ", ".join(packages)]
+        [describe_sampling(results["temperature"]), f"sampling seed {results['seed']}", seen, ", ".join(packages)]
     )
 
 

@@ -57,7 +57,7 @@ def test_values_and_notes():
     assert (second.task_id, second.value) == ("sequential_train", 1.0)
     assert second.notes.startswith("n=4; average chain length, 95 % interval 0.")
     assert "SEQ 0, 1, ... 75.0, 25.0 %" in second.notes
-    assert "temperature 0.6; seed 3; pixels_agent_pos; cronos-lerobot 0.1.0" in second.notes
+    assert "temperature 0.6; sampling seed 3; pixels_agent_pos; cronos-lerobot 0.1.0" in second.notes
     assert first.source_url == "https://example.org/log"
     told = {"reads_privileged_state": True, "observation": {"task_observation": "one_hot"}}
     (one,) = entries(independent(**told))
