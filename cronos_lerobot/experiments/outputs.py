@@ -58,11 +58,11 @@ def _draw(experiment: Experiment, found: pd.DataFrame, folder: Path) -> list[str
     if not len(found):
         return []
     name = experiment.name
-    figures = {
-        name: plots.curves_figure(experiment, found),
-        f"{name}_ends": plots.ends_figure(experiment, found),
-        f"{name}_by_task": plots.by_task_figure(experiment, found),
-    }
+    finished = found[found["finished"].astype(bool)]
+    figures = {name: plots.curves_figure(experiment, found)}
+    if len(finished):
+        figures[f"{name}_ends"] = plots.ends_figure(experiment, finished)
+    figures[f"{name}_by_task"] = plots.by_task_figure(experiment, found)
     for file, figure in figures.items():
         figure.savefig(folder / f"{file}.png", dpi=120)
     return [f"{file}.png" for file in figures]
