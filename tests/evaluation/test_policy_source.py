@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 from lerobot.configs import PreTrainedConfig
@@ -73,9 +74,10 @@ def test_an_official_base_is_found_by_its_name_and_is_what_its_card_says(name, t
     monkeypatch.chdir(tmp_path)
     source = find_policy(name)
     assert (source.name, pin_policy(name, None)) == (name, (str(source.folder), None))
-    config = PreTrainedConfig.from_pretrained(source.folder)
-    config.pretrained_path = source.folder
-    assert f"Fingerprint: `{fingerprint(config)}`" in (source.folder / "README.md").read_text()
+    weights = files_fingerprint(source.folder)
+    assert f"Fingerprint: `{weights}`" in (source.folder / "README.md").read_text()
+    benchmark = Path(__file__).parents[2] / "docs/benchmark.md"
+    assert f"| `{name}` | `{weights}` |" in benchmark.read_text()
     # A folder of that name is what it is everywhere else: a folder.
     (tmp_path / name).mkdir()
     with pytest.raises(ValueError, match="no checkpoint"):
