@@ -22,7 +22,7 @@ BLOCK = re.compile(r"(?:`([\w/]+\.py)`[^\n]*:\n\n)?```(bash|python)\n(.*?)```", 
 """A block of code, and the file that the line before it names."""
 OURS = re.compile(r"(cronos|lerobot)-[\w-]+|python ")
 SKIPPED = re.compile(
-    r"<|\.\.\.|=cuda|smolvla|openvla|launcher=slurm|me/(policy|eer|my_|clone|lora|cronos_kitchen)|^python|-reproduce"
+    r"<|\.\.\.|=cuda|smolvla|openvla|launcher=slurm|me/(policy|eer|my_|clone|lora|cronos_kitchen)|^python|-reproduce|=mine |outputs/mine"
 )
 SHORT = (
     # Command, flag, value that a quick run has.
@@ -54,7 +54,7 @@ def run_page(page: Path, whole: bool) -> int:
     """Run the commands of a page; returns how many failed."""
     failed = 0
     with tempfile.TemporaryDirectory() as folder:
-        for name in ("examples", "benchmarks", "policies", "cronos_lerobot"):
+        for name in ("examples", "benchmarks", "policies", "cronos_lerobot", "datasets_cards"):
             (Path(folder) / name).symlink_to(ROOT / name)
         for file, language, code in BLOCK.findall(page.read_text()):
             if language == "python" and file:
