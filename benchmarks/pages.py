@@ -22,7 +22,8 @@ BLOCK = re.compile(r"(?:`([\w/]+\.py)`[^\n]*:\n\n)?```(bash|python)\n(.*?)```", 
 """A block of code, and the file that the line before it names."""
 OURS = re.compile(r"(cronos|lerobot)-[\w-]+|python ")
 SKIPPED = re.compile(
-    r"<|\.\.\.|=cuda|smolvla|openvla|launcher=slurm|me/(policy|eer|my_|clone|lora|cronos_kitchen)|^python|-reproduce|=mine |outputs/mine"
+    r"<|\.\.\.|=cuda|smolvla|openvla|launcher=slurm|^python|-reproduce|=mine |outputs/mine"
+    r"|me/(policy|eer|t320|my_|clone|lora|cronos_kitchen)"
 )
 SHORT = (
     # Command, flag, value that a quick run has.
