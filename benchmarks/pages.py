@@ -1,10 +1,10 @@
 """Run the commands of the documentation, page by page, in a new folder.
 
-    python benchmarks/pages.py README.md docs/quickstart.md [--whole]
+    python benchmarks/pages.py README.md docs/quickstart.md
 
-Files that a page asks for are written, and its commands run in their order. By default they are shortened: a few
-steps, episodes and demonstrations show that a page holds together. `--whole` runs them as they are. Commands that
-need the Hub, a GPU, an installation or something of your own (`<...>`) are printed as skipped.
+Files that a page asks for are written, and its commands run in their order, shortened: a few steps, episodes and
+demonstrations show that a page holds together. Commands that need the Hub, a GPU, an installation or something of
+your own (`<...>`) are printed as skipped.
 """
 
 import argparse
@@ -20,9 +20,9 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"(?:`([\w/]+\.py)`[^\n]*:\n\n)?```(bash|python)\n(.*?)```", re.DOTALL)
 """A block of code, and the file that the line before it names."""
-OURS = re.compile(r"(cronos|lerobot)-[\w-]+|python ")
+OURS = re.compile(r"(PYTHONPATH=\S+ )?(cronos|lerobot)-")
 SKIPPED = re.compile(
-    r"<|\.\.\.|=cuda|smolvla|openvla|launcher=slurm|^python|-reproduce|=mine |outputs/mine"
+    r"<|\.\.\.|=cuda|smolvla|openvla|-reproduce|=mine |outputs/mine"
     r"|me/(policy|eer|t320|my_|clone|lora|cronos_kitchen)"
 )
 SHORT = (
@@ -45,13 +45,12 @@ def main() -> None:
     """Run the pages; ends with the number of commands that failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pages", nargs="+", type=Path)
-    parser.add_argument("--whole", action="store_true", help="run the commands as they are")
     args = parser.parse_args()
-    failed = sum(run_page(page.resolve(), args.whole) for page in args.pages)
+    failed = sum(run_page(page.resolve()) for page in args.pages)
     sys.exit(f"{failed} commands failed" if failed else 0)
 
 
-def run_page(page: Path, whole: bool) -> int:
+def run_page(page: Path) -> int:
     """Run the commands of a page; returns how many failed."""
     failed = 0
     with tempfile.TemporaryDirectory() as folder:
@@ -63,21 +62,14 @@ def run_page(page: Path, whole: bool) -> int:
                 path.parent.mkdir(exist_ok=True)
                 path.write_text(code)
             for command in commands(code) if language == "bash" else ():
-                failed += not run(command if whole else shorten(command), folder)
+                failed += not run(shorten(command), folder)
     return failed
 
 
 def commands(code: str) -> list[str]:
-    """The commands of a block, with what their variables stand for."""
-    variables, found = {}, []
-    for line in code.replace("\\\n", " ").splitlines():
-        if assigned := re.match(r'(\w+)="(.*)"$', line):
-            variables[f"${assigned[1]}"] = assigned[2]
-        for name, value in variables.items():
-            line = line.replace(name, value) if line.startswith(name) else line
-        if OURS.match(re.sub(r"^\w+=\S+ ", "", line)):
-            found.append(line.split(" # ")[0].strip())
-    return found
+    """The commands of a block."""
+    lines = [line.split(" # ")[0].strip() for line in code.replace("\\\n", " ").splitlines()]
+    return [line for line in lines if OURS.match(line)]
 
 
 def shorten(command: str) -> str:
@@ -85,7 +77,7 @@ def shorten(command: str) -> str:
     for name, flag, value in SHORT:
         if re.search(rf"(^| ){name}( |$)", command):
             command = re.sub(rf" {re.escape(flag)}=\S+", "", command) + f" {flag}={value}"
-    return command.replace(" --quick=true", "")
+    return command
 
 
 def run(command: str, folder: str) -> bool:

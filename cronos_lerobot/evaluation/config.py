@@ -119,6 +119,7 @@ class CronosEvalConfig:
         for name, value in self._derived(given).items():
             if name not in given:
                 setattr(env, name, value)
+        # The size of the state tells it, in the scene that is known by now.
         if self.policy is not None and "task_observation" not in given:
             env.task_observation = task_observation_of(self.policy.input_features or {}, env)
         env.__post_init__()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import yaml
@@ -29,6 +29,7 @@ class Row:
     @property
     def label(self) -> str:
         """What tables and figures call it, such as `T = 1280, EER, CL`."""
+        from cronos_lerobot.protocol import ProtocolConfig
         from cronos_lerobot.report.runs import describe_protocol
 
         given = dict(flag.removeprefix("--").split("=", 1) for flag in self.flags)
@@ -37,8 +38,7 @@ class Row:
         others = [
             f"{name.rpartition('.')[2]}={value}" for name, value in given.items() if name.startswith("algorithm.")
         ]
-        defaults = {"task_switch_interval": 80, "scene_reset_interval": 1280, "end_effector_reset": True}
-        return ", ".join([describe_protocol(defaults | own), *others])
+        return ", ".join([describe_protocol(asdict(ProtocolConfig()) | own), *others])
 
 
 def _value(text: str) -> Any:

@@ -25,13 +25,14 @@ def write_outputs(experiment: Experiment, runs: Sequence[Run], folder: Path) -> 
     folder.mkdir(parents=True, exist_ok=True)
     name, options = experiment.name, runs[0].options
     found = tables.collect(runs)
-    main = tables.main_table(experiment, found)
+    finished = found[found["finished"].astype(bool)]
+    main = tables.main_table(experiment, finished)
     budgets = [options.scale.scaled(budget, experiment.steps) for budget in experiment.budgets]
     sections = {
         "": main,
-        "Success after so many interventions": tables.budget_table(experiment, found, budgets),
-        "Sequences of tasks": tables.sequential_table(experiment, found),
-        "Streams without a reset": tables.stream_table(experiment, found),
+        "Success after so many interventions": tables.budget_table(experiment, finished, budgets),
+        "Sequences of tasks": tables.sequential_table(experiment, finished),
+        "Streams without a reset": tables.stream_table(experiment, finished),
     }
     where = f"{experiment.source} of the paper. " if experiment.source else ""
     lines = [f"# {experiment.title}", ""]

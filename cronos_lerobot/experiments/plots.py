@@ -53,7 +53,8 @@ def ends_figure(experiment: Experiment, found: pd.DataFrame) -> Figure:
             ends = [one["success"].iloc[-1] for one in curves(found, row, split)]
             if ends:
                 summary, place = summarise(ends, (0, 1)), y + shift
-                ax.plot(summary.ci95 or ends[:1], [place] * (2 if summary.ci95 else 1), "-", color=color, lw=2)
+                if summary.ci95:
+                    ax.plot(summary.ci95, [place, place], color=color, lw=2)
                 ax.plot(ends, [place] * len(ends), "o", color=color, ms=4, alpha=0.5, mew=0)
                 ax.plot(summary.mean, place, "D", color=color, ms=6, label=title)
         spent = [one["interventions"].iloc[-1] for one in curves(found, row, "train")]

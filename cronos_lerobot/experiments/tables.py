@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import isnan
 from pathlib import Path
+from statistics import mean
+from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from cronos_lerobot.experiments.definitions import Experiment, Row
 from cronos_lerobot.experiments.plan import Run
 from cronos_lerobot.report.load import EVALUATIONS, TRAIN, load_evaluations
 from cronos_lerobot.statistics import Summary, performance_gap, success_at, summarise
+
+Parts = list[dict[str, Any]]
+"""Numbers of an evaluation by task, position or segment, as in the column `parts`."""
 
 
 def collect(runs: Sequence[Run]) -> pd.DataFrame:
@@ -46,16 +50,15 @@ def curves(found: pd.DataFrame, row: Row, split: str) -> list[pd.DataFrame]:
 
 
 def main_table(experiment: Experiment, found: pd.DataFrame) -> pd.DataFrame:
-    """Success at the end, interventions, D and C of every row, over its finished seeds.
+    """Success at the end, interventions, D and C of every row, over its seeds.
 
     D and C are the areas between the curve and 1.0 over interaction steps and interventions (Equations 3 and 4),
     divided by the length of the axis.
     """
     rows = []
     paper = dict(zip([row.name for row in experiment.rows], experiment.paper, strict=False))
-    finished = found[found["finished"].astype(bool)]
     for row in experiment.rows:
-        seeds, held_out = curves(finished, row, "train"), curves(finished, row, "held_out")
+        seeds, held_out = curves(found, row, "train"), curves(found, row, "held_out")
         if not seeds:
             continue
         cells = {
@@ -80,7 +83,7 @@ def budget_table(experiment: Experiment, found: pd.DataFrame, budgets: Sequence[
     """Success after numbers of interventions, interpolated between evaluations; empty where a run spent fewer."""
     rows = []
     for row in experiment.rows if budgets else ():
-        seeds = curves(found[found["finished"].astype(bool)], row, "train")
+        seeds = curves(found, row, "train")
         cells = {"row": row.label}
         for budget in budgets:
             is_reached = all(one["interventions"].iloc[-1] >= budget for one in seeds)
@@ -92,37 +95,35 @@ def budget_table(experiment: Experiment, found: pd.DataFrame, budgets: Sequence[
 
 
 def sequential_table(experiment: Experiment, found: pd.DataFrame) -> pd.DataFrame:
-    """SEQ 0-3 and the chain length of every row and split, over its finished seeds."""
-    chosen = found[(found["suite"] == "sequential") & found["finished"].astype(bool)]
-    rows = []
-    for row in experiment.rows:
-        for split, runs in chosen[chosen["row"] == row.name].groupby("split", sort=False):
-            parts = [
-                {part["part"]: part["success"] for part in some if part["orderings"] == "all"}
-                for some in runs["parts"]
-            ]
-            means = {name: show(summarise([one[name] for one in parts])) for name in parts[0]}
-            rows.append(
-                {"row": row.label, "split": split, "seeds": len(parts), "n": int(runs["n"].iloc[0])} | means
-            )
-    return pd.DataFrame(rows)
+    """SEQ 0-3 and the chain length of every row and split, over its seeds."""
+
+    def values(parts: Parts) -> dict[str, float]:
+        return {part["part"]: part["success"] for part in parts if part["orderings"] == "all"}
+
+    return _by_split(experiment, found[found["suite"] == "sequential"], values)
 
 
 def stream_table(experiment: Experiment, found: pd.DataFrame) -> pd.DataFrame:
-    """Success in streams without a reset, of every row and split, over its finished seeds.
+    """Success in streams without a reset, of every row and split, over its seeds; n counts streams."""
 
-    All segments, the first one, and the second half; n counts streams.
-    """
-    chosen = found[(found["suite"] == "stream") & found["finished"].astype(bool)]
+    def values(parts: Parts) -> dict[str, float]:
+        segments = [part["success"] for part in parts]
+        half = segments[len(segments) // 2 :]
+        return {"all": mean(segments), "first segment": segments[0], "second half": mean(half)}
+
+    return _by_split(experiment, found[found["suite"] == "stream"], values)
+
+
+def _by_split(
+    experiment: Experiment, found: pd.DataFrame, values: Callable[[Parts], dict[str, float]]
+) -> pd.DataFrame:
     rows = []
     for row in experiment.rows:
-        for split, runs in chosen[chosen["row"] == row.name].groupby("split", sort=False):
-            segments = np.array([[part["success"] for part in parts] for parts in runs["parts"]])
-            shares = {"all": segments, "first segment": segments[:, :1]}
-            shares["second half"] = segments[:, segments.shape[1] // 2 :]
-            means = {name: show(summarise(values.mean(axis=1), (0, 1))) for name, values in shares.items()}
+        for split, runs in found[found["row"] == row.name].groupby("split", sort=False):
+            seeds = [values(parts) for parts in runs["parts"]]
+            means = {name: show(summarise([one[name] for one in seeds])) for name in seeds[0]}
             rows.append(
-                {"row": row.label, "split": split, "seeds": len(runs), "n": int(runs["n"].iloc[0])} | means
+                {"row": row.label, "split": split, "seeds": len(seeds), "n": int(runs["n"].iloc[0])} | means
             )
     return pd.DataFrame(rows)
 

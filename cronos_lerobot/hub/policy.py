@@ -12,6 +12,7 @@ from lerobot_env_cronos import get_scene
 from safetensors import safe_open
 
 from cronos_lerobot.agents.steering.steered import STEERING
+from cronos_lerobot.bases import OFFICIAL
 from cronos_lerobot.evaluation.policy_env import trained_scene
 from cronos_lerobot.evaluation.policy_loading import damage_named
 from cronos_lerobot.evaluation.policy_source import (
@@ -29,6 +30,7 @@ from cronos_lerobot.hub.push import matching
 from cronos_lerobot.hub.results import TRAINING, describe_setting, differences
 from cronos_lerobot.hub.stage import read_json, readable, stage, write_text
 from cronos_lerobot.protocol.interventions import COUNTED_INTERVENTIONS
+from cronos_lerobot.report.load import policy_name
 from cronos_lerobot.report.runs import TrainingRun
 
 FILES = (
@@ -136,10 +138,10 @@ def _about(
 
 def _training(run: TrainingRun) -> dict[str, Any]:
     """What an entry of the leaderboard says of the training."""
-    names = ("interaction_steps", "interventions", "interventions_by_kind")
+    counts = {name: run.last[name] for name in ("interaction_steps", "interventions")}
     base = (run.config.get("policy") or {}).get("pretrained_path")
-    own = {"num_envs": run.config["num_envs"], "seed": run.seed, "base_fingerprint": run.base}
-    return {name: run.last[name] for name in names} | own | {"base": Path(base).name if base else None}
+    name = policy_name(base).removeprefix(f"{OFFICIAL.name}/") if base else None
+    return counts | {"seed": run.seed, "base": name, "base_fingerprint": run.base}
 
 
 def _began_with(trained: dict[str, Any], run: TrainingRun | None) -> str | None:

@@ -109,7 +109,8 @@ def _describe_training(repo_id: str, revision: str) -> str:
     with readable(file):
         told = read_json(file)
         counts = f"{told['interaction_steps']:,} steps, {told['interventions']:,} interventions"
-        base = f"base {told['base']} {told['base_fingerprint']}" if told["base"] else "from scratch"
+        # A base of the Hub has no fingerprint.
+        base = f"base {told['base']} {told['base_fingerprint'] or ''}".strip() if told["base"] else "from scratch"
         return f"trained for {counts}, seed {told['seed']}, {base}"
 
 
@@ -144,7 +145,7 @@ def make_entries(
     policy: Mapping[str, Any],
     benchmark: Benchmark,
     config: ResultsConfig,
-    training: str = "",
+    training: str,
 ) -> list[EvalResultEntry]:
     """An entry for each suite and split to publish.
 

@@ -38,9 +38,9 @@ examples:
   two policies
       cronos-report compare outputs/eval/base outputs/eval/eer
   two rows of a table, all seeds of each
-      cronos-report compare outputs/reproduce/table1/t80 outputs/reproduce/table1/t1280_eer
+      cronos-report compare outputs/reproduce/runs/kitchen_2x2_state_paper_small/{t80,t1280_eer}_307k
 
-docs/evaluate.md says how the intervals and p-values are computed.
+docs/design.md says how the intervals and p-values are computed.
 """
 
 

@@ -47,7 +47,7 @@ def sequential(**changes):
 
 
 def entries(*results, policy=None, **flags):
-    return make_entries(results, policy or {}, BENCHMARK, ResultsConfig(**flags))
+    return make_entries(results, policy or {}, BENCHMARK, ResultsConfig(**flags), training="")
 
 
 def test_values_and_notes():
