@@ -1,9 +1,9 @@
-"""Run the commands of the documentation, page by page, in a new folder.
+"""Run the commands of the documentation, page by page, in one new folder.
 
     python benchmarks/pages.py README.md docs/quickstart.md
 
-Files that a page asks for are written, and its commands run in their order, shortened: a few steps, episodes and
-demonstrations show that a page holds together. Commands that need the Hub, a GPU, an installation or something of
+Files that the pages ask for are written, and their commands run in their order, shortened: a few steps, episodes and
+demonstrations show that the pages hold together. A page that uses the policies of another comes after it. Commands that need the Hub, a GPU, an installation or something of
 your own (`<...>`) are printed as skipped.
 """
 
@@ -46,23 +46,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pages", nargs="+", type=Path)
     args = parser.parse_args()
-    failed = sum(run_page(page.resolve()) for page in args.pages)
-    sys.exit(f"{failed} commands failed" if failed else 0)
-
-
-def run_page(page: Path) -> int:
-    """Run the commands of a page; returns how many failed."""
-    failed = 0
     with tempfile.TemporaryDirectory() as folder:
         for name in ("examples", "benchmarks", "policies", "cronos_lerobot", "datasets_cards"):
             (Path(folder) / name).symlink_to(ROOT / name)
-        for file, language, code in BLOCK.findall(page.read_text()):
-            if language == "python" and file:
-                path = Path(folder) / file
-                path.parent.mkdir(exist_ok=True)
-                path.write_text(code)
-            for command in commands(code) if language == "bash" else ():
-                failed += not run(shorten(command), folder)
+        failed = sum(run_page(page, folder) for page in args.pages)
+    sys.exit(f"{failed} commands failed" if failed else 0)
+
+
+def run_page(page: Path, folder: str) -> int:
+    """Run the commands of a page; returns how many failed."""
+    failed = 0
+    for file, language, code in BLOCK.findall(page.read_text()):
+        if language == "python" and file:
+            path = Path(folder) / file
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(code)
+        for command in commands(code) if language == "bash" else ():
+            failed += not run(shorten(command), folder)
     return failed
 
 
