@@ -2,9 +2,9 @@
 
     python benchmarks/pages.py README.md docs/quickstart.md
 
-Files that the pages ask for are written, and their commands run in their order, shortened: a few steps, episodes and
-demonstrations show that the pages hold together. A page that uses the policies of another comes after it. Commands that need the Hub, a GPU, an installation or something of
-your own (`<...>`) are printed as skipped.
+Files that the pages ask for are written, and their commands run in their order, shortened: a few steps, episodes
+and demonstrations show that the pages hold together. A page that uses the policies of another comes after it.
+Commands that need the Hub, a GPU, an installation or something of your own (`<...>`) are printed as skipped.
 """
 
 import argparse
