@@ -16,7 +16,7 @@ class ScriptedEnv(SequentialVectorEnv):
     def step_streams(self, actions, ids):
         self.clock += 1
         self.stepped.append(ids.tolist())
-        due = [self.script[i][TASKS.index(self.tasks[i])] for i in range(self.num_envs)]
+        due = [self.script[i][TASKS.index(self.current_tasks[i])] for i in range(self.num_envs)]
         # Held for this one step only: that is enough, whatever happens to the object afterwards.
         self.is_success = np.array([when == n + 1 for when, n in zip(due, self._elapsed, strict=True)])
         diverged = np.array([(self.clock, i) in self.diverge_at for i in range(self.num_envs)])

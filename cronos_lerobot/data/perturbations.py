@@ -136,7 +136,7 @@ class GraspMisses:
 
     def _steer(self, stream: int, position: np.ndarray) -> tuple[np.ndarray, float]:
         """Translation [m] and gripper command of one stream that is missing."""
-        body = self._env.simulation.body_pose(self._env.tasks[stream].object)[stream, :3]
+        body = self._env.simulation.body_pose(self._env.current_tasks[stream].object)[stream, :3]
         grasp = body + self._offset[stream]
         hover = grasp + np.array([0.0, 0.0, self.HOVER_M])
         if not self._descending[stream]:

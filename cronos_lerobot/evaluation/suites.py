@@ -83,7 +83,7 @@ def classify_starts(env: Any, ids: np.ndarray) -> list[Start]:
     complete, unsuitable = env.find_complete(tasks), find_unsuitable(env.simulation)
     starts = []
     for i in ids:
-        own = env.tasks[i]
+        own = env.current_tasks[i]
         meant = [bodies.index(body) for body in (own.object, own.receptacle)]
         done = [task for task, is_done in zip(tasks, complete[i], strict=True) if is_done]
         if own in done:

@@ -189,7 +189,7 @@ def test_the_expert_is_paid_after_it_has_let_go():
     for _ in range(80):
         env.step(expert.act())
         for i in np.flatnonzero(env.is_success & ~paid):
-            assert lies_on(env, env.tasks[i])[i]
+            assert lies_on(env, env.current_tasks[i])[i]
         paid |= env.is_success
     assert paid.all()
     # What is complete does not depend on which task a stream has; no object lies on both receptacles.

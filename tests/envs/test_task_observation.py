@@ -20,7 +20,7 @@ def test_two_tasks_in_one_state_differ_there_and_nowhere_else():
     env.set_task(range(3), [SCENE.tasks[0], SCENE.tasks[3], Task("kitchen shovel", None)])
     observation = env.observe()
     state = observation["agent_pos"]
-    assert env.agent_pos_names == AGENT_POS_NAMES + NAMES
+    assert tuple(env.state_names) == AGENT_POS_NAMES + NAMES
     np.testing.assert_array_equal(untold.observe()["agent_pos"], state[:, :13])
     np.testing.assert_array_equal(untold.observe()["environment_state"], observation["environment_state"])
     # Bottle on the plate; shovel on the cloth; shovel on the table.
@@ -39,9 +39,9 @@ def test_a_step_is_under_the_old_task_and_what_is_observed_after_the_switch_unde
 
 def test_what_would_be_seen_under_each_task_is_what_is_seen_under_it():
     env = make(2, **TOLD)
-    before = list(env.tasks)
+    before = list(env.current_tasks)
     would = env.observe_under(SCENE.tasks)
-    assert env.tasks == before
+    assert env.current_tasks == before
     for task, observation in zip(SCENE.tasks, would, strict=True):
         env.set_task([0, 1], [task, task])
         for name, column in env.observe().items():

@@ -197,12 +197,12 @@ def test_ids_that_are_none_are_refused_and_change_nothing(name):
 
 def test_no_stream_gets_its_task_where_one_is_unknown():
     env = make(2)
-    before = list(env.tasks)
+    before = list(env.current_tasks)
     other = next(task for task in env.scene.tasks if task != before[0])
     for tasks in ([other, other.instruction], [other]):
         with pytest.raises(ValueError):  # noqa: PT011
             env.set_task([0, 1], tasks)
-    assert env.tasks == before
+    assert env.current_tasks == before
 
 
 # Rewards -------------------------------------------------------------------------------------------------

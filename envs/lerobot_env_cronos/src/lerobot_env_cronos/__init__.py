@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from lerobot_env_cronos.simulation.simulation import ACTION_HIGH as ACTION_HIGH
     from lerobot_env_cronos.simulation.simulation import ACTION_LOW as ACTION_LOW
     from lerobot_env_cronos.vector_env import CronosVectorEnv as CronosVectorEnv
+    from lerobot_env_cronos.vector_env import EnvIdentity as EnvIdentity
 
 _MODULES = {
     "autoreset": "CronosGymVectorEnv",
@@ -52,7 +53,7 @@ _MODULES = {
     "scene.scenes": "STEPS_PER_TASK Body Scene Task get_scene",
     "sequential": "SequentialVectorEnv",
     "simulation.simulation": "ACTION_HIGH ACTION_LOW",
-    "vector_env": "CronosVectorEnv",
+    "vector_env": "CronosVectorEnv EnvIdentity",
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names.split()}
 

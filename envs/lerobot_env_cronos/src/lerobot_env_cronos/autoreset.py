@@ -132,4 +132,4 @@ class CronosGymVectorEnv(IndependentVectorEnv):
         return info | {f"_{name}": mask.copy() for name in info}
 
     def _task_numbers(self) -> np.ndarray:
-        return np.array([self.scene.tasks.index(task) for task in self.tasks])
+        return np.array([self.scene.tasks.index(task) for task in self.current_tasks])

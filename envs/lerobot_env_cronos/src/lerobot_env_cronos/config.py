@@ -129,6 +129,11 @@ class CronosEnvConfig(EnvConfig):
             self.features_map[key] = key
 
     @property
+    def steps_per_task(self) -> int:
+        """Control steps that a task has: the window of an evaluation, and K of a training unless it says another."""
+        return get_scene(self.scene).steps_per_task
+
+    @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Keyword arguments of `CronosVectorEnv`."""
         names = (

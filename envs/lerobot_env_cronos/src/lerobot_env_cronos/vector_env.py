@@ -6,20 +6,23 @@ an event of the training loop. `lerobot_env_cronos.episodic` adds episodes for e
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
 from lerobot_env_cronos.benchmark.configurations import check_split
 from lerobot_env_cronos.benchmark.load import load_benchmark
-from lerobot_env_cronos.scene.scenes import CONTROL_HZ, Task, get_scene
-from lerobot_env_cronos.simulation.observations import ObservationBuilder
+from lerobot_env_cronos.benchmark.version import gymnasium_id
+from lerobot_env_cronos.scene.cameras import camera_projection
+from lerobot_env_cronos.scene.scenes import BODIES, CONTROL_HZ, Task, get_scene
+from lerobot_env_cronos.simulation.observations import ObservationBuilder, environment_state_names
 from lerobot_env_cronos.simulation.simulation import (
     ACTION_HIGH,
     ACTION_HIGH_F32,
     ACTION_LOW,
     ACTION_LOW_F32,
+    ACTION_NAMES,
     Simulation,
     check_state,
 )
@@ -29,6 +32,17 @@ GRASP_REWARD, SUCCESS_REWARD = 0.1, 1.0
 LEROBOT_OPTIONS = ("lerobot_new_rollout",)
 """Of `reset`: what LeRobot's rollout says, which changes nothing here."""
 REWARDS = ("difference", "level")
+
+
+class EnvIdentity(NamedTuple):
+    """What tells one environment from another: what both have in common is the same benchmark."""
+
+    id: str
+    """Gymnasium's, with the version."""
+    fingerprint: str
+    """Of the benchmark: configurations and chains."""
+    source: str
+    """Where these come from."""
 
 
 class CronosVectorEnv(gym.vector.VectorEnv):
@@ -55,7 +69,13 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             no nested observation space (Stable-Baselines3).
 
     Attributes:
-        agent_pos_names: one for each number of `agent_pos`.
+        fps: control steps a second.
+        steps_per_task: control steps that a task has, the window of an evaluation and a training's K by default.
+        robot_type: LeRobot's, of datasets.
+        tasks, reset_tasks: of the scene; `current_tasks` has the one of each stream.
+        state_names, action_names: one for each number of `agent_pos` and of an action.
+        num_starts: configurations by split.
+        identity: what recordings, runs and results compare.
         timer: called with `physics`, `observe` or `reset`, returns the context in which that work is done; a
             training run hangs its stopwatch here.
     """
@@ -100,17 +120,41 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             self.simulation, obs_type, privileged_state, observation_height, observation_width, camera_name,
             render_size, renderer, task_observation, flat_observation,
         )  # fmt: skip
-        self.agent_pos_names = self._observations.agent_pos_names
+        self.state_names = list(self._observations.agent_pos_names)
         self.single_observation_space = self._observations.space
         self.single_action_space = gym.spaces.Box(ACTION_LOW_F32, ACTION_HIGH_F32, dtype=np.float32)
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
-        self.tasks: list[Task] = [self.scene.tasks[0]] * num_envs
+        self.fps = self.scene.fps
+        self.steps_per_task = self.scene.steps_per_task
+        self.robot_type = self.scene.robot_type
+        self.tasks, self.reset_tasks = self.scene.tasks, self.scene.reset_tasks
+        self.action_names = list(ACTION_NAMES)
+        self.num_starts = {split: len(poses) for split, poses in self.benchmark.configurations.items()}
+        self.identity = EnvIdentity(gymnasium_id(scene), self.benchmark.fingerprint, self.benchmark.source)
+        self.current_tasks: list[Task] = [self.scene.tasks[0]] * num_envs
         self.is_success = np.zeros(num_envs, dtype=bool)
         self.is_grasped = np.zeros(num_envs, dtype=bool)
         self._level = np.zeros(num_envs, dtype=np.float32)
         self._all = np.arange(num_envs)
         self.scene_reset(self._all, self._all % len(self.benchmark.configurations["train"]))
+
+    @property
+    def observation_details(self) -> dict[str, dict[str, Any]]:
+        """What datasets say of the observations, by LeRobot's names: of what the numbers and the pictures are."""
+        details: dict[str, dict[str, Any]] = {
+            "observation.environment_state": {
+                "names": list(environment_state_names(self.scene)),
+                "keypoints": {
+                    name.replace(" ", "_"): [list(point) for point in BODIES[name].keypoints]
+                    for name in self.scene.bodies
+                },
+            }
+        }
+        for camera in self._observations.cameras:
+            projection = camera_projection(camera, *self._observations.size)
+            details[f"observation.images.{camera}"] = {"projection": projection.tolist()}
+        return details
 
     # Gymnasium --------------------------------------------------------------------------------------------
 
@@ -173,12 +217,12 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         """The observation now, under the current tasks: of all streams, or with one row for each of `ids`."""
         with self.timer("observe"):
             chosen = self._all if ids is None else self._check_ids(ids)
-            return self._observations.observe(chosen, [self.tasks[i] for i in chosen])
+            return self._observations.observe(chosen, [self.current_tasks[i] for i in chosen])
 
     def observe_under(self, tasks: Sequence[Task]) -> list[dict[str, Any]]:
         """What `observe` would say of all streams under each of `tasks`; drawn once, so pictures are shared."""
         with self.timer("observe"):
-            seen = self._observations.observe(self._all, self.tasks)
+            seen = self._observations.observe(self._all, self.current_tasks)
             return [self._observations.tell(seen, [task] * self.num_envs) for task in tasks]
 
     def find_complete(self, tasks: Sequence[Task]) -> np.ndarray:
@@ -195,8 +239,8 @@ class CronosVectorEnv(gym.vector.VectorEnv):
     def _judge(self, ids: np.ndarray) -> None:
         """Evaluate success, grasp and the reward level of the current tasks of `ids`."""
         sim = self.simulation
-        for task in {self.tasks[i] for i in ids}:
-            mine = np.array([i for i in ids if self.tasks[i] == task])
+        for task in {self.current_tasks[i] for i in ids}:
+            mine = np.array([i for i in ids if self.current_tasks[i] == task])
             self.is_success[mine] = self._holds(task)[mine]
             self.is_grasped[mine] = sim.is_grasped(task.object)[mine]
         level = np.where(self.is_success, SUCCESS_REWARD, np.where(self.is_grasped, GRASP_REWARD, 0.0))
@@ -280,7 +324,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             by_name = "a Task, not its instruction, is needed; " if isinstance(unknown[0], str) else ""
             raise ValueError(f"unknown task {unknown[0]!r}: {by_name}valid tasks: {list(valid)}")
         for i, task in given:
-            self.tasks[i] = task
+            self.current_tasks[i] = task
         self._judge(ids)
 
     def _state_arrays(self) -> dict[str, np.ndarray]:
@@ -294,7 +338,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         """
         valid = self.scene.tasks + self.scene.reset_tasks
         own = {name: array.copy() for name, array in self._state_arrays().items()}
-        return self.simulation.get_state() | {"task": np.array([valid.index(task) for task in self.tasks])} | own
+        return self.simulation.get_state() | {"task": np.array([valid.index(task) for task in self.current_tasks])} | own
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Continue, bit for bit, from a state taken by `get_state`.
@@ -306,7 +350,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         check_state(state, arrays | {"task": self._all})
         self.simulation.set_state(state)
         valid = self.scene.tasks + self.scene.reset_tasks
-        self.tasks = [valid[i] for i in state["task"]]
+        self.current_tasks = [valid[i] for i in state["task"]]
         for name, array in arrays.items():
             array[:] = state[name]
 
@@ -327,7 +371,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
     @property
     def instructions(self) -> list[str]:
         """The language instruction of every stream."""
-        return [task.instruction for task in self.tasks]
+        return [task.instruction for task in self.current_tasks]
 
     def render(self) -> tuple[np.ndarray, ...]:
         """One frame (height, width, 3) uint8 per stream at `render_size`."""

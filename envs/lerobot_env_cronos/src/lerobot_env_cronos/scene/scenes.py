@@ -84,6 +84,21 @@ class Scene:
             object.__setattr__(self, name, tuple(value))
 
     @property
+    def fps(self) -> int:
+        """Control steps a second [Hz]."""
+        return CONTROL_HZ
+
+    @property
+    def steps_per_task(self) -> int:
+        """Control steps that a task has."""
+        return STEPS_PER_TASK
+
+    @property
+    def robot_type(self) -> str:
+        """LeRobot's name of the arm, of datasets."""
+        return "widowx"
+
+    @property
     def bodies(self) -> tuple[str, ...]:
         """All free bodies, objects first; the order of the state vector."""
         return self.objects + self.receptacles
