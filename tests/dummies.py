@@ -1,7 +1,6 @@
 """A tiny environment and a tiny policy with the interfaces of the real ones, for exact tests of the loop."""
 
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -9,7 +8,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import make_policy_processor_pipelines
-from lerobot_env_cronos import EpisodeGroup
+from lerobot_env_cronos import EnvIdentity
 
 NUM_BINS = 3
 
@@ -28,7 +27,6 @@ BODIES = ("toy bear", "ketchup bottle", "yellow plate")
 BEAR, BOTTLE, _ = BODIES
 TASKS = (DummyTask(1.0, BEAR), DummyTask(-1.0, BEAR), DummyTask(2.0, BOTTLE), DummyTask(-2.0, BOTTLE))
 RESET_TASKS = (DummyTask(0.0, BEAR), DummyTask(0.5, BOTTLE))
-EPISODES = tuple(EpisodeGroup(i, (task,), tuple(range(64))) for i, task in enumerate(TASKS))
 
 
 class DummyEnv:
@@ -38,26 +36,28 @@ class DummyEnv:
     `lost` the (stream, body) that have left the workspace.
     """
 
-    metadata = {"render_fps": 5}  # noqa: RUF012
+    fps, robot_type = 5, "dummy"
+    tasks, reset_tasks = TASKS, RESET_TASKS
+    identity = EnvIdentity("dummies/line-v1", "0" * 16, "dummies")
+    num_starts = {"train": 64, "held_out": 64}  # noqa: RUF012
+    state_names = tuple(f"s{i}" for i in range(13))
+    action_names = tuple(f"a{i}" for i in range(7))
     single_observation_space = gym.spaces.Dict({"agent_pos": gym.spaces.Box(-9, 9, (13,), np.float32)})
+    single_action_space = gym.spaces.Box(-1, 1, (7,), np.float32)
 
     def __init__(self, num_envs: int, diverge_at: set[tuple[int, int]] | None = None):
         self.num_envs = num_envs
-        self.scene = SimpleNamespace(name="dummies", tasks=TASKS, reset_tasks=RESET_TASKS, bodies=BODIES)
         self.lost: set[tuple[int, int]] = set()
-        self.tasks = [TASKS[0]] * num_envs
+        self.current_tasks = [TASKS[0]] * num_envs
         self.x = np.zeros(num_envs)
         self.moved = 0
         self.t = 0
         self.diverge_at = diverge_at or set()
         self.calls: list = []
-        self.benchmark = SimpleNamespace(
-            groups=lambda suite, split: EPISODES, source="dummies", fingerprint="0" * 16
-        )
 
     @property
     def instructions(self):
-        return [task.instruction for task in self.tasks]
+        return [task.instruction for task in self.current_tasks]
 
     def step(self, actions):
         self.calls.append("step")
@@ -76,7 +76,7 @@ class DummyEnv:
 
     @property
     def is_success(self):
-        return np.abs(self.x - [task.goal for task in self.tasks]) < 0.3
+        return np.abs(self.x - [task.goal for task in self.current_tasks]) < 0.3
 
     def observe(self, ids=None):
         self.calls.append("observe")
@@ -97,7 +97,7 @@ class DummyEnv:
     def set_task(self, ids, tasks):
         self.calls.append("set_task")
         for i, task in zip(ids, tasks, strict=True):
-            self.tasks[i] = task
+            self.current_tasks[i] = task
 
     def scene_reset(self, ids, configurations, split="train"):
         self.calls.append(("scene_reset", list(ids)))
@@ -110,17 +110,17 @@ class DummyEnv:
         return np.array([[(i, k) in self.lost for k in range(3)] for i in range(self.num_envs)])
 
     def put_back(self, stream, body, rng):
-        self.calls.append(("put_back", stream, body))
-        self.lost.discard((stream, self.scene.bodies.index(body)))
+        self.calls.append(("put_back", stream, BODIES[body]))
+        self.lost.discard((stream, body))
 
     def get_state(self):
         everything = TASKS + RESET_TASKS
-        tasks = np.array([everything.index(task) for task in self.tasks])
+        tasks = np.array([everything.index(task) for task in self.current_tasks])
         return {"x": self.x.copy(), "t": np.full(self.num_envs, self.t), "task": tasks}
 
     def set_state(self, state):
         self.x, self.t = state["x"].copy(), int(state["t"][0])
-        self.tasks = [(TASKS + RESET_TASKS)[i] for i in state["task"]]
+        self.current_tasks = [(TASKS + RESET_TASKS)[i] for i in state["task"]]
 
     def close(self):
         pass

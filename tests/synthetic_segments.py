@@ -1,5 +1,7 @@
 """Segments with pictures that a codec keeps: a square moving over a smooth background."""
 
+from types import SimpleNamespace
+
 import gymnasium
 import numpy as np
 
@@ -21,8 +23,20 @@ def observation_space(environment_state: int | None = 3) -> gymnasium.spaces.Dic
     return gymnasium.spaces.Dict(spaces)
 
 
+def world(space: gymnasium.spaces.Dict | None = None) -> SimpleNamespace:
+    """What the features of a dataset follow from."""
+    space = observation_space() if space is None else space
+    size = space["agent_pos"].shape[0] if "agent_pos" in space.spaces else 0
+    return SimpleNamespace(
+        single_observation_space=space,
+        single_action_space=gymnasium.spaces.Box(-1, 1, (7,), np.float32),
+        state_names=[f"state_{i}" for i in range(size)],
+        action_names=["dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper"],
+    )
+
+
 def features(video: bool = True):
-    return demonstration_features(observation_space(), video=video)
+    return demonstration_features(world(), video=video)
 
 
 def images(length: int, seed: int = 0) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Recorded streams of a loop whose every number says which stream and step it belongs to."""
 
 import numpy as np
-from synthetic_segments import FPS, STATE_DIM, images, observation_space
+from synthetic_segments import FPS, STATE_DIM, images, observation_space, world
 
 from cronos_lerobot.agents.base import ActionSample
 from cronos_lerobot.data.origin import STREAMS as STREAMS_KIND
@@ -79,7 +79,7 @@ def record(
     root, *, flush_at=(), skip=(), steps=STEPS, repo_id="me/stream", origin: Origin | None = ORIGIN
 ) -> None:
     """Record the streams; `skip` leaves out segments (stream, number)."""
-    features = stream_features(observation_space(environment_state=None))
+    features = stream_features(world(observation_space(environment_state=None)))
     writer = SegmentWriter(repo_id, root, features, FPS, origin=origin)
     recorder = StreamRecorder(writer, num_envs=STREAMS, segment_length=K)
     add_segment = writer.add_segment

@@ -16,9 +16,6 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.utils import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH, INFO_PATH
 from lerobot.utils.constants import ACTION, DONE, REWARD
-from lerobot_env_cronos import get_scene
-from lerobot_env_cronos.scene.scenes import CONTROL_HZ
-from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 from PIL import Image, UnidentifiedImageError
 from tqdm import tqdm
 
@@ -82,7 +79,7 @@ def check_dataset(root: Path, take: Callable[[pa.Table], object] = lambda rows: 
 
 
 def _check_columns(meta: LeRobotDatasetMetadata, origin: Origin) -> None:
-    """Check that a dataset has the columns that its kind promises, of this robot."""
+    """Check that a dataset has the columns that its kind promises."""
     assert meta.episodes is not None
     promised = [ACTION, REWARD, SUCCESS, DONE, TRUNCATED, *(STREAM_COLUMNS if origin.kind == STREAMS else ())]
     lost = [name for name in promised if name not in meta.features]
@@ -93,15 +90,6 @@ def _check_columns(meta: LeRobotDatasetMetadata, origin: Origin) -> None:
         )
     if not any(name.startswith("observation.") for name in meta.features):
         raise DatasetFileError("the dataset has no observation")
-    names, fps = meta.features[ACTION]["names"], meta.fps
-    if list(names or []) != list(ACTION_NAMES) or fps != CONTROL_HZ:
-        raise DatasetFileError(
-            f"the actions are {brief(names)} at {fps} Hz, the scene has {list(ACTION_NAMES)} at {CONTROL_HZ} Hz"
-        )
-    scene = get_scene(origin.scene)
-    known = {task.instruction for task in (*scene.tasks, *scene.reset_tasks)}
-    if unknown := sorted(set(meta.tasks.index if meta.tasks is not None else []) - known):
-        raise DatasetFileError(f"the dataset has tasks that {scene.name} has not: {brief(unknown)}")
 
 
 def _episode_rows(meta: LeRobotDatasetMetadata) -> pd.DataFrame:

@@ -17,10 +17,11 @@ import draccus
 from draccus.utils import DecodingError
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.utils import flatten_dict
-from lerobot_env_cronos import CronosVectorEnv, check_environment_id, gymnasium_id
 
-from cronos_lerobot.data.schema import FORMAT, ROBOT_TYPE, STREAM_ID, SUCCESS, Features
+from cronos_lerobot.data.schema import FORMAT, STREAM_ID, SUCCESS, Features
 from cronos_lerobot.dataset_metadata import brief
+from cronos_lerobot.environment_id import check_environment_id
+from cronos_lerobot.protocol.streams import Streams
 from cronos_lerobot.provenance import git_commit, package_versions
 from cronos_lerobot.whole_files import written_whole
 
@@ -76,17 +77,17 @@ class Origin:
 
     @property
     def scene(self) -> str:
-        """Name of its scene."""
+        """Name in the environment's id."""
         return check_environment_id(self.environment, "the dataset")
 
 
-def origin_of(env: CronosVectorEnv, kind: str, flags: Mapping[str, Any]) -> Origin:
+def origin_of(env: Streams, kind: str, flags: Mapping[str, Any]) -> Origin:
     """The origin of what is about to be recorded in `env`."""
-    source = env.benchmark.source
+    source = env.identity.source
     return Origin(
         kind,
-        gymnasium_id(env.scene.name),
-        env.benchmark.fingerprint,
+        env.identity.id,
+        env.identity.fingerprint,
         "a folder" if Path(source).exists() else source,
         # As a file gives them back: a tuple is a list.
         json.loads(json.dumps(flags)),
@@ -112,7 +113,7 @@ def flags_of(config: Any, only: Sequence[str] | None = None) -> dict[str, Any]:
 
 
 def create_dataset(
-    repo_id: str, root: Path, fps: int, features: Features, origin: Origin | None, robot_type: str = ROBOT_TYPE
+    repo_id: str, root: Path, fps: int, features: Features, origin: Origin | None, robot_type: str | None
 ) -> LeRobotDatasetMetadata:
     """Start an empty dataset that says where it comes from; format, environment and benchmark also in SUCCESS."""
     if origin is not None:

@@ -8,7 +8,6 @@ from typing import Any, Self
 
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, REWARD
-from lerobot_env_cronos import CronosVectorEnv
 
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.data.origin import STREAMS, origin_of
@@ -28,13 +27,13 @@ from cronos_lerobot.data.schema import (
     TOTAL_INTERVENTIONS,
     TRUNCATED,
     VALUE,
-    describe_observation,
     frame_format,
     stream_features,
 )
 from cronos_lerobot.data.writer import SegmentWriter
 from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import Step
+from cronos_lerobot.protocol.streams import Streams
 
 
 class StreamRecorder:
@@ -86,7 +85,7 @@ class StreamRecorder:
     @classmethod
     def open(
         cls,
-        env: CronosVectorEnv,
+        env: Streams,
         repo_id: str,
         root: str | Path,
         *,
@@ -100,7 +99,7 @@ class StreamRecorder:
         """A recorder of `env`'s streams: into a new dataset, or on from a checkpoint.
 
         Args:
-            env: whose streams will be recorded; only its spaces, scene, size and frame rate are read.
+            env: whose streams will be recorded; only what it says of itself is read.
             repo_id: the dataset's name, "owner/name".
             root: its folder; must not exist for a new dataset and must for a resumed one.
             segment_length: the most steps between two task switches (K).
@@ -113,8 +112,9 @@ class StreamRecorder:
         writer = SegmentWriter(
             repo_id,
             root,
-            stream_features(env.single_observation_space, describes=describes, **describe_observation(env)),
-            int(env.metadata["render_fps"]),
+            stream_features(env, describes=describes),
+            round(env.fps),
+            robot_type=env.robot_type,
             resume=None if state is None else state["num_episodes"],
             origin=origin_of(env, STREAMS, flags or {}),
             **writer_options,

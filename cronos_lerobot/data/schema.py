@@ -13,19 +13,13 @@ from typing import Any, cast
 import gymnasium
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, OBS_IMAGES, REWARD
-from lerobot_env_cronos import CronosVectorEnv
-from lerobot_env_cronos.scene.cameras import camera_projection
-from lerobot_env_cronos.scene.scenes import BODIES
-from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS, agent_pos_names, environment_state_names
-from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 
 from cronos_lerobot.agents.processing import VECTOR_KEYS
 from cronos_lerobot.data.video import check_video_size
+from cronos_lerobot.protocol.streams import Streams
 
 FORMAT = 3
 """Of the columns below and of `meta/cronos.json`. Any other number is an error."""
-ROBOT_TYPE = "widowx"
-"""`robot_type` of demonstrations and streams: LeRobot merges only datasets of one robot."""
 
 SUCCESS = "next.success"
 TRUNCATED = "next.truncated"
@@ -76,56 +70,42 @@ SEGMENT_COLUMNS = (
 of SUCCESS and INTERVENED whether any frame has it."""
 
 
-def demonstration_features(
-    observation_space: gymnasium.Space,
-    *,
-    video: bool = True,
-    state_names: Sequence[str] | None = None,
-    environment_state_names: Sequence[str] | None = None,
-    keypoints: Mapping[str, Sequence] | None = None,
-    projections: Mapping[str, Sequence] | None = None,
-) -> Features:
-    """Features of a demonstration dataset.
+def demonstration_features(env: Streams, *, video: bool = True) -> Features:
+    """Features of a demonstration dataset of `env`.
 
     Args:
-        observation_space: of ONE environment, in the raw format of `lerobot.envs`: a Dict with any of
-            "pixels" (a Dict of uint8 (H, W, 3) boxes by camera), "agent_pos", "environment_state".
+        env: whose spaces and names are read.
         video: store the pixels as mp4 (small); if False as PNG in the data files (exact, fast to read).
-        state_names: one name per dimension of `agent_pos`; numbered when None.
-        environment_state_names: the same for `environment_state`.
-        keypoints: points in the frame of each body [m], as `Body.keypoints`.
-        projections: (3, 4) of each camera, as `camera_projection`.
 
     Returns:
         LeRobot's feature dictionary: the observation, `action`, `next.reward`, `next.success`, `next.done`,
         `next.truncated`.
 
     Raises:
-        ValueError: the space is not such a Dict, or a list of names has the wrong length.
+        ValueError: the observation is not in the raw format of `lerobot.envs`, or a list of names has the wrong
+            length.
     """
     features: Features = {}
-    names = {"agent_pos": state_names, "environment_state": environment_state_names}
-    for key, space in cast(gymnasium.spaces.Dict, observation_space).items():
+    for key, space in cast(gymnasium.spaces.Dict, env.single_observation_space).items():
         if key == "pixels":
             for camera, box in cast(gymnasium.spaces.Dict, space).items():
-                feature = _camera_feature(box.shape or (), video)
-                features[f"{OBS_IMAGES}.{camera}"] = feature
-                if projections:
-                    feature["projection"] = projections[camera]
+                features[f"{OBS_IMAGES}.{camera}"] = _camera_feature(box.shape or (), video)
         elif key in VECTOR_KEYS:
-            feature = features[VECTOR_KEYS[key]] = _vector_feature(key, space.shape or (), names[key])
-            if key == "environment_state" and keypoints:
-                feature["keypoints"] = keypoints
+            names = env.state_names if key == "agent_pos" else None
+            features[VECTOR_KEYS[key]] = _vector_feature(key, space.shape or (), names)
         else:
             raise ValueError(f"unknown observation {key!r}; valid: 'pixels', {sorted(VECTOR_KEYS)}")
-    features[ACTION] = _vector_feature(ACTION, (len(ACTION_NAMES),), ACTION_NAMES)
+    for name, details in getattr(env, "observation_details", {}).items():
+        if name in features:
+            features[name] |= details
+    features[ACTION] = _vector_feature(ACTION, env.single_action_space.shape or (), env.action_names)
     return features | _scalar_features({REWARD: "float32", SUCCESS: "bool", DONE: "bool", TRUNCATED: "bool"})
 
 
 def stream_features(
-    observation_space: gymnasium.Space, *, describes: Sequence[str] = ("log_prob", "value"), **names: Any
+    env: Streams, *, video: bool = True, describes: Sequence[str] = ("log_prob", "value")
 ) -> Features:
-    """Features of a recorded training stream: those of a demonstration and the annotations.
+    """Features of a recorded training stream of `env`: those of a demonstration and the annotations.
 
     No frame is `next.done`: a stream never ends. The last frame of a finished segment is `next.truncated`; the
     observation that followed it is not recorded.
@@ -144,30 +124,12 @@ def stream_features(
     - `intervention`: a person or a script acted on this frame.
 
     Args:
-        observation_space: as for `demonstration_features`.
+        env: as for `demonstration_features`.
+        video: as there.
         describes: what the agent says of its actions, some of "log_prob" and "value".
-        names: as for `demonstration_features`.
     """
     own = STREAM_COLUMNS | {f"cronos.{name}": "float32" for name in describes}
-    return demonstration_features(observation_space, **names) | _scalar_features(own)
-
-
-def describe_observation(env: CronosVectorEnv) -> dict[str, Any]:
-    """What the numbers and pictures of `env` are of, as keyword arguments of `demonstration_features`."""
-    space = cast(gymnasium.spaces.Dict, env.single_observation_space)
-    size = (space["agent_pos"].shape or (0,))[0]
-    names = (agent_pos_names(env.scene, option) for option in TASK_OBSERVATIONS)
-    return {
-        "state_names": next(n for n in names if len(n) == size),
-        "environment_state_names": environment_state_names(env.scene),
-        "keypoints": {
-            name.replace(" ", "_"): [list(point) for point in BODIES[name].keypoints] for name in env.scene.bodies
-        },
-        "projections": {
-            camera: camera_projection(camera, *(box.shape or ())[:2]).tolist()
-            for camera, box in cast(gymnasium.spaces.Dict, space.get("pixels", {})).items()
-        },
-    }
+    return demonstration_features(env, video=video) | _scalar_features(own)
 
 
 def frame_format(feature: Mapping[str, Any]) -> tuple[tuple[int, ...], np.dtype]:

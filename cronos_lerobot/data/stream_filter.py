@@ -21,7 +21,6 @@ from cronos_lerobot.data.origin import SEGMENTS, create_dataset
 from cronos_lerobot.data.recorder import segment_row
 from cronos_lerobot.data.schema import (
     DECISION_COLUMNS,
-    ROBOT_TYPE,
     SEGMENT_COLUMNS,
     STREAM_COLUMNS,
     STREAM_ID,
@@ -141,9 +140,7 @@ def filter_streams(
             raise FileExistsError(f"{root} exists: give another --output.root")
         partial = root.with_name(f".{root.name}.partial")
         shutil.rmtree(partial, ignore_errors=True)
-        meta = create_dataset(
-            repo_id, partial, source.meta.fps, features, origin, source.meta.robot_type or ROBOT_TYPE
-        )
+        meta = create_dataset(repo_id, partial, source.meta.fps, features, origin, source.meta.robot_type)
         dataset = GrowingDataset(meta, DatasetStats(meta.features), CopiedVideoFile)
         for segment, rows, stats in _read(source, segments):
             _copy(source, segment, rows, stats, meta, dataset, frames_after_success)

@@ -74,6 +74,7 @@ class SegmentWriter:
         resume: int | None = None,
         max_pending_bytes: int = 256 * 2**20,
         flush_interval_s: float = FLUSH_INTERVAL_S,
+        robot_type: str | None = None,
         origin: Origin | None = None,
         may_differ: tuple[str, ...] = (),
     ) -> None:
@@ -87,6 +88,7 @@ class SegmentWriter:
             resume: how many of the first episodes to keep, -1 for all; None starts a new dataset.
             max_pending_bytes: segments waiting for the encoder; `add_segment` blocks when it is exceeded.
             flush_interval_s: the longest that a segment waits for a flush [s].
+            robot_type: LeRobot's; LeRobot merges only datasets of one robot.
             origin: where it comes from; what is appended later has to be of the same.
             may_differ: flags of the origin that may be others than they were.
 
@@ -105,7 +107,7 @@ class SegmentWriter:
         with ExitStack() as on_failure:
             self._lock = on_failure.enter_context(FolderLock(self.root))
             if resume is None:
-                self._meta = create_dataset(repo_id, self.root, fps, features, origin)
+                self._meta = create_dataset(repo_id, self.root, fps, features, origin, robot_type)
                 stats = DatasetStats(self._meta.features)
             else:
                 stats = self._resume(repo_id, resume, origin, may_differ)

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
+from lerobot.envs import EnvConfig
 from lerobot.envs.factory import make_env_pre_post_processors
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import set_seed
-from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
+from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.expert.expert import ScriptedExpert
-from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 
 from cronos_lerobot.agents.base import ActionSample, Actor, Columns, StreamSeed, observation_steps, samples
 from cronos_lerobot.agents.chunk_player import ObservationHistory, make_player
@@ -41,10 +41,12 @@ class SamplingPolicy(Actor):
         policy: a LeRobot policy on its device, or what acts instead of it.
         processors: the policy's.
         temperature: 0 takes the likeliest action.
+        action_size: A.
     """
 
-    def __init__(self, policy: Any, processors: PolicyProcessors, temperature: float) -> None:
+    def __init__(self, policy: Any, processors: PolicyProcessors, temperature: float, action_size: int) -> None:
         self._policy, self._processors, self.temperature = policy, processors, temperature
+        self._action_size = action_size
         # What acts instead of a policy may have no modes.
         if callable(getattr(policy, "eval", None)):
             policy.eval()
@@ -86,7 +88,7 @@ class SamplingPolicy(Actor):
         """A row of numbers (k, A) in [0, 1) for each step of each stream, whether it decides or not."""
         if not self._takes_uniform:
             return None
-        return np.stack([self._rngs[i].random(len(ACTION_NAMES), dtype=np.float32) for i in streams])
+        return np.stack([self._rngs[i].random(self._action_size, dtype=np.float32) for i in streams])
 
     def _decide(self, columns: Columns, instructions: list[str], uniform: np.ndarray | None) -> np.ndarray:
         """Decisions (k, n, A) in physical units."""
@@ -154,7 +156,11 @@ class ExpertActor(Actor):
 
 
 def make_actor(
-    policy: Any, processors: PolicyProcessors, temperature: float, env_processors: tuple[Any, Any] | None = None
+    policy: Any,
+    processors: PolicyProcessors,
+    temperature: float,
+    action_size: int,
+    env_processors: tuple[Any, Any] | None = None,
 ) -> SamplingPolicy | SelectingPolicy:
     """Return the actor of a LeRobot policy on its device.
 
@@ -162,15 +168,16 @@ def make_actor(
         policy: that of the actions, or what steers it.
         processors: the policy's.
         temperature: of the sampling, if the policy has `sample_actions`.
+        action_size: numbers of an action.
         env_processors: LeRobot's processors between environment and policy, (before, after), if any.
     """
     if samples(policy):
-        return SamplingPolicy(policy, processors, temperature)
+        return SamplingPolicy(policy, processors, temperature, action_size)
     return SelectingPolicy(policy, processors, env_processors or (_as_it_is, _as_it_is))
 
 
 def load_actor(
-    config: PreTrainedConfig, env: CronosEnvConfig, temperature: float, rename_map: dict[str, str] | None = None
+    config: PreTrainedConfig, env: EnvConfig, temperature: float, rename_map: dict[str, str] | None = None
 ) -> SamplingPolicy | SelectingPolicy:
     """Load a checkpoint and return its actor, steered if the checkpoint is a steered one.
 
@@ -200,7 +207,8 @@ def load_actor(
         )
     env_processors = make_env_pre_post_processors(env_cfg=env, policy_cfg=config)
     own = make_processors(policy, *processors)
-    return make_actor(with_steering(policy, config.pretrained_path), own, temperature, env_processors)
+    action_size = env.features[ACTION].shape[0]
+    return make_actor(with_steering(policy, config.pretrained_path), own, temperature, action_size, env_processors)
 
 
 def _as_it_is(batch: Any) -> Any:

@@ -12,9 +12,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from lerobot_env_cronos import STEPS_PER_TASK, Task
 
 from cronos_lerobot.agents.base import Actor, StreamSeed
+from cronos_lerobot.protocol.streams import STEPS_PER_TASK, Streams, Task
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class Rules:
 class Trajectory:
     """T steps and the start, to draw pictures from."""
 
-    qpos: np.ndarray
-    """(T + 1, nq) float32, joint positions."""
+    states: np.ndarray
+    """(T + 1, ...) what the runner was told to keep: joint positions, or frames."""
     position: np.ndarray
     """(T + 1,) int, number of the task at hand."""
     is_complete: np.ndarray
@@ -69,12 +69,14 @@ class ChainResult:
     """Positions of other successes without a grasp of the object from the task's start to its success."""
     starts: list[str] = field(default_factory=list)
     """How each task's bodies lay when it was given, if the runner was asked to look."""
+    is_kept: bool = False
+    """Whether the runner keeps its trajectory."""
     frames: list[tuple[np.ndarray, int, bool]] = field(default_factory=list)
-    """Rows of the trajectory, if the runner keeps it."""
+    """Rows of the trajectory."""
     elapsed: int = 0
     """Control steps of the task at hand."""
-    was_found: bool = False
-    """Whether it was complete when it was given."""
+    was_found: bool | None = None
+    """Whether it was complete when it was given; None until that is known."""
     was_grasped: bool = False
 
     @property
@@ -102,6 +104,9 @@ class ChainResult:
         self.steps += 1
         self.elapsed += 1
         self.was_grasped |= is_grasped
+        if self.was_found is None:
+            # No task can be done in one step.
+            self.was_found = is_success
         if is_success and not self.success[-1]:
             self.success[-1] = True
             if self.was_found:
@@ -114,26 +119,27 @@ class ChainRunner:
     """Runs chains with one actor.
 
     Args:
-        env: streams of their own, never those of a training. Needs `scene_reset`, `set_task`, `observe`, `step`,
-            and `end_effector_reset` if the rules ask for it. Its `is_success` and `is_grasped`, if it has them,
-            are those of the current tasks now.
+        env: streams of their own, never those of a training. Its `is_success` and `is_grasped` (N,), if it has
+            them, are those of the current tasks now.
         actor: chooses the actions.
         rules: of all chains.
         look: says how the bodies of streams (k,) lie, a word each; None does not look.
-        keeps_states: return trajectories; needs `positions` of the environment.
+        states: returns what a picture is drawn from of streams (k,), (k, ...); None keeps no trajectories.
+        num_kept: trajectories of the first so many chains alone.
     """
 
     def __init__(
         self,
-        env: Any,
+        env: Streams,
         actor: Actor,
         rules: Rules = Rules(),  # noqa: B008 - frozen
         *,
         look: Callable[[Any, np.ndarray], Iterable[str]] | None = None,
-        keeps_states: bool = False,
+        states: Callable[[np.ndarray], np.ndarray] | None = None,
+        num_kept: int | None = None,
     ) -> None:
         self.env, self.actor, self.rules = env, actor, rules
-        self._look, self._keeps_states = look, keeps_states
+        self._look, self._states, self._num_kept = look, states, num_kept
         self._everyone = np.arange(env.num_envs)
         self._runs: dict[int, ChainResult] = {}
 
@@ -154,6 +160,8 @@ class ChainRunner:
             on_end: called with each result as it comes in.
         """
         results = [ChainResult(chain) for chain in chains]
+        for result in results[: self._num_kept]:
+            result.is_kept = self._states is not None
         waiting, self._runs = deque(results), {}
         self._instructions = [chains[0].tasks[0].instruction] * self.env.num_envs
         observation = self.env.observe()
@@ -190,7 +198,8 @@ class ChainRunner:
         ids = np.array(due, dtype=int)
         if len(ids):
             if self.rules.end_effector_reset:
-                self.env.end_effector_reset(ids)
+                arms: Any = self.env
+                arms.end_effector_reset(ids)
             self._give_next_task(ids)
             self.actor.begin(ids)
         return ids
@@ -203,20 +212,19 @@ class ChainRunner:
         looks = list(self._look(self.env, ids)) if self._look else []
         for row, (i, run) in enumerate(zip(ids, runs, strict=True)):
             run.elapsed = 0
-            run.was_found, run.was_grasped = self._now("is_success", i), self._now("is_grasped", i)
+            run.was_found, run.was_grasped = self._now("is_success", i), bool(self._now("is_grasped", i))
             run.starts += looks[row : row + 1]
             self._instructions[i] = run.task.instruction
             if not run.frames:
                 self._keep_state(i, run)
 
-    def _now(self, name: str, i: int) -> bool:
+    def _now(self, name: str, i: int) -> bool | None:
         known = getattr(self.env, name, None)
-        return known is not None and bool(known[i])
+        return None if known is None else bool(known[i])
 
     def _keep_state(self, i: int, run: ChainResult) -> None:
-        if self._keeps_states:
-            qpos = self.env.positions(np.array([i]))[0].astype(np.float32)
-            run.frames.append((qpos, len(run.success) - 1, run.success[-1]))
+        if run.is_kept and self._states is not None:
+            run.frames.append((self._states(np.array([i]))[0], len(run.success) - 1, run.success[-1]))
 
     def _step(self, observation: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """Act in the streams that run; the others hold still."""

@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import draccus
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
-from lerobot_env_cronos import Benchmark, CronosEnvConfig, gymnasium_id, load_benchmark
-from lerobot_env_cronos.benchmark.configurations import SPLITS
-from lerobot_env_cronos.config import is_of_this_package
+from lerobot_env_cronos import CronosEnvConfig
 from lerobot_env_cronos.sequential import ADVANCES
 
 from cronos_lerobot.data.video import check_video_size
+from cronos_lerobot.environment_id import check_environment_id
 from cronos_lerobot.evaluation.chains import Chain
 from cronos_lerobot.evaluation.policy_env import (
     check_observations,
@@ -28,7 +27,16 @@ from cronos_lerobot.evaluation.policy_env import (
 )
 from cronos_lerobot.evaluation.policy_source import files_fingerprint, fingerprint
 from cronos_lerobot.evaluation.results import FORMAT
-from cronos_lerobot.evaluation.suites import INDEPENDENT, SEQUENTIAL, SUITES, make_chains
+from cronos_lerobot.evaluation.suites import (
+    INDEPENDENT,
+    SEQUENTIAL,
+    SPLITS,
+    SUITES,
+    Benchmark,
+    benchmark_of,
+    make_chains,
+)
+from cronos_lerobot.protocol.streams import Streams, check_capability, check_makes_streams
 from cronos_lerobot.ranges import check_ranges, limits, ranged
 
 QUICK_CONFIGURATIONS, QUICK_ORDERINGS = 16, 3
@@ -66,8 +74,8 @@ class CronosEvalConfig:
     """Evaluate a policy on single tasks, on chains of tasks, and on streams that nobody resets."""
 
     env: EnvConfig = field(default_factory=CronosEnvConfig)
-    """Scene, benchmark and observations. By default the scene is the benchmark's or that of the policy's training;
-    renderer and observations are those of the policy."""
+    """The environment. Of a CRONOS scene, by default scene, renderer and observations are those of the policy's
+    training."""
     policy: PreTrainedConfig | None = None
     """The policy: --policy.path=<checkpoint, or Hub id[@revision]>."""
     eval: SuitesConfig = field(default_factory=SuitesConfig)
@@ -103,8 +111,7 @@ class CronosEvalConfig:
         Raises:
             ValueError: a value is not valid, or there is nothing to evaluate.
         """
-        if not is_of_this_package(self.env):
-            raise ValueError(f"cronos-eval evaluates --env.type=cronos, got {self.env.type!r}")
+        check_makes_streams(self.env)
         if (self.policy is None) != self.expert:
             raise ValueError("choose a policy, --policy.path=<checkpoint or Hub id>, or --expert=true, not both")
         if not (self.eval.suites and self.eval.splits):
@@ -112,7 +119,21 @@ class CronosEvalConfig:
         if not self.policy_name:
             self.policy_name = EXPERT if self.policy is None else str(self.policy.pretrained_path)
         check_ranges(self)
-        env, default = self.env, CronosEnvConfig()
+        if isinstance(self.env, CronosEnvConfig):
+            self._resolve_scene(self.env, given)
+        elif self.expert:
+            raise ValueError(f"--expert=true needs --env.type=cronos, got {self.env.type!r}")
+        if self.policy is not None:
+            check_observations(self.policy, self.env, self.rename_map)
+        if self.output_dir is None:
+            name = "expert" if self.policy is None else self.policy.type
+            self.output_dir = (
+                Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_{self.env.type}_{name}"
+            )
+
+    def _resolve_scene(self, env: CronosEnvConfig, given: Collection[str]) -> None:
+        """Fill in what follows from the policy in the config of a CRONOS scene."""
+        default = CronosEnvConfig()
         given = {*given, *(f.name for f in fields(env) if getattr(env, f.name) != getattr(default, f.name))}
         if wrong := next((name for name in ELSEWHERE if name in given), None):
             raise ValueError(f"--env.{wrong} is of lerobot-eval; here it is --{ELSEWHERE[wrong]}")
@@ -125,11 +146,6 @@ class CronosEvalConfig:
         env.__post_init__()
         if self.eval.videos:
             check_video_size("--env.render_size", env.render_size)
-        if self.policy is not None:
-            check_observations(self.policy, env, self.rename_map)
-        if self.output_dir is None:
-            name = "expert" if self.policy is None else self.policy.type
-            self.output_dir = Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_cronos_{name}"
 
     def _derived(self, given: Collection[str]) -> dict[str, Any]:
         """Fields of `env` that follow from the policy: its training's scene and renderer, and what it observes."""
@@ -140,31 +156,30 @@ class CronosEvalConfig:
         return trained_observations(self.policy.input_features or {}, path) | scene
 
     @property
-    def env_config(self) -> CronosEnvConfig:
-        """`env`, of a resolved config."""
-        assert isinstance(self.env, CronosEnvConfig)
+    def streams(self) -> Any:
+        """`env`, which has `create_streams`."""
         return self.env
 
-    @cached_property
-    def benchmark(self) -> Benchmark:
-        """What `env` names: its configurations, episodes and chains."""
-        return load_benchmark(self.env_config.benchmark, self.env_config.scene)
-
-    def chains(self, suite: str, split: str) -> list[Chain]:
+    def chains(self, benchmark: Benchmark, suite: str, split: str) -> list[Chain]:
         """What is run of a suite and split."""
         quick = (QUICK_CONFIGURATIONS, QUICK_ORDERINGS) if self.quick else (None, None)
         configurations, orderings = self.eval.n_episodes or quick[0], self.eval.orderings or quick[1]
-        return make_chains(self.benchmark, suite, split, configurations, orderings)
+        return make_chains(benchmark, suite, split, configurations, orderings)
+
+    def check_world(self, env: Streams) -> None:
+        """Raise a ValueError unless a world has what the flags need."""
+        if self.end_effector_reset:
+            check_capability(env, "end_effector_reset", "--end_effector_reset=true")
 
     @cached_property
     def policy_fingerprint(self) -> str:
         """What tells the policy from another one of its name."""
         return EXPERT if self.policy is None else fingerprint(self.policy)
 
-    def header(self, suite: str, split: str) -> dict[str, Any]:
-        """What results.json says about how a suite and split was evaluated, as JSON values."""
-        env, policy = self.env_config, self.policy
-        observation = {name: draccus.encode(getattr(env, name)) for name in OBSERVATION}
+    def header(self, env: Streams, suite: str, split: str) -> dict[str, Any]:
+        """What results.json says about how a suite and split was evaluated in a world, as JSON values."""
+        shown, policy, identity = self.env, self.policy, env.identity
+        observation = {name: draccus.encode(getattr(shown, name)) for name in OBSERVATION if hasattr(shown, name)}
         return {
             "format": FORMAT,
             "policy": self.policy_name,
@@ -173,14 +188,14 @@ class CronosEvalConfig:
             "policy_revision": self.policy_revision,
             "policy_config": draccus.encode(policy) if policy else None,
             "reads_privileged_state": policy is not None and reads_privileged_state(policy),
-            "scene": env.scene,
-            "environment": gymnasium_id(env.scene),
-            "benchmark": {"source": self.benchmark.source, "fingerprint": self.benchmark.fingerprint},
+            "scene": check_environment_id(identity.id, "the environment"),
+            "environment": identity.id,
+            "benchmark": {"source": identity.source, "fingerprint": identity.fingerprint},
             "suite": suite,
             "split": split,
-            "total": len(make_chains(self.benchmark, suite, split)),
-            "obs_type": env.obs_type,
-            "renderer": env.renderer,
+            "total": len(make_chains(benchmark_of(env), suite, split)),
+            "obs_type": obs_type_of(shown),
+            "renderer": getattr(shown, "renderer", None),
             "observation": observation | {"rename_map": self.rename_map},
             "temperature": self.eval.temperature,
             "seed": self.seed,
@@ -192,6 +207,14 @@ class CronosEvalConfig:
     def __get_path_fields__(cls) -> list[str]:
         """Fields that take `--<field>.path`."""
         return ["policy"]
+
+
+def obs_type_of(env: EnvConfig) -> str:
+    """LeRobot's name of the kind of observation."""
+    if hasattr(env, "obs_type"):
+        return str(env.obs_type)
+    shows_pictures = any(feature.type is FeatureType.VISUAL for feature in env.features.values())
+    return "pixels_agent_pos" if shows_pictures else "environment_state_agent_pos"
 
 
 OBSERVATION = ("camera_name", "observation_height", "observation_width", "privileged_state", "task_observation")

@@ -5,16 +5,19 @@ Its chains, random numbers and actors are those of `cronos-eval`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
 
 from cronos_lerobot.agents.base import samples
 from cronos_lerobot.agents.processing import PolicyProcessors
 from cronos_lerobot.evaluation.actors import make_actor
-from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner
+from cronos_lerobot.evaluation.chains import ChainResult, ChainRunner, Rules
 from cronos_lerobot.evaluation.results import describe_episodes, numbers_of
-from cronos_lerobot.evaluation.suites import INDEPENDENT, make_chains, sampling_seed
+from cronos_lerobot.evaluation.suites import INDEPENDENT, benchmark_of, make_chains, sampling_seed
+from cronos_lerobot.protocol.streams import STEPS_PER_TASK
 from cronos_lerobot.ranks import Ranks
 
 
@@ -23,12 +26,13 @@ def run_independent(
     policy: Any,
     processors: PolicyProcessors,
     *,
-    n_episodes: int,
+    n_episodes: int | None,
     split: str,
     temperature: float,
     seed: int,
+    window: int = STEPS_PER_TASK,
     ranks: Ranks | None = None,
-    keeps_states: bool = False,
+    states: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> list[ChainResult]:
     """Run every task of the environment's benchmark with a policy, and leave everything else as it was.
 
@@ -39,25 +43,26 @@ def run_independent(
         env: environments of the evaluation's own, never those of a training.
         policy: a LeRobot policy on its device, or what acts instead of it by `sample_actions`.
         processors: between `env` and `policy`.
-        n_episodes: the first N configurations of every task.
+        n_episodes: the first N configurations of every task; None takes all.
         split: `train` or `held_out`.
         temperature: of the sampling, 0 for the likeliest action.
         seed: of the sampling.
+        window: control steps of a task.
         ranks: processes that share the episodes; all of them call this and get the whole result.
-        keeps_states: return the trajectories, too.
+        states: of `ChainRunner`, to return the trajectories, too.
 
     Returns:
         The episodes, task by task.
     """
     ranks = ranks or Ranks()
-    chains = make_chains(env.benchmark, INDEPENDENT, split, n_episodes)
+    chains = make_chains(benchmark_of(env), INDEPENDENT, split, n_episodes)
     # What acts instead of a policy may have no modes.
     was_training, rng_state = getattr(policy, "training", None), get_rng_state()
     try:
-        actor = make_actor(policy, processors, temperature)
+        actor = make_actor(policy, processors, temperature, env.single_action_space.shape[0])
         actor.seed(ranks.own_seed(seed))
         own = chains[ranks.rank :: ranks.count]
-        runner = ChainRunner(env, actor, keeps_states=keeps_states)
+        runner = ChainRunner(env, actor, Rules(window), states=states)
         results = runner.run(own, split, sampling_seed(seed, INDEPENDENT, split)) if own else []
     finally:
         if was_training is not None:
@@ -98,4 +103,4 @@ def evaluate_independent(
         "steps": sum(episode["steps"] for episode in episodes),
         "episodes": [[e[name] for name in ("seed", "number", "configuration", "length")] for e in episodes],
     }
-    return header | numbers_of(INDEPENDENT, episodes, env.benchmark, split)
+    return header | numbers_of(INDEPENDENT, episodes, benchmark_of(env), split)

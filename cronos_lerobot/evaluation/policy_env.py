@@ -14,6 +14,7 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.datasets import CODEBASE_VERSION
 from lerobot.datasets.utils import INFO_PATH
+from lerobot.envs import EnvConfig
 from lerobot.utils.constants import (
     ACTION,
     HF_LEROBOT_HOME,
@@ -34,6 +35,8 @@ WITHOUT_LANGUAGE = ("act", "diffusion", "gaussian_actor", "tdmpc", "vqbet")
 """LeRobot's policies that read no instruction."""
 
 Features = Mapping[str, PolicyFeature]
+OURS = "lerobot_env_cronos/"
+"""How the ids of CRONOS scenes begin."""
 
 
 def reads_privileged_state(config: PreTrainedConfig) -> bool:
@@ -47,13 +50,12 @@ def reads_privileged_state(config: PreTrainedConfig) -> bool:
     return has_pictures and OBS_ENV_STATE in inputs and not hasattr(config, "critic_observation")
 
 
-def warn_of_inputs(config: PreTrainedConfig, env: CronosEnvConfig) -> None:
+def warn_of_inputs(config: PreTrainedConfig, env: Any) -> None:
     """Log if a policy cannot know its task, or reads what no robot has."""
-    num_tasks = len(get_scene(env.scene).tasks)
-    if config.type in WITHOUT_LANGUAGE and env.task_observation == "none" and num_tasks > 1:
+    if config.type in WITHOUT_LANGUAGE and isinstance(env, CronosEnvConfig) and env.task_observation == "none":
         logging.warning(
             f"--policy.type={config.type} reads no instructions and is not told its task "
-            f"(--env.task_observation=one_hot): it cannot tell the {num_tasks} tasks apart."
+            f"(--env.task_observation=one_hot): it cannot tell the tasks apart."
         )
     if reads_privileged_state(config):
         logging.warning(
@@ -72,7 +74,7 @@ def trained_scene(path: Path | None) -> dict[str, str]:
         ValueError: its config is damaged, or its scene is not registered here.
     """
     env, origin = _training(path)
-    scene = env.get("scene") or (origin.scene if origin else None)
+    scene = env.get("scene") or (origin.scene if origin and origin.environment.startswith(OURS) else None)
     if not scene:
         return {}
     try:
@@ -118,8 +120,8 @@ def _training(path: Path | None) -> tuple[dict[str, Any], Origin | None]:
     return env if env.get("type", "cronos") == "cronos" else {}, origin
 
 
-def scene_of_dataset(repo_id: str, root: Path | str | None, revision: str | None = None) -> str | None:
-    """The scene of a dataset on this machine; None if there is none that says it.
+def environment_of_dataset(repo_id: str, root: Path | str | None, revision: str | None = None) -> str | None:
+    """The environment's id of a dataset on this machine; None if there is none that says it.
 
     Args:
         repo_id: its name, "owner/name".
@@ -127,7 +129,7 @@ def scene_of_dataset(repo_id: str, root: Path | str | None, revision: str | None
         revision: of a downloaded one; None is that of LeRobot's format.
     """
     origin = _origin_of(repo_id, root, revision)
-    return origin.scene if origin else None
+    return origin.environment if origin else None
 
 
 def _origin_of(repo_id: str, root: Path | str | None, revision: str | None) -> Origin | None:
@@ -152,7 +154,7 @@ def _find_dataset(repo_id: str, revision: str | None) -> Path:
 
 
 def check_observations(
-    policy: PreTrainedConfig, env: CronosEnvConfig, rename_map: Mapping[str, str] | None = None
+    policy: PreTrainedConfig, env: EnvConfig, rename_map: Mapping[str, str] | None = None
 ) -> None:
     """Check that an environment shows a policy what it takes, and takes its actions, of the right sizes.
 
@@ -166,12 +168,13 @@ def check_observations(
     Raises:
         ValueError: it does not; names the flag that would.
     """
-    told = task_observation_of(policy.input_features or {}, env)
-    if told != env.task_observation:
-        raise ValueError(
-            f"the policy takes {OBS_STATE} as with --env.task_observation={told}; the environment has "
-            f"--env.task_observation={env.task_observation}"
-        )
+    if isinstance(env, CronosEnvConfig):
+        told = task_observation_of(policy.input_features or {}, env)
+        if told != env.task_observation:
+            raise ValueError(
+                f"the policy takes {OBS_STATE} as with --env.task_observation={told}; the environment has "
+                f"--env.task_observation={env.task_observation}"
+            )
     names = {key: name for key, name in env.features_map.items() if key in env.features}
     given = {(rename_map or {}).get(name, name): env.features[key] for key, name in names.items()}
     for name, taken in ((policy.input_features or {}) | (policy.output_features or {})).items():
@@ -179,19 +182,29 @@ def check_observations(
         if feature is None:
             if name.startswith(EMPTY_CAMERA):
                 continue
-            pixels = "--env.obs_type=pixels_agent_pos with --env.camera_name=<its cameras>"
-            flag = "--env.obs_type=environment_state_agent_pos" if name == OBS_ENV_STATE else pixels
             raise ValueError(
-                f"the policy takes {name}, which the environment does not give: {flag} does, or --rename_map"
+                f"the policy takes {name}, which the environment does not give: {_flag_of(name, env)} --rename_map"
+                " gives it another name"
             )
         if taken.type is not FeatureType.VISUAL and tuple(taken.shape) != tuple(feature.shape):
             raise ValueError(
-                f"the policy was made for {name} of {taken.shape[0]} numbers, {env.scene} has {feature.shape[0]}: "
-                f"it was trained {_where_it_fits(name, taken.shape[0], env)}"
+                f"the policy was made for {name} of {taken.shape[0]} numbers, the environment has "
+                f"{feature.shape[0]}: it was trained {_where_it_fits(name, taken.shape[0], env)}"
             )
 
 
-def _where_it_fits(name: str, size: int, env: CronosEnvConfig) -> str:
+def _flag_of(name: str, env: EnvConfig) -> str:
+    """What makes a CRONOS scene show an observation."""
+    if not isinstance(env, CronosEnvConfig):
+        return ""
+    if name == OBS_ENV_STATE:
+        return "--env.obs_type=environment_state_agent_pos does, or"
+    return "--env.obs_type=pixels_agent_pos with --env.camera_name=<its cameras> does, or"
+
+
+def _where_it_fits(name: str, size: int, env: EnvConfig) -> str:
+    if not isinstance(env, CronosEnvConfig):
+        return "elsewhere"
     told = env.task_observation
     fitting = [f"--env.scene={scene}" for scene in SCENES if _size(name, scene, env, told) == size]
     if name == ACTION or not fitting:

@@ -17,16 +17,16 @@ from typing import Any
 from huggingface_hub import hf_hub_download
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.configs import PreTrainedConfig
+from lerobot.envs import EnvConfig
 from lerobot.policies import make_policy
 from lerobot.processor import ProcessorStep
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
-from lerobot_env_cronos import CronosEnvConfig
 from safetensors import SafetensorError
 
 from cronos_lerobot.evaluation.policy_source import find_base
 
 
-def load_policy(config: PreTrainedConfig, env: CronosEnvConfig, rename_map: dict[str, str] | None = None) -> Any:
+def load_policy(config: PreTrainedConfig, env: EnvConfig, rename_map: dict[str, str] | None = None) -> Any:
     """Return the policy of a config on its device, from scratch if the config has no `pretrained_path`.
 
     PEFT's adapters may name the policy below them as seen from where they were trained (see `find_base`).

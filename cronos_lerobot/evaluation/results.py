@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lerobot_env_cronos import check_environment_id
-from lerobot_env_cronos.benchmark.configurations import SPLITS
-from lerobot_env_cronos.benchmark.orderings import Ordering, is_training_cycle
-from lerobot_env_cronos.scene.scenes import Scene, Task
+from lerobot_env_cronos import EpisodeGroup
 
+from cronos_lerobot.environment_id import check_environment_id
 from cronos_lerobot.evaluation.chains import ChainResult
-from cronos_lerobot.evaluation.suites import STREAM, SUITES, Start
+from cronos_lerobot.evaluation.suites import SPLITS, STREAM, SUITES, Benchmark, Start
+from cronos_lerobot.protocol.streams import Task
 from cronos_lerobot.statistics import cluster_interval, effective_trials
 from cronos_lerobot.whole_files import written_whole
 
@@ -30,7 +29,7 @@ FIELDS = {"policy": str, "policy_fingerprint": str, "scene": str, "benchmark": d
 Episode = Mapping[str, Any]
 """Outcome of a chain: `number` (task, ordering, or first task of the stream), `configuration`, `seed` (of the
 action sampling), `length` (tasks completed), `steps`, `found_complete` and `never_grasped` (positions, see
-`ChainResult`). Of a stream also `success` and `starts` (by segment)."""
+`ChainResult`). Of a stream also `success` and, if the world says it, `starts` (by segment)."""
 
 
 def folder_name(suite: str, split: str) -> str:
@@ -98,15 +97,19 @@ def write_json(path: Path, content: Any) -> None:
         file.write(json.dumps(content, indent=1) + "\n")
 
 
-def describe_episodes(results: Sequence[ChainResult], seed: int) -> list[dict[str, Any]]:
+def describe_episodes(
+    results: Sequence[ChainResult], seed: int, *, of_streams: bool = False
+) -> list[dict[str, Any]]:
     """Outcomes as JSON values, see `Episode`."""
     episodes = []
     for r in results:
         episode: dict[str, Any] = {"number": r.chain.number, "configuration": r.chain.configuration, "seed": seed}
         episode |= {"length": r.length, "steps": r.steps}
         episode |= {"found_complete": r.found_complete, "never_grasped": r.never_grasped}
+        if of_streams:
+            episode |= {"success": r.success}
         if r.starts:
-            episode |= {"success": r.success, "starts": r.starts}
+            episode |= {"starts": r.starts}
         episodes.append(episode)
     return episodes
 
@@ -139,17 +142,16 @@ def independent_results(episodes: Sequence[Episode], tasks: Sequence[Task]) -> d
     return success_rate(episodes) | {"per_task": {text: success_rate(some) for text, some in by_task.items()}}
 
 
-def sequential_results(episodes: Sequence[Episode], orderings: Sequence[Ordering], scene: Scene) -> dict[str, Any]:
+def sequential_results(episodes: Sequence[Episode], groups: Sequence[EpisodeGroup]) -> dict[str, Any]:
     """Success by position and the average chain length: of all orderings, and apart for those seen in training.
 
     Args:
         episodes: of the chains of whole orderings.
-        orderings: of the scene; those without an episode are left out.
-        scene: an ordering is `seen` if it is a piece of the scene's training cycle (`is_training_cycle`).
+        groups: the orderings; those without an episode are left out. A piece of the training cycle is `seen`.
     """
     numbers = sorted({e["number"] for e in episodes})
-    seen = [i for i in numbers if is_training_cycle(orderings[i], scene)]
-    num_tasks = len(orderings[0])
+    seen = [i for i in numbers if groups[i].is_training_cycle]
+    num_tasks = len(groups[0].tasks)
     kinds = {
         name: _summary([e for e in episodes if e["number"] in some], num_tasks) if some else None
         for name, some in (("seen", seen), ("unseen", [i for i in numbers if i not in seen]))
@@ -157,7 +159,7 @@ def sequential_results(episodes: Sequence[Episode], orderings: Sequence[Ordering
     per_ordering = []
     for i in numbers:
         lengths = np.array([e["length"] for e in episodes if e["number"] == i])
-        tasks = [task.instruction for task in orderings[i]]
+        tasks = groups[i].instructions
         row = {"ordering": i, "tasks": tasks, "seen": i in seen, "n": len(lengths)}
         row |= {"positions": [float((lengths > k).mean()) for k in range(num_tasks)]}
         per_ordering.append(row | {"average_chain_length": float(lengths.mean())})
@@ -201,12 +203,13 @@ def stream_results(episodes: Sequence[Episode], cycle: int) -> dict[str, Any]:
 
     Returns:
         `success`, `n` (streams), `ci95`, `effective_n` of all segments; `done` (success without the segments found
-        complete); `share_found_complete`; `by_segment`; `by_start`, with each `share`; `stuck`.
+        complete); `share_found_complete`; `by_segment`; `by_start`, with each `share`; `stuck`. Where the world
+        does not say how segments begin, there are no starts and no causes.
     """
-    success, starts = (np.array([e[name] for e in episodes]) for name in ("success", "starts"))
+    success = np.array([e["success"] for e in episodes])
     num_streams, length = success.shape
     configurations = np.repeat([[e["configuration"]] for e in episodes], length, axis=1)
-    found = starts == Start.COMPLETE
+    found, starts = _starts(episodes, length)
 
     def rate(mask: np.ndarray) -> dict[str, Any] | None:
         return _rate(success[mask], configurations[mask]) if mask.any() else None
@@ -215,7 +218,7 @@ def stream_results(episodes: Sequence[Episode], cycle: int) -> dict[str, Any]:
     segments = [
         _rate(success[:, k], configurations[:, k])
         | {"share_found_complete": float(found[:, k].mean())}
-        | {"starts": {name.value: int((starts[:, k] == name).sum()) for name in Start}}
+        | {"starts": {name.value: int((starts[:, k] == name).sum()) for name in Start if (starts != "").any()}}
         for k in range(length)
     ]
     shares = {name: {"share": r["n"] / success.size} for name, r in by_start.items() if r}
@@ -231,18 +234,29 @@ def stream_results(episodes: Sequence[Episode], cycle: int) -> dict[str, Any]:
     }
 
 
+def _starts(episodes: Sequence[Episode], length: int) -> tuple[np.ndarray, np.ndarray]:
+    """Which segments (n, length) were found complete, and how they began: "" where that is not known."""
+    if all("starts" in e for e in episodes):
+        starts = np.array([e["starts"] for e in episodes])
+        return starts == Start.COMPLETE, starts
+    found = np.zeros((len(episodes), length), bool)
+    for row, episode in zip(found, episodes, strict=True):
+        row[episode["found_complete"]] = True
+    return found, np.full(found.shape, "")
+
+
 def _stuck(done: np.ndarray, starts: np.ndarray, last: int) -> dict[str, Any]:
     """Streams in which the policy did no task in the last segments, and their causes; see `stream_results`."""
     stuck = np.flatnonzero(~done[:, -last:].any(axis=1))
-    causes = Counter(Counter(starts[i, -last:].tolist()).most_common(1)[0][0] for i in stuck)
+    causes = Counter(Counter(starts[i, -last:].tolist()).most_common(1)[0][0] for i in stuck if starts[i, 0])
     return {"streams": len(stuck), "share": len(stuck) / len(done), "causes": dict(causes.most_common())}
 
 
-def numbers_of(suite: str, episodes: Sequence[Episode], benchmark: Any, split: str) -> dict[str, Any]:
+def numbers_of(suite: str, episodes: Sequence[Episode], benchmark: Benchmark, split: str) -> dict[str, Any]:
     """The numbers of a suite and split."""
     if suite == STREAM:
-        return stream_results(episodes, len(benchmark.scene.tasks))
+        return stream_results(episodes, len(benchmark.tasks))
     groups = benchmark.groups(suite, split)
     if suite == SUITES[0]:
         return independent_results(episodes, [group.tasks[0] for group in groups])
-    return sequential_results(episodes, [group.tasks for group in groups], benchmark.scene)
+    return sequential_results(episodes, groups)

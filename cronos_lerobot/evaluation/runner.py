@@ -7,6 +7,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +30,32 @@ from cronos_lerobot.evaluation.results import (
     result_files,
     write_json,
 )
-from cronos_lerobot.evaluation.suites import STREAM, classify_starts, rules_of, sampling_seed
+from cronos_lerobot.evaluation.suites import (
+    STREAM,
+    benchmark_of,
+    classify_starts,
+    rules_of,
+    sampling_seed,
+)
 from cronos_lerobot.locks import FolderLock
+from cronos_lerobot.protocol.streams import Draws, Streams, steps_per_task
 from cronos_lerobot.provenance import git_commit, package_versions
 
-Draw = Callable[[Path, dict[str, Any], Sequence[ChainResult], Callable[[np.ndarray], np.ndarray], int], None]
+FRAMES_KEPT = 4
+"""Chains whose frames are kept, for each video that is wanted."""
+Render = Callable[[np.ndarray], np.ndarray]
+Draw = Callable[[Path, dict[str, Any], Sequence[ChainResult], Render, int, float], None]
 """Draws videos and pictures, see `film.suites.draw_suite`."""
+
+
+@dataclass(frozen=True)
+class Film:
+    """How chains are filmed: what is kept of them, and how it becomes frames."""
+
+    states: Callable[[np.ndarray], np.ndarray]
+    render: Render
+    num_kept: int | None = None
+    """Frames take space: of a world that keeps them only the first chains are filmed."""
 
 
 class Evaluation:
@@ -53,7 +74,11 @@ class Evaluation:
         assert config.output_dir is not None
         self.config, self.folder, self._draw = config, config.output_dir, draw
         pairs = [(suite, split) for suite in config.eval.suites for split in config.eval.splits]
-        self.chains = {pair: config.chains(*pair) for pair in dict.fromkeys(pairs)}
+        # What the world is; more streams of it are made where they are needed.
+        self.world: Streams = config.streams.create_streams(1)
+        config.check_world(self.world)
+        self.benchmark = benchmark_of(self.world)
+        self.chains = {pair: config.chains(self.benchmark, *pair) for pair in dict.fromkeys(pairs)}
         done = [self._check(file) for file in result_files(self.folder) if file.is_file()]
         if not done and (self.folder / EVAL_INFO).exists():
             raise FileExistsError(f"{self.folder} has an evaluation of lerobot-eval: choose another --output_dir")
@@ -64,7 +89,7 @@ class Evaluation:
         results = read_results(file)
         pair = results["suite"], results["split"]
         n = len(self.chains[pair]) if pair in self.chains else results["n"]
-        check_same(results, self.config.header(*pair) | {"n": n}, file)
+        check_same(results, self.config.header(self.world, *pair) | {"n": n}, file)
         return pair
 
     def _file(self, suite: str, split: str) -> Path:
@@ -87,7 +112,7 @@ class Evaluation:
     def _run_missing(self) -> None:
         config = self.config
         num_envs = min(config.eval.batch_size, max(len(self.chains[pair]) for pair in self.missing))
-        env = CronosVectorEnv(num_envs, config.env_config.scene, **config.env_config.gym_kwargs)
+        env = self.world if num_envs == 1 else config.streams.create_streams(num_envs)
         try:
             actor = self._load_actor(env)
             for suite, split in self.missing:
@@ -96,37 +121,54 @@ class Evaluation:
         finally:
             env.close()
 
-    def _load_actor(self, env: CronosVectorEnv) -> Actor:
+    def _load_actor(self, env: Streams) -> Actor:
         config = self.config
         if config.policy is None:
+            assert isinstance(env, CronosVectorEnv)
             return ExpertActor(env)
-        warn_of_inputs(config.policy, config.env_config)
-        return load_actor(config.policy, config.env_config, config.eval.temperature, config.rename_map)
+        warn_of_inputs(config.policy, config.env)
+        return load_actor(config.policy, config.env, config.eval.temperature, config.rename_map)
 
-    def _run_suite(self, env: CronosVectorEnv, actor: Actor, suite: str, split: str) -> dict[str, Any]:
+    def _run_suite(self, env: Streams, actor: Actor, suite: str, split: str) -> dict[str, Any]:
         config, chains = self.config, self.chains[suite, split]
         start = time.perf_counter()
-        is_stream, draw = suite == STREAM, self._draw if config.eval.videos else None
+        is_stream, film = suite == STREAM, self._film(env)
         runner = ChainRunner(
             env,
             actor,
-            rules_of(suite, config.advance, config.end_effector_reset),
-            look=classify_starts if is_stream else None,
-            keeps_states=draw is not None,
+            rules_of(suite, steps_per_task(config.env), config.advance, config.end_effector_reset),
+            look=classify_starts if is_stream and isinstance(env, CronosVectorEnv) else None,
+            states=film.states if film else None,
+            num_kept=film.num_kept if film else None,
         )
         actor.seed(config.seed)
         ended = _run_with_bar(runner, chains, split, sampling_seed(config.seed, suite, split), f"{suite} {split}")
-        episodes = describe_episodes(ended, config.seed)
-        results = config.header(suite, split) | {"temperature": actor.temperature}
+        episodes = describe_episodes(ended, config.seed, of_streams=is_stream)
+        results = config.header(env, suite, split) | {"temperature": actor.temperature}
         results |= _provenance(time.perf_counter() - start)
-        results |= numbers_of(suite, episodes, config.benchmark, split) | {"episodes": episodes}
-        if draw is not None:
+        results |= numbers_of(suite, episodes, self.benchmark, split) | {"episodes": episodes}
+        if film is not None and self._draw is not None:
+            folder = self._file(suite, split).parent
             try:
-                draw(self._file(suite, split).parent, results, ended, env.render_positions, config.eval.videos)
+                self._draw(folder, results, ended, film.render, config.eval.videos, env.fps)
             except RuntimeError as error:
                 # Policies that read the state run on machines without OpenGL.
                 logging.warning("no videos: %s", error)
         return results
+
+    def _film(self, env: Streams) -> Film | None:
+        """How the chains are filmed; None if they are not."""
+        count = self.config.eval.videos
+        if not count or self._draw is None:
+            return None
+        if isinstance(env, CronosVectorEnv):
+            return Film(
+                lambda ids: env.positions(ids).astype(np.float32),
+                lambda q: env.render_positions(q.astype(np.float64)),
+            )
+        if isinstance(env, Draws):
+            return Film(env.render_streams, lambda frames: frames, FRAMES_KEPT * count)
+        return None
 
 
 def _provenance(seconds: float) -> dict[str, Any]:

@@ -2,20 +2,66 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from itertools import cycle, islice
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
-from lerobot_env_cronos import Benchmark
-from lerobot_env_cronos.benchmark.configurations import SPLITS
+from lerobot_env_cronos import EpisodeGroup
+from lerobot_env_cronos.benchmark.orderings import draw_orderings
 from lerobot_env_cronos.simulation.workspace import Unsuitable, find_unsuitable
 
 from cronos_lerobot.evaluation.chains import Chain, Rules
+from cronos_lerobot.protocol.streams import Streams, Task
 
+SPLITS = ("train", "held_out")
 INDEPENDENT, SEQUENTIAL, STREAM = SUITES = ("independent", "sequential", "stream")
 STREAM_TASKS = 16
 """Tasks in a row in the stream suite."""
+
+
+class Benchmark(Protocol):
+    """What is evaluated in a world."""
+
+    @property
+    def tasks(self) -> Sequence[Task]:
+        """Of the world."""
+        ...
+
+    @property
+    def num_starts(self) -> Mapping[str, int]:
+        """By split."""
+        ...
+
+    def groups(self, suite: str, split: str) -> Sequence[EpisodeGroup]:
+        """The episodes or chains of the independent or sequential suite."""
+        ...
+
+
+@dataclass(frozen=True)
+class DrawnBenchmark:
+    """Of a world that brings none: every task, and up to ten orderings of them all, from every start."""
+
+    tasks: Sequence[Any]
+    num_starts: Mapping[str, int]
+
+    def groups(self, suite: str, split: str) -> list[EpisodeGroup]:
+        """See `Benchmark`. The first ordering is the training cycle."""
+        starts = tuple(range(self.num_starts[split]))
+        if suite == INDEPENDENT:
+            return [EpisodeGroup(i, (task,), starts) for i, task in enumerate(self.tasks)]
+        orderings = draw_orderings(len(self.tasks))
+        return [
+            EpisodeGroup(i, tuple(self.tasks[k] for k in ordering), starts, is_training_cycle=i == 0)
+            for i, ordering in enumerate(orderings)
+        ]
+
+
+def benchmark_of(env: Streams) -> Benchmark:
+    """What is evaluated in `env`."""
+    return getattr(env, "benchmark", None) or DrawnBenchmark(env.tasks, env.num_starts)
 
 
 def make_chains(
@@ -34,8 +80,8 @@ def make_chains(
         orderings: the first N orderings of the sequential suite; None takes all.
     """
     if suite == STREAM:
-        tasks = benchmark.scene.tasks
-        first = range(len(benchmark.configurations[split]))[:n_episodes]
+        tasks = benchmark.tasks
+        first = range(benchmark.num_starts[split])[:n_episodes]
         return [Chain(c % len(tasks), _from(tasks, c % len(tasks)), c) for c in first]
     groups = benchmark.groups(suite, split)
     if suite == SEQUENTIAL:
@@ -43,16 +89,16 @@ def make_chains(
     return [Chain(group.number, group.tasks, c) for group in groups for c in group.configurations[:n_episodes]]
 
 
-def _from(tasks: tuple[Any, ...], first: int) -> tuple[Any, ...]:
+def _from(tasks: Sequence[Any], first: int) -> tuple[Any, ...]:
     """The tasks of a stream: the cycle from task number `first`."""
     return tuple(islice(cycle(tasks), first, first + STREAM_TASKS))
 
 
-def rules_of(suite: str, advance: str, end_effector_reset: bool) -> Rules:
+def rules_of(suite: str, window: int, advance: str, end_effector_reset: bool) -> Rules:
     """The rules of a suite's chains; a stream continues whatever happens, window by window."""
     if suite == STREAM:
-        return Rules(end_effector_reset=end_effector_reset, stops=False)
-    return Rules(advance=advance, end_effector_reset=end_effector_reset)
+        return Rules(window, end_effector_reset=end_effector_reset, stops=False)
+    return Rules(window, advance, end_effector_reset)
 
 
 def sampling_seed(seed: int, suite: str, split: str) -> tuple[int, int, int]:
@@ -78,7 +124,7 @@ class Start(StrEnum):
 
 
 def classify_starts(env: Any, ids: np.ndarray) -> list[Start]:
-    """Say how the bodies of the current tasks of streams `ids` (k,) lie."""
+    """Say how the bodies of the current tasks of streams `ids` (k,) of a CRONOS scene lie."""
     tasks, bodies = env.scene.tasks, env.scene.bodies
     complete, unsuitable = env.find_complete(tasks), find_unsuitable(env.simulation)
     starts = []

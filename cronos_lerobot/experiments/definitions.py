@@ -30,6 +30,7 @@ class Row:
     def label(self) -> str:
         """What tables and figures call it, such as `T = 1280, EER, CL`."""
         from cronos_lerobot.protocol import ProtocolConfig
+        from cronos_lerobot.protocol.streams import STEPS_PER_TASK
         from cronos_lerobot.report.runs import describe_protocol
 
         given = dict(flag.removeprefix("--").split("=", 1) for flag in self.flags)
@@ -38,7 +39,7 @@ class Row:
         others = [
             f"{name.rpartition('.')[2]}={value}" for name, value in given.items() if name.startswith("algorithm.")
         ]
-        return ", ".join([describe_protocol(asdict(ProtocolConfig()) | own), *others])
+        return ", ".join([describe_protocol(asdict(ProtocolConfig(STEPS_PER_TASK)) | own), *others])
 
 
 def _value(text: str) -> Any:

@@ -18,6 +18,8 @@ from lerobot_env_cronos import CronosEnvConfig
 from markupsafe import Markup
 
 from cronos_lerobot.hub.stage import clean
+from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.protocol.streams import STEPS_PER_TASK
 from cronos_lerobot.provenance import package_versions
 from cronos_lerobot.training.config import CronosTrainConfig
 
@@ -92,7 +94,8 @@ def changed_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
     flags = flatten_dict(dict(flags), sep=".")
     algorithm, known = flags.get("algorithm.type"), RLAlgorithmConfig.get_known_choices()
     choice = {"algorithm": known[algorithm]()} if isinstance(algorithm, str) and algorithm in known else {}
-    config = draccus.encode(CronosTrainConfig(env=CronosEnvConfig(), **choice))
+    K = flags.get("protocol.task_switch_interval", STEPS_PER_TASK)
+    config = draccus.encode(CronosTrainConfig(env=CronosEnvConfig(), protocol=ProtocolConfig(K), **choice))
     defaults = flatten_dict(json.loads(json.dumps(config)), sep=".")
     return {
         name: value if isinstance(value, str) else json.dumps(value)

@@ -19,6 +19,8 @@ from cronos_lerobot.hub.cards import is_packaged
 from cronos_lerobot.report.runs import TrainingRun, read_training_run
 from cronos_lerobot.training.run_folder import MANIFEST, METRICS
 
+CRONOS = "cronos"
+"""`--env.type` of CRONOS scenes."""
 DEFAULTS = {field.name: field.default for field in fields(CronosEnvConfig)}
 
 
@@ -72,7 +74,7 @@ def is_repository(name: Any) -> bool:
 def environment_flags(
     policy: Mapping[str, Any], trained: Mapping[str, Any], scene: str | None, model: Path | None = None
 ) -> list[str]:
-    """Flags with which `lerobot-eval` and `cronos-eval` show a policy what it takes.
+    """Flags with which `cronos-eval`, and in CRONOS scenes `lerobot-eval`, show a policy what it takes.
 
     Args:
         policy: its config.json. A plugin's config class may not be installed here.
@@ -81,6 +83,9 @@ def environment_flags(
         model: its folder, which tells the renderer of the pictures that it learned from.
     """
     rename_map = dict(trained.get("rename_map") or {})
+    renamed = [f"--rename_map={json.dumps(rename_map)}"] if rename_map else []
+    if (kind := (trained.get("env") or {}).get("type", CRONOS)) != CRONOS:
+        return ["--env.discover_packages_path=<module of the environment>", f"--env.type={kind}", *renamed]
     shown_as = {renamed: name for name, renamed in rename_map.items()}
     features = {
         shown_as.get(name, name): PolicyFeature(FeatureType(feature["type"]), tuple(feature["shape"]))
@@ -93,7 +98,7 @@ def environment_flags(
     for name, value in wanted.items():
         if name in ("scene", "obs_type") or value != DEFAULTS[name]:
             flags.append(f"--env.{name}={str(value).lower() if isinstance(value, bool) else value}")
-    return flags + ([f"--rename_map={json.dumps(rename_map)}"] if rename_map else [])
+    return flags + renamed
 
 
 def _task_observation(features: Mapping[str, PolicyFeature], env: Mapping[str, Any], scene: str | None) -> str:

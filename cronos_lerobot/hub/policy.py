@@ -24,7 +24,7 @@ from cronos_lerobot.evaluation.policy_source import (
 )
 from cronos_lerobot.evaluation.results import read_evaluation
 from cronos_lerobot.hub.cards import changed_flags, render_card
-from cronos_lerobot.hub.checkpoint import environment_flags, find_checkpoint, is_repository
+from cronos_lerobot.hub.checkpoint import CRONOS, environment_flags, find_checkpoint, is_repository
 from cronos_lerobot.hub.config import PolicyConfig, check_name
 from cronos_lerobot.hub.push import matching
 from cronos_lerobot.hub.results import TRAINING, describe_setting, differences
@@ -120,12 +120,14 @@ def _about(
     if config.scene:
         get_scene(config.scene)
     flags = environment_flags(policy, trained, scene, model)
+    world = (trained.get("env") or {}).get("type", CRONOS)
     is_reset_free = all(trained.get(name) for name in ("env", "protocol", "algorithm"))
     return {
         "repo_id": config.repo_id,
         "policy": policy,
         "tags": [str(tag) for tag in policy.get("tags") or []],
-        "scene": scene,
+        "scene": scene or (world if world != CRONOS else None),
+        "plays_in_lerobot": world == CRONOS and not (model / STEERING).is_file(),
         "dataset": config.dataset or (trained.get("record") or trained.get("dataset") or {}).get("repo_id"),
         "is_steered": (model / STEERING).is_file(),
         "is_reset_free": is_reset_free,

@@ -209,7 +209,7 @@ def _setting(results: Mapping[str, Any]) -> str:
         f"{name} {versions[name]}" for name in ("cronos-lerobot", "lerobot_env_cronos") if name in versions
     ]
     seen = results["obs_type"] + " with the privileged state" * bool(results["reads_privileged_state"])
-    seen += " and the task" * (results["observation"]["task_observation"] != "none")
+    seen += " and the task" * (results["observation"].get("task_observation", "none") != "none")
     return "; ".join(
         [describe_sampling(results["temperature"]), f"sampling seed {results['seed']}", seen, ", ".join(packages)]
     )

@@ -4,27 +4,30 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
-from lerobot_env_cronos.vector_env import REWARDS
-
 RESET_PHASES = ("together", "staggered")
+REWARDS = ("difference", "level")
+OF_THE_WORLD = -1
+"""Value of an interval that follows from the steps of a task."""
 
 
 @dataclass
 class ProtocolConfig:
     """When a stream switches task, when the policy learns, and which resets a stream gets.
 
+    The intervals follow from the environment's steps of a task unless they are given; see `resolve`.
+
     Raises:
         ValueError: an interval is no multiple of K, or a value is not valid.
     """
 
-    task_switch_interval: int = 80
-    """K: control steps of one stream between two task switches, the length of a segment."""
-    update_interval: int = 160
-    """U: control steps of each stream between two policy updates; a multiple of K."""
-    scene_reset_interval: int | None = 1280
-    """T (H in Algorithm 1): control steps of one stream between two scene resets; a multiple of K. 80 is episodic
-    training, null never resets the scene."""
+    task_switch_interval: int = OF_THE_WORLD
+    """K: control steps of one stream between two task switches, the length of a segment; -1 takes the
+    environment's, 80 for kitchen_2x2."""
+    update_interval: int = OF_THE_WORLD
+    """U: control steps of each stream between two policy updates; a multiple of K. -1 is 2 K."""
+    scene_reset_interval: int | None = OF_THE_WORLD
+    """T (H in Algorithm 1): control steps of one stream between two scene resets; a multiple of K. -1 is 16 K, K
+    is episodic training, null never resets the scene."""
     curriculum: list[tuple[int, int | None]] = field(default_factory=list)
     """[[until_step, T], ...]: T up to and including that interaction step (summed over the streams), null for no
     scene reset, later scene_reset_interval. The paper's curriculum of a 1.3 M step run is [[650000, 320]]."""
@@ -44,33 +47,50 @@ class ProtocolConfig:
     task_order: str = "heuristic"
     """How the next task is chosen: `heuristic` (the fixed cycle of Appendix E), `random` (uniform) or the name of
     a registered order."""
-    num_configurations: int = NUM_CONFIGURATIONS
-    """Scene resets draw from the first N configurations of the training split. A scene of the package has 64."""
+    num_configurations: int | None = None
+    """Scene resets draw from the first N configurations of the training split; null draws from all."""
     reward: str = "difference"
     """`difference` pays the change of the reward level (0.1 grasped, 1.0 success) between two steps, `level`
     pays the level at every step."""
 
     def __post_init__(self) -> None:
-        for name, low in (("task_switch_interval", 1), ("num_configurations", 1), ("reset_budget", 1)):
-            if (value := getattr(self, name)) is not None and value < low:
-                raise ValueError(f"--protocol.{name} must be >= {low}, got {value}.")
+        for name in ("num_configurations", "reset_budget"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise ValueError(f"--protocol.{name} must be >= 1, got {value}.")
+        if self.task_switch_interval != OF_THE_WORLD:
+            self.resolve(self.task_switch_interval)
         for name, valid in (("reset_phase", RESET_PHASES), ("reward", REWARDS)):
             if getattr(self, name) not in valid:
                 raise ValueError(f"--protocol.{name} must be one of {valid}, got {getattr(self, name)!r}.")
-        intervals = [interval for _, interval in self.curriculum]
-        for name, multiples in (
-            ("update_interval", [self.update_interval]),
-            ("scene_reset_interval", [self.scene_reset_interval]),
-            ("curriculum", intervals),
-        ):
-            if any(m is not None and (m < 1 or m % self.task_switch_interval) for m in multiples):
-                raise ValueError(
-                    f"--protocol.{name} must be a positive multiple of --protocol.task_switch_interval="
-                    f"{self.task_switch_interval}, got {getattr(self, name)}."
-                )
         ends = [until_step or 0 for until_step, _ in self.curriculum]
         if ends != sorted(set(ends)) or 0 in ends:
             raise ValueError(f"--protocol.curriculum must have increasing steps > 0, got {self.curriculum}.")
+
+    def resolve(self, steps_per_task: int) -> ProtocolConfig:
+        """Fill in the intervals that were not given, for a world whose tasks have so many control steps.
+
+        Raises:
+            ValueError: an interval is no multiple of K.
+        """
+        if self.task_switch_interval == OF_THE_WORLD:
+            self.task_switch_interval = steps_per_task
+        if (K := self.task_switch_interval) < 1:
+            raise ValueError(f"--protocol.task_switch_interval must be >= 1, got {K}.")
+        if self.update_interval == OF_THE_WORLD:
+            self.update_interval = 2 * K
+        if self.scene_reset_interval == OF_THE_WORLD:
+            self.scene_reset_interval = 16 * K
+        for name, multiples in (
+            ("update_interval", [self.update_interval]),
+            ("scene_reset_interval", [self.scene_reset_interval]),
+            ("curriculum", [interval for _, interval in self.curriculum]),
+        ):
+            if any(m is not None and (m < 1 or m % K) for m in multiples):
+                raise ValueError(
+                    f"--protocol.{name} must be a positive multiple of --protocol.task_switch_interval={K}, got "
+                    f"{getattr(self, name)}."
+                )
+        return self
 
     def scene_reset_interval_at(self, interaction_step: int) -> int | None:
         """T in force at `interaction_step` (summed over the streams); None means no periodic reset."""

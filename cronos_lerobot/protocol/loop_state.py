@@ -170,7 +170,7 @@ class LoopState:
         """Count one event of `kind` for each stream of `ids`."""
         self.interventions[ids, kind] += 1
         self.preceded_by[ids] = np.maximum(self.preceded_by[ids], kind)
-        if kind in (Intervention.SCENE_RESET, Intervention.DIVERGENCE):
+        if kind in (Intervention.SCENE_RESET, Intervention.DIVERGENCE, Intervention.INITIAL):
             self.segments_since_reset[ids] = 0
         if kind is Intervention.DIVERGENCE:
             self.diverged[ids] = False

@@ -110,7 +110,7 @@ class HeuristicReset(ResetStrategy):
         unsuitable = env.unsuitable_bodies()
         for stream in ids:
             for body in np.flatnonzero(unsuitable[stream]):
-                env.put_back(int(stream), env.scene.bodies[body], self.rng)
+                env.put_back(int(stream), int(body), self.rng)
 
 
 class SceneReset(ResetStrategy):
@@ -118,18 +118,19 @@ class SceneReset(ResetStrategy):
 
     Args:
         rng: draws the configuration of the train split, one for each stream.
-        num_configurations: draws from the first N of the split only.
+        num_configurations: draws from the first N of the split only; None from all.
     """
 
     kind = Intervention.SCENE_RESET
 
-    def __init__(self, rng: np.random.Generator, num_configurations: int) -> None:
+    def __init__(self, rng: np.random.Generator, num_configurations: int | None = None) -> None:
         self.rng = rng
         self.num_configurations = num_configurations
 
     def apply(self, env: Any, ids: np.ndarray) -> None:
         """Place the streams `ids` in configurations of the training split."""
-        env.scene_reset(ids, self.rng.integers(self.num_configurations, size=len(ids)))
+        available = self.num_configurations or env.num_starts["train"]
+        env.scene_reset(ids, self.rng.integers(available, size=len(ids)))
 
 
 class PeriodicSceneReset(SceneReset):

@@ -8,13 +8,14 @@ from typing import Any
 
 from cronos_lerobot.agents.base import Agent
 from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.protocol.streams import Streams
 
 
 @dataclass(frozen=True)
 class RunContext:
     """What a run is made of, for a task order or a reset strategy with a method `bind`."""
 
-    env: Any
+    env: Streams
     """The streams: all N of them, whatever process they are in."""
     agent: Agent
     tasks: Sequence[Any]

@@ -11,6 +11,7 @@ import numpy as np
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.loop_state import LoopState
 from cronos_lerobot.protocol.run_context import RunContext
+from cronos_lerobot.protocol.streams import Streams
 from cronos_lerobot.registry import Registry
 
 
@@ -22,9 +23,15 @@ class TaskSet:
     reset_tasks: tuple[Any, ...] = ()
 
     @classmethod
-    def of(cls, scene: Any, protocol: ProtocolConfig) -> TaskSet:
-        """The tasks of `scene` that `protocol` trains."""
-        return cls(tuple(scene.tasks), tuple(scene.reset_tasks) if protocol.learned_reset else ())
+    def of(cls, env: Streams, protocol: ProtocolConfig) -> TaskSet:
+        """The tasks of `env` that `protocol` trains.
+
+        Raises:
+            ValueError: learned resets are wanted, and there are no reset tasks.
+        """
+        if protocol.learned_reset and not env.reset_tasks:
+            raise ValueError(f"--protocol.learned_reset needs reset_tasks, and {env.identity.id} has none")
+        return cls(tuple(env.tasks), tuple(env.reset_tasks) if protocol.learned_reset else ())
 
     @property
     def all(self) -> tuple[Any, ...]:

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from lerobot_env_cronos import check_environment_id
 
+from cronos_lerobot.environment_id import check_environment_id
 from cronos_lerobot.evaluation.policy_source import PUSHED
 from cronos_lerobot.training.run_folder import MANIFEST, METRICS
 
@@ -180,7 +180,7 @@ def describe_protocol(protocol: dict[str, Any]) -> str:
     words += protocol.get("extra_resets") or []
     if protocol.get("task_order", "heuristic") != "heuristic":
         words.append(f"{protocol['task_order']} order")
-    if protocol.get("num_configurations", 64) != 64:
+    if protocol.get("num_configurations") not in (None, 64):
         words.append(f"{protocol['num_configurations']} configuration(s)")
     if (budget := protocol.get("reset_budget")) is not None:
         words.append(f"at most {budget} interventions")

@@ -26,7 +26,7 @@ from cronos_lerobot.command_line import parse_command_line
 from cronos_lerobot.data.demo_starts import check_starts
 from cronos_lerobot.data.demos import DemoCollector, DemoConfig, ExpertError, tasks_of
 from cronos_lerobot.data.origin import DEMONSTRATIONS, flags_of, origin_of
-from cronos_lerobot.data.schema import demonstration_features, describe_observation
+from cronos_lerobot.data.schema import demonstration_features
 from cronos_lerobot.data.writer import RecordingError, SegmentWriter
 from cronos_lerobot.dataset_metadata import check_path
 from cronos_lerobot.locks import FolderLock
@@ -103,7 +103,7 @@ def _open(cfg: RecordDemosConfig) -> tuple[SegmentWriter, DemoCollector]:
     scene = get_scene(cfg.env.scene)
     task = find_task(scene.name, cfg.env.task)
     tasks = tasks_of(cfg, scene) if task is None else [task]
-    env = CronosVectorEnv(cfg.num_envs, cfg.env.scene, **cfg.env.gym_kwargs)
+    env = cfg.env.create_streams(cfg.num_envs)
     check_starts(cfg.start, scene, tasks)
     # Before there is a dataset: whether pictures can be drawn here.
     env.observe(np.arange(1))
@@ -145,9 +145,7 @@ def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv) -> SegmentWriter:
     assert root is not None
     # Before anything is deleted: what cannot be recorded raises here.
     check_path(root)
-    features = demonstration_features(
-        env.single_observation_space, video=cfg.dataset.video, **describe_observation(env)
-    )
+    features = demonstration_features(env, video=cfg.dataset.video)
     if root.exists() and not cfg.resume:
         if not cfg.dataset.overwrite:
             raise FileExistsError(f"{root} exists: --resume=true adds to it, --dataset.overwrite=true replaces it")
@@ -159,7 +157,8 @@ def open_writer(cfg: RecordDemosConfig, env: CronosVectorEnv) -> SegmentWriter:
         cfg.dataset.repo_id,
         root,
         features,
-        int(env.metadata["render_fps"]),
+        round(env.fps),
+        robot_type=env.robot_type,
         resume=-1 if cfg.resume else None,
         origin=origin_of(env, DEMONSTRATIONS, flags_of(cfg)),
         may_differ=MAY_DIFFER,

@@ -29,7 +29,6 @@ from lerobot.utils.constants import (
     TRAINING_STATE_DIR,
 )
 from lerobot.utils.random_utils import deserialize_rng_state, serialize_rng_state, set_seed
-from lerobot_env_cronos import check_environment_id
 from safetensors import SafetensorError
 from torch.optim import Optimizer
 
@@ -51,7 +50,7 @@ DAMAGE = (RuntimeError, ValueError, KeyError, TypeError, AttributeError, EOFErro
 """What PyTorch raises for a file that is truncated, or no state at all."""
 
 
-def save_checkpoint(run: Run, observers: dict[str, Any], env_state: dict[str, np.ndarray]) -> Path:
+def save_checkpoint(run: Run, observers: dict[str, Any], env_state: dict[str, np.ndarray] | None) -> Path:
     """Write a checkpoint and point `last` at it; returns its folder. All processes call it, the first one writes.
 
     A kill at any moment leaves either the whole checkpoint or none: it is written beside its place and
@@ -60,7 +59,7 @@ def save_checkpoint(run: Run, observers: dict[str, Any], env_state: dict[str, np
     Args:
         run: between two segments.
         observers: states of the loggers and recorders by name: numbers, strings, NumPy arrays.
-        env_state: of `env.get_state()`.
+        env_state: of `env.get_state()`; None of a world without.
 
     Raises:
         OSError: the run's folder is gone, or the disk is full.
@@ -99,19 +98,17 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
     """Read the state in a checkpoint, without executing anything that the file says.
 
     Raises:
-        ValueError: the file is missing or damaged, or of another version of this package or of the environment.
+        ValueError: the file is missing or damaged, or of another version of this package.
     """
     path = checkpoint / TRAINING_STATE_DIR / STATE
     try:
         state = as_it_was(torch.load(path, map_location="cpu", weights_only=True, mmap=True))
-        found, environment = state["format"], state["environment"]
+        found = state["format"]
     except DAMAGE as error:
         # PyTorch's own message advises to load the file unsafely.
         raise ValueError(f"{path} is missing or damaged, or cronos-train did not write it.") from error
     if found != FORMAT:
         raise ValueError(f"{path} has format {found}, this version reads {FORMAT}: begin a new run.")
-    if environment is not None:
-        check_environment_id(environment, f"the run of {checkpoint}", "begin a new run")
     return state
 
 
@@ -123,9 +120,10 @@ def restore(run: Run, state: dict[str, Any]) -> dict[str, Any]:
         state: of `read_state`.
 
     Raises:
-        ValueError: the weights or the state are damaged, or of another policy.
+        ValueError: the weights or the state are damaged, or of another policy or environment.
     """
     checkpoint = Path(run.config.checkpoint_path or "")
+    _check_identity(state, describe_environment(run.env.identity))
     try:
         load_weights(run.agent.policy, checkpoint / PRETRAINED_MODEL_DIR)
         _restore(run, state)
@@ -151,7 +149,7 @@ def point_last_at(checkpoint: Path) -> None:
     new.replace(link)
 
 
-def _collect(run: Run, observers: dict[str, Any], env_state: dict[str, np.ndarray]) -> dict[str, Any]:
+def _collect(run: Run, observers: dict[str, Any], env_state: dict[str, np.ndarray] | None) -> dict[str, Any]:
     """What state.pt holds; only the first process has all of it."""
     optimizer = run.agent.optimizer
     state = {
@@ -168,7 +166,7 @@ def _collect(run: Run, observers: dict[str, Any], env_state: dict[str, np.ndarra
         "optimizer": None if optimizer is None else _states(optimizer),
         "observers": observers,
     }
-    saved = to_saved(state | describe_environment(run.config.env), "state")
+    saved = to_saved(state | describe_environment(run.env.identity), "state")
     return saved | {"agent": agent_state(run.agent)}
 
 
@@ -194,7 +192,7 @@ def _restore(run: Run, state: dict[str, Any]) -> None:
         _load_optimizer(run.agent.optimizer, state["optimizer"])
     run.loop.__dict__.update(vars(LoopState.from_state_dict(state["loop"])))
     run.generators.load_state_dict(state["generators"], run.loop.n)
-    run.env.set_state(state["env"])
+    _restore_world(run, state["env"])
     run.agent.load_state_dict(state["agent"])
     load_own_states(run.strategies, state["strategies"])
     rank, count = run.ranks.rank, len(state["rng"])
@@ -208,6 +206,28 @@ def _restore(run: Run, state: dict[str, Any]) -> None:
     else:
         # Those of the first process, or of the run's beginning, would be drawn twice.
         set_seed(int(np.random.SeedSequence((run.config.seed, rank, run.loop.n)).generate_state(1)[0]))
+
+
+def _check_identity(was: dict[str, Any], now: dict[str, Any]) -> None:
+    """Check that a run resumes in the world that it began in. The source names a release."""
+    for name in ("environment", "benchmark"):
+        had, has = (one[name] if name == "environment" else one[name]["fingerprint"] for one in (was, now))
+        if had != has:
+            raise ValueError(
+                f"the run began with the {name} {was[name]}, which now is {now[name]}: begin a new run"
+            )
+
+
+def _restore_world(run: Run, state: dict[str, np.ndarray] | None) -> None:
+    """Put the streams back to where they were; where a world keeps no state, place them anew."""
+    if state is not None:
+        run.env.set_state(state)
+        return
+    logging.warning(f"{run.env.identity.id} keeps no state: every stream begins with a new placement.")
+    streams = np.arange(run.loop.num_streams)
+    run.resets.initial.apply(run.env, streams)
+    run.loop.count_intervention(streams, run.resets.initial.kind)
+    run.loop.diverged[:] = False
 
 
 def _changes_device(run: Run, was: str | None) -> bool:

@@ -9,17 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import draccus
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.envs import EnvConfig
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, PRETRAINED_MODEL_DIR
-from lerobot_env_cronos import Benchmark, CronosEnvConfig, load_benchmark
-from lerobot_env_cronos.benchmark.configurations import NUM_CONFIGURATIONS
-from lerobot_env_cronos.config import is_of_this_package
-from lerobot_env_cronos.scene.scenes import CONTROL_HZ
+from lerobot_env_cronos import CronosEnvConfig, load_benchmark
 
 from cronos_lerobot.agents import builtin  # noqa: F401  (registers the agents)
 from cronos_lerobot.agents.ppo.config import PPOConfig
@@ -28,6 +25,7 @@ from cronos_lerobot.data.video import MAX_FILE_DURATION_S, check_video_size
 from cronos_lerobot.data.writer import FLUSH_INTERVAL_S
 from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.resets import EXTRA_RESETS
+from cronos_lerobot.protocol.streams import Streams, check_capability, check_makes_streams, steps_per_task
 from cronos_lerobot.protocol.task_orders import TASK_ORDERS
 from cronos_lerobot.ranges import check_ranges, limits, ranged
 
@@ -61,7 +59,7 @@ class RecordConfig:
             raise ValueError(f"--record.streams must be `all` or 1 to {num_envs}, got {self.streams!r}.")
         return int(number)
 
-    def check(self, num_envs: int, env: CronosEnvConfig, segment_length: int) -> None:
+    def check(self, num_envs: int, env: EnvConfig, segment_length: int) -> None:
         """Find at the start what the writer would stumble over after hours.
 
         Raises:
@@ -71,22 +69,22 @@ class RecordConfig:
         if self.repo_id is None:
             return
         self.count(num_envs)
-        if segment_length > (longest := int(MAX_FILE_DURATION_S * CONTROL_HZ)):
+        if segment_length > (longest := int(MAX_FILE_DURATION_S * env.fps)):
             raise ValueError(
                 f"--protocol.task_switch_interval must be <= {longest} to be recorded (a video of "
                 f"{MAX_FILE_DURATION_S:.0f} s), got {segment_length}."
             )
-        if env.obs_type == "pixels_agent_pos":
-            size = (env.observation_height, env.observation_width)
-            check_video_size("--env.observation_height and --env.observation_width", size)
+        for key, feature in env.features.items():
+            if feature.type is FeatureType.VISUAL:
+                check_video_size(f"{key} of --env.type={env.type}", feature.shape[:2])
 
 
 @dataclass
 class PeriodicEvaluationConfig:
     """Independent evaluation on environments of its own: every task from every configuration."""
 
-    n_episodes: int = ranged(NUM_CONFIGURATIONS, minimum=1)
-    """Configurations for each task: the first N of the split."""
+    n_episodes: int | None = ranged(None, minimum=1)
+    """Configurations for each task: the first N of the split; null takes all."""
     repetitions: int = ranged(1, minimum=1)
     """Episodes of each task and configuration, each with its own random numbers, if the policy samples."""
     split: str = ranged("train", choices=("train", "held_out"))
@@ -199,20 +197,22 @@ def complete(config: CronosTrainConfig) -> None:
     """Fill in what follows from other values: names, the benchmark's revision, what a policy or critic must see.
 
     Raises:
-        ValueError: there is no CRONOS environment, or no policy.
+        ValueError: there is no environment to train in, or no policy; or an interval is no multiple of K.
     """
     env, policy = config.env, config.policy
-    if not is_of_this_package(env):
-        raise ValueError("Choose an environment to train in: --env.type=cronos --env.scene=kitchen_2x2.")
+    check_makes_streams(env)
+    assert env is not None
     if policy is None:
         raise ValueError("Choose a policy: --policy.path=<checkpoint or Hub id>, or --policy.type=<name>.")
+    config.protocol.resolve(steps_per_task(env))
     config.job_name = config.job_name or f"{env.type}_{policy.type}"
     if config.output_dir is None:
         config.output_dir = Path("outputs/train") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_{config.job_name}"
-    if env.benchmark is not None and not Path(env.benchmark).is_dir():
-        # One of the Hub stays what it was when the run began.
-        env.benchmark = load_benchmark(env.benchmark, env.scene).source
-    _show_privileged_state(config, env, policy)
+    if isinstance(env, CronosEnvConfig):
+        if env.benchmark is not None and not Path(env.benchmark).is_dir():
+            # One of the Hub stays what it was when the run began.
+            env.benchmark = load_benchmark(env.benchmark, env.scene).source
+        _show_privileged_state(config, env, policy)
 
 
 def _show_privileged_state(config: CronosTrainConfig, env: CronosEnvConfig, policy: PreTrainedConfig) -> None:
@@ -237,11 +237,11 @@ def check(config: CronosTrainConfig) -> None:
     """
     check_ranges(config)
     env, policy, options = config.env, config.policy, config.eval
-    assert isinstance(env, CronosEnvConfig)
+    assert env is not None
     assert policy is not None
     if config.resume not in (False, True, AUTO):
         raise ValueError(f"--resume must be true, false or auto, got {config.resume!r}.")
-    for name in EVALUATION_ONLY:
+    for name in EVALUATION_ONLY if isinstance(env, CronosEnvConfig) else ():
         if (value := getattr(env, name)) != getattr(CronosEnvConfig, name):
             raise ValueError(f"--env.{name}={value} is for lerobot-eval; training has --protocol.* and --eval.*.")
     if options.repetitions > 1 and not options.temperature:
@@ -256,14 +256,23 @@ def check(config: CronosTrainConfig) -> None:
     AGENTS.check(config.algorithm.type)
     assert isinstance(config.algorithm, AgentConfig)
     config.algorithm.check_reward(config.protocol.reward)
-    _check_configurations(config, load_benchmark(env.benchmark, env.scene))
     config.record.check(config.num_envs, env, config.protocol.task_switch_interval)
 
 
-def _check_configurations(config: CronosTrainConfig, benchmark: Benchmark) -> None:
-    wanted = [("protocol.num_configurations", "train", config.protocol.num_configurations)]
+def check_world(config: CronosTrainConfig, env: Streams) -> None:
+    """Check that a world has what a config asks of it.
+
+    Raises:
+        ValueError: it has fewer starts, or lacks what a flag needs.
+    """
+    protocol = config.protocol
+    wanted = [("protocol.num_configurations", "train", protocol.num_configurations)]
     if config.evaluates:
         wanted.append(("eval.n_episodes", config.eval.split, config.eval.n_episodes))
     for flag, split, count in wanted:
-        if count > (available := len(benchmark.configurations[split])):
+        if count is not None and count > (available := env.num_starts[split]):
             raise ValueError(f"--{flag} must be <= {available}, the {split} configurations, got {count}.")
+    if protocol.end_effector_reset:
+        check_capability(env, "end_effector_reset", "--protocol.end_effector_reset=true")
+    if protocol.heuristic_reset:
+        check_capability(env, "put_back", "--protocol.heuristic_reset=true")

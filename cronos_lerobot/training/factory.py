@@ -3,33 +3,38 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from copy import deepcopy
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.envs import EnvConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.random_utils import deserialize_rng_state, serialize_rng_state, set_seed
-from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
+from lerobot_env_cronos import CronosEnvConfig
 from lerobot_env_cronos.simulation.simulation import num_cores
 
 from cronos_lerobot.agents.base import samples
 from cronos_lerobot.agents.imitation.config import DemosConfig
-from cronos_lerobot.agents.processing import EMPTY_CAMERA, make_processors, observation_columns
+from cronos_lerobot.agents.processing import make_processors, observation_columns
 from cronos_lerobot.agents.steering.steered import STEERING
 from cronos_lerobot.agents.weights import train_in_float32, wrap
 from cronos_lerobot.evaluation.policy_env import (
     check_observations,
-    scene_of_dataset,
+    environment_of_dataset,
     trained_scene,
     warn_of_inputs,
 )
 from cronos_lerobot.evaluation.policy_loading import check_processor_classes, damage_named, load_policy
 from cronos_lerobot.evaluation.policy_source import UNDECISIVE, load_policy_config
+from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.protocol.streams import Streams
 from cronos_lerobot.ranks import Ranks
-from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.config import CronosTrainConfig, check_world
 from cronos_lerobot.training.run import Parts
 
 RENAME_STEP, DEVICE_STEP = "rename_observations_processor", "device_processor"
@@ -50,46 +55,54 @@ def make_parts(config: CronosTrainConfig, ranks: Ranks) -> Parts:
     if not ranks.is_main:
         set_seed(ranks.own_seed(config.seed))
     env = make_env(config, num_envs, ranks.local_count)
+    check_world(config, env)
+    if config.checkpoint_path is None:
+        check_demonstrations(config.algorithm, env.identity.id)
     if config.algorithm.type == "imitation" and not samples(policy):
         check_decision(policy, preprocessor, postprocessor, env)
     own_eval_env = partial(make_eval_env, config, local_processes=ranks.local_count)
     return Parts(env, own_eval_env, policy, preprocessor, postprocessor, ranks)
 
 
-def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1) -> CronosVectorEnv:
-    """Return `num_envs` streams of the config's scene; they never reset themselves.
+def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1) -> Streams:
+    """Return `num_envs` streams of the config's world; they never reset themselves.
 
     `local_processes` of this node share its cores, unless the config says how many threads each takes.
+
+    Raises:
+        ValueError: `--protocol.reward` is given, and the world has its own.
     """
-    options = _env_options(config, local_processes)
-    return _cronos(config).create_streams(num_envs, reward=config.protocol.reward, **options)
+    reward = config.protocol.reward
+    if reward == ProtocolConfig().reward:
+        return make_eval_env(config, num_envs, local_processes)
+    env = _of_one_process(config, local_processes)
+    try:
+        return env.create_streams(num_envs, reward=reward)
+    except TypeError as error:
+        raise ValueError(f"--protocol.reward={reward}: --env.type={env.type} has a reward of its own") from error
 
 
-def make_eval_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1) -> CronosVectorEnv:
-    """Return `num_envs` environments of the config's scene for the periodic evaluation; see `make_env`."""
-    return CronosVectorEnv(num_envs, _cronos(config).scene, **_env_options(config, local_processes))
+def make_eval_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1) -> Streams:
+    """Return `num_envs` streams of the config's world for the periodic evaluation; see `make_env`."""
+    return _of_one_process(config, local_processes).create_streams(num_envs)
 
 
-def _env_options(config: CronosTrainConfig, local_processes: int) -> dict[str, Any]:
-    options = _cronos(config).gym_kwargs
-    if options["num_threads"] == 0 and local_processes > 1:
-        options["num_threads"] = max(1, num_cores() // local_processes)
-    return options
-
-
-def _cronos(config: CronosTrainConfig) -> CronosEnvConfig:
-    assert isinstance(config.env, CronosEnvConfig)
-    return config.env
+def _of_one_process(config: CronosTrainConfig, local_processes: int) -> Any:
+    """The environment's config with its share of the node's cores, if it has `num_threads`."""
+    env: Any = config.env
+    if local_processes > 1 and getattr(env, "num_threads", None) == 0:
+        return replace(env, num_threads=max(1, num_cores() // local_processes))
+    return env
 
 
 def make_policy_and_processors(config: CronosTrainConfig) -> tuple[Any, Any, Any]:
     """Return the config's policy on its device, its preprocessor and its postprocessor; see `make_parts`."""
-    env_config, path = _cronos(config), config.weights_path
+    env_config, path = config.env, config.weights_path
+    assert env_config is not None
     policy_config = _config_to_build(config)
     check_observations(policy_config, env_config, config.rename_map)
-    check_pictures(policy_config, env_config)
+    check_pictures(policy_config, env_config, config.rename_map)
     if config.checkpoint_path is None:
-        check_demonstrations(config.algorithm, env_config.scene)
         _warn(policy_config, config)
     # What is saved of a resumed run names the policy that it began with, and no checkpoint.
     base, policy_config.pretrained_path = policy_config.pretrained_path, path
@@ -135,7 +148,7 @@ def _config_to_build(config: CronosTrainConfig) -> PreTrainedConfig:
     return saved
 
 
-def check_decision(policy: Any, preprocessor: Any, postprocessor: Any, env: CronosVectorEnv) -> None:
+def check_decision(policy: Any, preprocessor: Any, postprocessor: Any, env: Streams) -> None:
     """Ask a policy that acts by LeRobot's `select_action` for one decision, which leaves no trace.
 
     Raises:
@@ -160,9 +173,9 @@ def check_decision(policy: Any, preprocessor: Any, postprocessor: Any, env: Cron
 
 def _warn(policy: PreTrainedConfig, config: CronosTrainConfig) -> None:
     """Say what a new run may not mean to begin with."""
-    env, path = _cronos(config), config.weights_path
+    env, path = config.env, config.weights_path
     warn_of_inputs(policy, env)
-    if path is None:
+    if path is None or not isinstance(env, CronosEnvConfig):
         return
     if (Path(path) / STEERING).is_file():
         logging.warning(f"The run begins without the actor ({STEERING}) in {path}, which steers the policy there.")
@@ -171,8 +184,8 @@ def _warn(policy: PreTrainedConfig, config: CronosTrainConfig) -> None:
         logging.warning(f"{path} was trained in --env.scene={trained}: it does not know {env.scene}.")
 
 
-def check_demonstrations(algorithm: Any, scene: str) -> None:
-    """Check that an agent's demonstrations, if they are on this machine, are of the run's scene.
+def check_demonstrations(algorithm: Any, environment: str) -> None:
+    """Check that an agent's demonstrations, if they are on this machine, are of the run's environment.
 
     Raises:
         ValueError: they are of another one, whose columns may have the same sizes.
@@ -180,19 +193,21 @@ def check_demonstrations(algorithm: Any, scene: str) -> None:
     demos = getattr(algorithm, "demos", None)
     if not isinstance(demos, DemosConfig) or demos.repo_id is None:
         return
-    if (other := scene_of_dataset(demos.repo_id, demos.root)) not in (None, scene):
-        raise ValueError(f"--algorithm.demos.repo_id={demos.repo_id} is of --env.scene={other}, not of {scene}.")
+    if (other := environment_of_dataset(demos.repo_id, demos.root)) not in (None, environment):
+        raise ValueError(f"--algorithm.demos.repo_id={demos.repo_id} is of {other}, not of {environment}.")
 
 
-def check_pictures(policy: PreTrainedConfig, env: CronosEnvConfig) -> None:
+def check_pictures(policy: PreTrainedConfig, env: EnvConfig, rename_map: Mapping[str, str] | None = None) -> None:
     """Warn of pictures of another size than the policy was made for: not every policy scales them.
 
     Raises:
         ValueError: the policy says that it does not.
     """
-    size = (env.observation_height, env.observation_width)
+    names = {key: (rename_map or {}).get(name, name) for key, name in env.features_map.items()}
+    shown = {names[key]: feature.shape for key, feature in env.features.items()}
     for name, feature in (policy.input_features or {}).items():
-        if feature.type is not FeatureType.VISUAL or name.startswith(EMPTY_CAMERA) or feature.shape[1:] == size:
+        size = tuple(shown.get(name, ()))[:2]
+        if feature.type is not FeatureType.VISUAL or not size or tuple(feature.shape[1:]) == size:
             continue
         height, width = feature.shape[1:]
         text = f"--env.observation_height={height} --env.observation_width={width} is what the policy was made for"

@@ -20,7 +20,7 @@ from cronos_lerobot.evaluation.policy_source import (
     pin_policy,
 )
 from cronos_lerobot.training.config import AUTO, CronosTrainConfig
-from cronos_lerobot.training.run_folder import describe_environment, last_checkpoint
+from cronos_lerobot.training.run_folder import last_checkpoint
 
 FIXED = (
     "seed", "num_envs", "peft", "rename_map", "env", "policy", "record", "protocol", "algorithm", "eval",
@@ -138,7 +138,7 @@ def check_resumed(config: CronosTrainConfig, saved: dict[str, Any]) -> None:
     """Check that `config` changes nothing that the run of a checkpoint, `saved`, must keep.
 
     Raises:
-        ValueError: a fixed flag or the benchmark has changed, or the run is beyond the end that is asked for.
+        ValueError: a fixed flag has changed, or the run is beyond the end that is asked for.
     """
     given, own = (flatten_dict(tree, sep=".") for tree in (config.to_dict(), saved["config"]))
     # What follows from other flags comes after them.
@@ -153,10 +153,6 @@ def check_resumed(config: CronosTrainConfig, saved: dict[str, Any]) -> None:
                 f"--{name}={given.get(name)}, but the run that is resumed has {own.get(name)} and keeps it: leave "
                 "the flag out, or begin a new run with this one's checkpoint as --policy.path."
             )
-    now, was = describe_environment(config.env)["benchmark"], saved["benchmark"]
-    # The source names a release; the fingerprint says what it is.
-    if (now and now["fingerprint"]) != (was and was["fingerprint"]):
-        raise ValueError(f"the run began with the benchmark {was}, which now is {now}.")
     if config.total_steps < (done := saved["interaction_steps"]):
         raise ValueError(f"--steps={config.steps}, but the run has done {done} steps: give {done} or more.")
 

@@ -15,6 +15,7 @@ from cronos_lerobot.protocol.own_state import own_states
 from cronos_lerobot.protocol.resets import make_resets
 from cronos_lerobot.protocol.rf_mtrl import rf_mtrl
 from cronos_lerobot.protocol.run_context import RunContext
+from cronos_lerobot.protocol.streams import KeepsState, Streams
 from cronos_lerobot.protocol.task_orders import TaskSet, bind_task_order, find_inner, make_task_order
 from cronos_lerobot.ranks import Ranks, bit_sum
 from cronos_lerobot.stopwatch import Stopwatch
@@ -27,10 +28,10 @@ from cronos_lerobot.training.sharding import ShardedEnv
 class Parts:
     """What a run is assembled from."""
 
-    env: Any
+    env: Streams
     """The N streams, or those of this process; never reset by anyone but the run."""
     make_eval_env: Callable[[int], Any]
-    """Makes n environments for the periodic evaluation (a `CronosVectorEnv`)."""
+    """Makes n streams for the periodic evaluation."""
     policy: Any
     """A LeRobot policy that the config's agent can train."""
     preprocessor: Any
@@ -58,8 +59,11 @@ class Run:
         self.ranks = parts.ranks
         self.make_eval_env = parts.make_eval_env
         self.preprocessor, self.postprocessor = parts.preprocessor, parts.postprocessor
-        self.stopwatch = parts.env.timer = Stopwatch()
-        self.task_set = TaskSet.of(parts.env.scene, config.protocol)
+        env: Any = parts.env
+        # A world that times its own work does it by this.
+        self.stopwatch = env.timer = Stopwatch()
+        self.keeps_state = isinstance(env, KeepsState)
+        self.task_set = TaskSet.of(env, config.protocol)
         policy = parts.policy
         self.generators = NamedGenerators(config.seed, str(next(policy.parameters()).device))
         self.processors = make_processors(policy, parts.preprocessor, parts.postprocessor)
@@ -71,7 +75,7 @@ class Run:
         self._drawn_alike = sorted(self.generators.state_dict()["numpy"])
         # Every named generator exists before a checkpoint is loaded into them.
         self.agent = self._make_agent(policy)
-        self.env: Any = parts.env if self.ranks.count == 1 else ShardedEnv(parts.env, self.ranks)
+        self.env: Any = env if self.ranks.count == 1 else ShardedEnv(env, self.ranks)
         context = RunContext(self.env, self.agent, self.task_set.tasks, config.protocol, config.total_steps)
         bind_task_order(self.task_order, context)
         self.resets.bind(context)

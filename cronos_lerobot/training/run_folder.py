@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
-from lerobot_env_cronos import CronosEnvConfig, gymnasium_id, load_benchmark
 
 from cronos_lerobot.evaluation.policy_source import files_fingerprint
 from cronos_lerobot.provenance import git_commit, package_versions
 from cronos_lerobot.whole_files import written_whole
 
 if TYPE_CHECKING:
+    from cronos_lerobot.protocol.streams import EnvIdentity
     from cronos_lerobot.training.config import CronosTrainConfig
 
 MANIFEST = "manifest.json"
@@ -79,7 +79,9 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
-def note_start(config: CronosTrainConfig, num_processes: int = 1, interaction_steps: int = 0) -> None:
+def note_start(
+    config: CronosTrainConfig, identity: EnvIdentity, num_processes: int = 1, interaction_steps: int = 0
+) -> None:
     """Append a start, after `interaction_steps`, to the manifest: a change of machine or version is on record."""
     manifest, weights = read_manifest(Path(config.output_dir or "")), config.weights_path
     instructions = torch.backends.cpu.get_cpu_capability()
@@ -102,7 +104,7 @@ def note_start(config: CronosTrainConfig, num_processes: int = 1, interaction_st
         # Of a folder: two machines may have made other clones of it.
         "policy_fingerprint": files_fingerprint(Path(weights)) if weights and Path(weights).is_dir() else None,
         "config": config.to_dict(),
-    } | describe_environment(config.env)
+    } | describe_environment(identity)
     was = manifest["starts"][-1]["machine"].get("cpu_capability") if manifest["starts"] else None
     if was not in (None, instructions):
         logging.warning(
@@ -126,14 +128,11 @@ def is_finished(config: CronosTrainConfig) -> bool:
     return config.total_steps <= end["steps"] and config.protocol.reset_budget == end["reset_budget"]
 
 
-def describe_environment(env: Any) -> dict[str, Any]:
-    """The environment's id with its version, and the benchmark's source and fingerprint; None of other kinds."""
-    if not isinstance(env, CronosEnvConfig):
-        return {"environment": None, "benchmark": None}
-    benchmark = load_benchmark(env.benchmark, env.scene)
+def describe_environment(identity: EnvIdentity) -> dict[str, Any]:
+    """The environment's id with its version, and the source and fingerprint of its starts."""
     return {
-        "environment": gymnasium_id(env.scene),
-        "benchmark": {"source": benchmark.source, "fingerprint": benchmark.fingerprint},
+        "environment": identity.id,
+        "benchmark": {"source": identity.source, "fingerprint": identity.fingerprint},
     }
 
 

@@ -19,6 +19,12 @@ from cronos_lerobot.protocol.loop_state import Step
 from cronos_lerobot.ranks import Ranks
 
 INFO = ("is_success", "is_grasped", "diverged", "intervened")
+DESCRIBED = (
+    "fps", "robot_type", "tasks", "reset_tasks", "identity", "single_observation_space", "single_action_space",
+    "state_names", "action_names", "num_starts", "observe",
+)  # fmt: skip
+"""What all processes have alike, and the observation, which is this process's."""
+OPTIONAL = ("observation_details", "observe_under")
 OWN = ("action", "log_prob", "value")
 """Arrays of an ActionSample that have a row for each stream of this process."""
 
@@ -43,11 +49,11 @@ class ShardedEnv:
         self.timer: Callable[[str], AbstractContextManager] = env.timer
         self.num_envs = env.num_envs * ranks.count
         self.mine = ranks.share_of(self.num_envs)
-        self.scene = env.scene
-        self.benchmark = env.benchmark
-        self.metadata = env.metadata
-        self.single_observation_space = env.single_observation_space
-        self.observe, self.observe_under = env.observe, env.observe_under
+        for name in DESCRIBED:
+            setattr(self, name, getattr(env, name))
+        for name in OPTIONAL:
+            if hasattr(env, name):
+                setattr(self, name, getattr(env, name))
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict]:
         """Act on the streams of this process; the reward (N,) and the info's flags (N,) are of all."""
@@ -70,9 +76,9 @@ class ShardedEnv:
         if len(own):
             self._env.set_task(own - self.mine.start, [given[int(i)] for i in own])
 
-    def scene_reset(self, ids: np.ndarray, configurations: np.ndarray, split: str = "train") -> None:
-        """Put every body of the streams `ids` at configurations (k,) of a split, and the arm home."""
-        self._on_own(partial(self._env.scene_reset, split=split), ids, configurations)
+    def scene_reset(self, ids: np.ndarray, starts: np.ndarray, split: str = "train") -> None:
+        """Put the streams `ids` (k,) into the starts number `starts` (k,) of a split."""
+        self._on_own(partial(self._env.scene_reset, split=split), ids, starts)
 
     def place_bodies(self, ids: np.ndarray, poses: np.ndarray) -> None:
         """Put every body of the streams `ids` at `poses` (k, bodies, 7), and the arm home."""
@@ -86,7 +92,7 @@ class ShardedEnv:
         """Bodies that no task can reach any more, (N, bodies) bool."""
         return self._concatenate(self._env.unsuitable_bodies())
 
-    def put_back(self, stream: int, body: str, rng: np.random.Generator) -> None:
+    def put_back(self, stream: int, body: int, rng: np.random.Generator) -> None:
         """Put one body of a stream at a free place; `rng` continues alike in all processes."""
         owner = stream // self._env.num_envs
         if owner == self._ranks.rank:

@@ -10,6 +10,7 @@ import numpy as np
 
 from cronos_lerobot.evaluation.independent import evaluate_independent
 from cronos_lerobot.protocol.loop_state import Event, SegmentEnd, Step, Update
+from cronos_lerobot.protocol.streams import steps_per_task
 from cronos_lerobot.training.checkpoint import point_last_at, restore, save_checkpoint
 from cronos_lerobot.training.logging import RunLogger, SilentLogger
 from cronos_lerobot.training.recording import StreamObserver
@@ -73,7 +74,7 @@ class Trainer:
             self.logger = RunLogger(self.config, self.loop, observers.get("logger"))
             if self.config.checkpoint_path is not None:
                 point_last_at(self.config.checkpoint_path)
-            note_start(self.config, run.ranks.count, self.loop.n)
+            note_start(self.config, run.env.identity, run.ranks.count, self.loop.n)
 
     def train(self, stop: StopRequest | None = None) -> bool:
         """Run to the last step or the end of the budget.
@@ -102,7 +103,7 @@ class Trainer:
                 if isinstance(event, SegmentEnd):
                     # Reading the simulations' state wakes sleeping bodies, so it is done at every switch: the run
                     # must not depend on how often it is saved, nor on where its budget ended.
-                    env_state = self.run.env.get_state()
+                    env_state = self._env_state()
                     if self._update is not None and self._end_update(env_state, stop):
                         return False
             self._end(env_state)
@@ -111,7 +112,10 @@ class Trainer:
             self.recorder.close()
             self.logger.close()
 
-    def _end_update(self, env_state: dict[str, np.ndarray], stop: StopRequest) -> bool:
+    def _env_state(self) -> dict[str, np.ndarray] | None:
+        return self.run.env.get_state() if self.run.keeps_state else None
+
+    def _end_update(self, env_state: dict[str, np.ndarray] | None, stop: StopRequest) -> bool:
         """Log an update, save and evaluate if it is time; returns whether the run was told to stop."""
         self.run.check_processes()
         self._log_update()
@@ -138,7 +142,7 @@ class Trainer:
                 f"{self.loop.b:,} interventions reach --protocol.reset_budget={self.config.protocol.reset_budget}."
             )
         if self._saves.last < self.loop.n:
-            self._save(self.run.env.get_state() if env_state is None else env_state)
+            self._save(self._env_state() if env_state is None else env_state)
         if not self._is_between_rollouts:
             # The latest records are of an earlier step.
             self.logger.log("end", {})
@@ -193,7 +197,8 @@ class Trainer:
     @cached_property
     def _eval_env(self) -> Any:
         options, run = self.config.eval, self.run
-        num_episodes = -(-len(run.task_set.tasks) * options.n_episodes // run.ranks.count)
+        per_task = options.n_episodes or run.env.num_starts[options.split]
+        num_episodes = -(-len(run.task_set.tasks) * per_task // run.ranks.count)
         return run.make_eval_env(min(options.batch_size, num_episodes))
 
     def _evaluate(self) -> None:
@@ -211,12 +216,13 @@ class Trainer:
             split=options.split,
             temperature=options.temperature,
             seed=options.seed,
+            window=steps_per_task(self.config.env),
             ranks=run.ranks,
         )
         self.logger.log("evaluation", result | {"at_interventions": reached})
         run.stopwatch.lap()
 
-    def _save(self, env_state: dict[str, np.ndarray]) -> None:
+    def _save(self, env_state: dict[str, np.ndarray] | None) -> None:
         if not self.config.save_checkpoint:
             return
         # Before the logger's, as a recording that fails in its flush is told there.

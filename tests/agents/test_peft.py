@@ -134,10 +134,10 @@ def test_adapters_around_a_policy_that_trains_by_itself_leave_it_one(tmp_path):
     assert isinstance(wrapped, PeftModel)
     assert not missing_methods(wrapped)
     assert make_trainable(wrapped, OPTIONS) is wrapped
-    assert isinstance(make_actor(wrapped, PolicyProcessors(*identity_processors()), 0.5), SamplingPolicy)
+    assert isinstance(make_actor(wrapped, PolicyProcessors(*identity_processors()), 0.5, 7), SamplingPolicy)
     # What decides in a policy's place needs no more than this.
     acting = SimpleNamespace(sample_actions=wrapped.sample_actions)
-    actor = make_actor(acting, PolicyProcessors(*identity_processors()), 0.5)
+    actor = make_actor(acting, PolicyProcessors(*identity_processors()), 0.5, 7)
     assert isinstance(actor, SamplingPolicy)
     sizes = {"agent_pos": policy.config.robot_state_feature, "environment_state": policy.config.env_state_feature}
     seen = {name: np.zeros((2, *feature.shape), np.float32) for name, feature in sizes.items() if feature}

@@ -7,13 +7,13 @@ from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.scene.robot import HOME_QPOS
 
 from cronos_lerobot.data.demos import DemoCollector, DemoConfig
-from cronos_lerobot.data.schema import demonstration_features, describe_observation
+from cronos_lerobot.data.schema import demonstration_features
 from cronos_lerobot.data.writer import SegmentWriter
 from cronos_lerobot.scripts.record_demos import DemoDatasetConfig, RecordDemosConfig
 
 
 def collect(env, root, config: DemoConfig, num_episodes=4, *, seed=0, tasks=None, expert=None):
-    features = demonstration_features(env.single_observation_space, **describe_observation(env))
+    features = demonstration_features(env)
     with SegmentWriter("me/demos", root, features, 5) as writer:
         collector = DemoCollector(env, expert or ScriptedExpert(env), writer, config, seed=seed, tasks=tasks)
         collector.collect(num_episodes)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from lerobot_policy_pocketvla import PocketVLAConfig
 from packaging.version import Version
-from synthetic_segments import FPS, features, observation_space
+from synthetic_segments import FPS, features, observation_space, world
 from synthetic_streams import record
 
 from cronos_lerobot.agents.imitation.batches import Demonstrations
@@ -23,7 +23,7 @@ OPEN = {
     "streams": lambda root: StreamDataset("me/stream", root),
     "streamed": lambda root: StreamDataset("me/stream", root, streaming=True),
     "resume": lambda root: SegmentWriter(
-        "me/stream", root, stream_features(observation_space(None)), 5, resume=-1
+        "me/stream", root, stream_features(world(observation_space(None))), 5, resume=-1
     ),
     "demos": lambda root: Demonstrations(
         DemosConfig(repo_id="me/stream", root=root), PocketVLAConfig(device="cpu")

@@ -12,7 +12,7 @@ from lerobot_env_cronos.expert.reach import find_reach
 from cronos_lerobot.data.demos import DemoCollector, DemoConfig, StartConfig
 from cronos_lerobot.data.file_check import check_dataset
 from cronos_lerobot.data.perturbations import ActionNoise, MissConfig, NoiseConfig
-from cronos_lerobot.data.schema import demonstration_features, describe_observation
+from cronos_lerobot.data.schema import demonstration_features
 from cronos_lerobot.data.writer import SegmentWriter
 from cronos_lerobot.scripts.record_demos import record_demos
 
@@ -39,7 +39,7 @@ def test_successful_episodes_of_every_task_in_balance(env, tmp_path):
 
 def test_a_resumed_dataset_begins_with_the_next_configurations(env, tmp_path):
     collect(env, tmp_path / "d", DemoConfig(), 6)
-    features = demonstration_features(env.single_observation_space, **describe_observation(env))
+    features = demonstration_features(env)
     with SegmentWriter("me/demos", tmp_path / "d", features, 5, resume=-1) as writer:
         DemoCollector(env, ScriptedExpert(env), writer, DemoConfig()).collect(6)
     episodes = LeRobotDataset("me/demos", root=tmp_path / "d").meta.episodes

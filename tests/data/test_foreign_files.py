@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from synthetic_segments import FPS, features, observation_space
+from synthetic_segments import FPS, features, observation_space, world
 from synthetic_streams import record
 
 from cronos_lerobot.data.file_check import check_dataset
@@ -29,7 +29,7 @@ def change_info(root, **changes):
 
 
 def resume(root):
-    columns = stream_features(observation_space(environment_state=None))
+    columns = stream_features(world(observation_space(environment_state=None)))
     return SegmentWriter("me/stream", root, columns, FPS, resume=0)
 
 

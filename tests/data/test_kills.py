@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from lerobot.datasets import LeRobotDataset
-from synthetic_segments import FPS, observation_space
+from synthetic_segments import FPS, observation_space, world
 from synthetic_streams import ORIGIN, STREAMS, K, record, step
 
 from cronos_lerobot.data.recorder import StreamRecorder
@@ -33,7 +33,7 @@ def record_on(folder: Path, steps: int) -> None:
     else:
         shutil.rmtree(folder / "d", ignore_errors=True)
     writer = SegmentWriter(
-        "me/stream", folder / "d", stream_features(observation_space(environment_state=None)), FPS,
+        "me/stream", folder / "d", stream_features(world(observation_space(environment_state=None))), FPS,
         resume=None if state is None else state["num_episodes"], origin=ORIGIN,
         flush_interval_s=FLUSH_INTERVAL_S,
     )  # fmt: skip

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset
-from synthetic_segments import FPS, STATE_DIM, observation_space
+from synthetic_segments import FPS, STATE_DIM, observation_space, world
 from synthetic_streams import PICTURES, RESET, TASKS, K, intervention, step, success
 
 from cronos_lerobot.data.recorder import StreamRecorder
@@ -18,7 +18,7 @@ class Loop:
         self.space = observation_space(environment_state=None)
 
     def writer(self, root, **options):
-        return SegmentWriter("me/stream", root, stream_features(self.space), FPS, **options)
+        return SegmentWriter("me/stream", root, stream_features(world(self.space)), FPS, **options)
 
     def step(self, recorder: StreamRecorder, **changes):
         own = {"interventions": np.arange(self.n) + self.t // K}
@@ -137,7 +137,9 @@ def test_a_run_that_ends_inside_a_segment_keeps_its_frames(tmp_path):
 def test_what_the_agent_does_not_know_is_no_column(tmp_path, describes):
     """Not a probability of 1, and not a value of 0."""
     loop = Loop(1)
-    writer = SegmentWriter("me/stream", tmp_path / "d", stream_features(loop.space, describes=describes), FPS)
+    writer = SegmentWriter(
+        "me/stream", tmp_path / "d", stream_features(world(loop.space), describes=describes), FPS
+    )
     recorder = StreamRecorder(writer, num_envs=1, segment_length=K)
     for _ in range(K):
         loop.step(recorder, log_prob=None, **({} if describes else {"value": None}))

@@ -11,7 +11,7 @@ from lerobot.configs import FeatureType
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
 from lerobot.utils.feature_utils import dataset_to_policy_features
-from synthetic_segments import FPS, features, observation_space, segment
+from synthetic_segments import FPS, features, observation_space, segment, world
 from synthetic_streams import ORIGIN, PICTURES, STEPS, STREAMS, TASKS, UPDATE, K, record
 
 from cronos_lerobot.data.schema import stream_features
@@ -202,7 +202,7 @@ def test_errors_are_one_line(root, tmp_path, monkeypatch, command):
     damaged = shutil.copytree(root, tmp_path / "d") / "meta/episodes/chunk-000/file-001.parquet"
     damaged.write_bytes(damaged.read_bytes()[: damaged.stat().st_size // 2])
     writer = SegmentWriter(
-        "me/stream", tmp_path / "e", stream_features(observation_space(None)), FPS, origin=ORIGIN
+        "me/stream", tmp_path / "e", stream_features(world(observation_space(None))), FPS, origin=ORIGIN
     )
     for name, line in (("d", "file-001.parquet is damaged"), ("e", "no episode yet")):
         flags = ["--dataset.repo_id=me/stream", f"--dataset.root={tmp_path / name}"]
@@ -213,7 +213,7 @@ def test_errors_are_one_line(root, tmp_path, monkeypatch, command):
 
 
 def test_annotations_are_no_policy_features():
-    policy_features = dataset_to_policy_features(stream_features(observation_space()))
+    policy_features = dataset_to_policy_features(stream_features(world()))
     assert {key: feature.type for key, feature in policy_features.items()} == {
         "observation.images.front": FeatureType.VISUAL,
         "observation.state": FeatureType.STATE,

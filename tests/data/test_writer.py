@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets import LeRobotDataset
-from synthetic_segments import FPS, assert_same_pictures, features, segment
+from synthetic_segments import FPS, assert_same_pictures, features, segment, world
 
 from cronos_lerobot.data import storage
 from cronos_lerobot.data.schema import demonstration_features
@@ -35,7 +35,7 @@ def resume(root: Path, num_episodes=-1, video=True) -> SegmentWriter:
 
 
 def write(root: Path, segments, flush_after=(), video=True) -> SegmentWriter:
-    writer = SegmentWriter("me/test", root, features(video), FPS)
+    writer = SegmentWriter("me/test", root, features(video), FPS, robot_type="widowx")
     for i, (frames, task) in enumerate(segments):
         writer.add_segment(frames, task, episode_metadata={"number": i})
         if i in flush_after:
@@ -253,7 +253,7 @@ def test_frames_at_the_end_of_the_longest_file_are_found(tmp_path):
     shades = np.broadcast_to(np.arange(length, dtype=np.uint8)[:, None, None, None], (length, 16, 16, 3))
     frames = {key: array for key, array in segment(length).items() if not key.startswith("observation")}
     frames["observation.images.front"] = shades
-    with SegmentWriter("me/test", tmp_path / "d", demonstration_features(space), FPS) as writer:
+    with SegmentWriter("me/test", tmp_path / "d", demonstration_features(world(space)), FPS) as writer:
         for _ in range(count):
             writer.add_segment(frames, "task")
     dataset = LeRobotDataset("me/test", root=tmp_path / "d")

@@ -1,7 +1,7 @@
 """A recorded stream whose progress and weights are worked out by hand, with every kind of boundary."""
 
 import numpy as np
-from synthetic_segments import FPS, STATE_DIM, images, observation_space
+from synthetic_segments import FPS, STATE_DIM, images, observation_space, world
 from synthetic_streams import ORIGIN, make_step
 
 from cronos_lerobot.data.recorder import StreamRecorder
@@ -65,7 +65,7 @@ def record_weighted(
     describes=("log_prob", "value"),
 ) -> None:
     """Record one stream with pictures; `describes` is what the agent knows."""
-    features = stream_features(observation_space(environment_state=None), describes=describes)
+    features = stream_features(world(observation_space(environment_state=None)), describes=describes)
     writer = SegmentWriter("me/stream", root, features, FPS, origin=origin)
     recorder = StreamRecorder(writer, num_envs=1, segment_length=K)
     pictures = images(sum(len(levels) - 1 for _, levels in SEGMENTS))

@@ -157,10 +157,11 @@ def test_found_and_ungrasped_successes_and_trajectories():
         def positions(self, ids):
             return np.stack([self.position, self.elapsed], axis=1)[ids].astype(float)
 
-    (result,) = ChainRunner(Known(1), Idle(), keeps_states=True).run(CHAINS[:1], "train", (0,))
+    env = Known(1)
+    (result,) = ChainRunner(env, Idle(), states=env.positions).run(CHAINS[:1], "train", (0,))
     assert (result.found_complete, result.never_grasped) == ([1], [0, 3])
     trajectory = result.trajectory
-    assert trajectory.qpos.shape == (result.steps + 1, 2)
+    assert trajectory.states.shape == (result.steps + 1, 2)
     # Complete from the step on which it was, until the window is over.
     assert np.flatnonzero(np.diff(trajectory.is_complete.astype(int)) == 1).tolist() == [9, 99, 189, 279]
     assert np.flatnonzero(np.diff(trajectory.position)).tolist() == [80, 160, 240]

@@ -12,7 +12,7 @@ from forked_commands import run_forked
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import rollout
-from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, IndependentVectorEnv, get_scene
+from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv, IndependentVectorEnv, get_scene, load_benchmark
 from PIL import Image
 from tiny_checkpoints import STATE, TINY_ACT, save_policy
 
@@ -128,11 +128,11 @@ def test_a_lerobot_policy_does_what_it_does_in_lerobot_eval(tmp_path):
     rollout(theirs, policy, *env_processors, *processors, seeds=[4, 5, 6])
     ours = CronosVectorEnv(3, **STATE)
     chains = [Chain(1, (tasks[1],), configuration) for configuration in (4, 5, 6)]
-    actor = make_actor(policy, make_processors(policy, *processors), 0.6, env_processors)
-    results = ChainRunner(ours, actor, keeps_states=True).run(chains, "train", (0,))
+    actor = make_actor(policy, make_processors(policy, *processors), 0.6, 7, env_processors)
+    results = ChainRunner(ours, actor, states=ours.positions).run(chains, "train", (0,))
     assert [result.steps for result in results] == [80] * 3
     np.testing.assert_array_equal(ours.simulation.qpos, theirs.simulation.qpos)
-    start, end = results[0].trajectory.qpos[[0, -1]]
+    start, end = results[0].trajectory.states[[0, -1]]
     assert np.abs(start[:6] - end[:6]).max() > 0.05  # it has moved
 
 
@@ -188,8 +188,9 @@ def test_a_damaged_policy_is_told_in_one_line_and_takes_no_folder(name, tmp_path
 
 def test_quick_is_less():
     whole, quick = CronosEvalConfig(expert=True), CronosEvalConfig(expert=True, quick=True)
+    benchmark = load_benchmark(None, "kitchen_2x2")
     counts = [
-        [len(c.chains(suite, "train")) for suite in ("independent", "sequential", "stream")]
+        [len(c.chains(benchmark, suite, "train")) for suite in ("independent", "sequential", "stream")]
         for c in (whole, quick)
     ]
     assert counts == [[256, 640, 64], [4 * 16, 3 * 16, 16]]

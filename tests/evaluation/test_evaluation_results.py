@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from lerobot_env_cronos import get_scene, load_orderings
+from lerobot_env_cronos import EpisodeGroup, get_scene, load_orderings
 from lerobot_env_cronos.benchmark.orderings import is_training_cycle
 
 from cronos_lerobot.evaluation.eval_info import write_eval_info
@@ -25,6 +25,7 @@ from cronos_lerobot.statistics import wilson_interval
 ORDERINGS = load_orderings("kitchen_2x2")
 SCENE = get_scene("kitchen_2x2")
 TASKS = SCENE.tasks
+GROUPS = [EpisodeGroup(i, tasks, (0,), is_training_cycle(tasks, SCENE)) for i, tasks in enumerate(ORDERINGS)]
 
 
 def outcomes(lengths_by_number, found=(), never_grasped=()):
@@ -43,7 +44,7 @@ def outcomes(lengths_by_number, found=(), never_grasped=()):
 
 def test_sequential_results_of_a_hand_made_matrix():
     # Two orderings, four configurations. Tasks completed in a row: 4 2 0 1 and 1 1 0 0.
-    results = sequential_results(outcomes({0: [4, 2, 0, 1], 5: [1, 1, 0, 0]}), ORDERINGS, SCENE)
+    results = sequential_results(outcomes({0: [4, 2, 0, 1], 5: [1, 1, 0, 0]}), GROUPS)
     assert results["n"] == 8
     # Position 0: 3 of 4 and 2 of 4. Position 1: 2 and 0. Positions 2 and 3: 1 and 0.
     assert [p["success"] for p in results["positions"]] == [5 / 8, 2 / 8, 1 / 8, 1 / 8]
@@ -82,14 +83,14 @@ def test_the_tasks_of_a_configuration_are_correlated_in_the_independent_suite():
 
 def test_orderings_of_the_training_cycle_are_reported_apart_from_the_others():
     a, b = [i for i, ordering in enumerate(ORDERINGS) if not is_training_cycle(ordering, SCENE)][:2]
-    results = sequential_results(outcomes({0: [4, 4, 3, 1], a: [2, 0, 0, 0], b: [1, 1, 0, 0]}), ORDERINGS, SCENE)
+    results = sequential_results(outcomes({0: [4, 4, 3, 1], a: [2, 0, 0, 0], b: [1, 1, 0, 0]}), GROUPS)
     seen, unseen = results["seen"], results["unseen"]
     assert (seen["n"], seen["orderings"], unseen["n"], unseen["orderings"]) == (4, 1, 8, 2)
     assert [p["success"] for p in seen["positions"]] == [1, 0.75, 0.75, 0.5]
     assert (seen["average_chain_length"]["mean"], unseen["average_chain_length"]["mean"]) == (3, 0.5)
     # One ordering has no spread; the cycle from its second task on is the same cycle.
     assert [p["std"] for p in seen["positions"]] == [None] * 4
-    assert sequential_results(outcomes({0: [1]}), [[*TASKS[1:], TASKS[0]]], SCENE)["unseen"] is None
+    assert sequential_results(outcomes({0: [1]}), GROUPS[:1])["unseen"] is None
 
 
 def test_successes_that_were_found_or_came_without_a_grasp_are_counted_at_their_position():
@@ -154,7 +155,7 @@ def write(folder, suite, split, numbers, episodes, **changes):
 def test_tables_are_printed_in_the_tasks_order(tmp_path, capsys):
     some = outcomes({0: [4, 2], 1: [1, 1]})
     for split in ("train", "held_out"):
-        write(tmp_path, "sequential", split, sequential_results(some, ORDERINGS, SCENE), some)
+        write(tmp_path, "sequential", split, sequential_results(some, GROUPS), some)
     single = outcomes({i: [1] for i in range(4)})
     write(tmp_path, "independent", "train", independent_results(single, TASKS), single)
     write(tmp_path, "stream", "train", stream_results(streams(), cycle=2), streams())
@@ -208,7 +209,7 @@ def test_an_evaluation_in_lerobots_format(tmp_path):
     some = outcomes({0: [1, 0], 2: [1, 1]})
     write(tmp_path, "independent", "train", independent_results(some, TASKS[:1]), some)
     chains = outcomes({3: [4, 2]})
-    video = write(tmp_path, "sequential", "held_out", sequential_results(chains, ORDERINGS, SCENE), chains).parent
+    video = write(tmp_path, "sequential", "held_out", sequential_results(chains, GROUPS), chains).parent
     (video / "videos").mkdir()
     (video / "videos/good.mp4").touch()
     write_eval_info(tmp_path)

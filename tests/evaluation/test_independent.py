@@ -112,7 +112,7 @@ class Counting:
 
 
 def make_actor(policy):
-    return SamplingPolicy(policy, PolicyProcessors(lambda batch: batch, lambda action: action), 1.0)
+    return SamplingPolicy(policy, PolicyProcessors(lambda batch: batch, lambda action: action), 1.0, 7)
 
 
 def act(actor, ids, seen):

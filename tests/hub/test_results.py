@@ -41,8 +41,7 @@ def independent(**changes):
 def sequential(**changes):
     """The 4 chains complete 2, 1, 1 and 0 tasks."""
     chains = [episode(0, 0, 2), episode(0, 1, 1), episode(1, 0, 1), episode(1, 1, 0)]
-    orderings = [group.tasks for group in BENCHMARK.groups("sequential", "train")]
-    numbers = sequential_results(chains, orderings, BENCHMARK.scene)
+    numbers = sequential_results(chains, BENCHMARK.groups("sequential", "train"))
     return COMMON | {"suite": "sequential"} | numbers | changes
 
 

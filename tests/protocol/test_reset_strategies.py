@@ -175,7 +175,7 @@ def test_scene_resets_draw_from_the_first_configurations_only():
 
 def test_papers_row_with_hsr_counts_scene_resets_like_the_curriculum():
     """1.3 M steps, nothing lost: 64 streams x (31 resets at T = 320 + 8 at T = 1280), about the paper's 2,000."""
-    config = ProtocolConfig(curriculum=[(650_000, 320)], heuristic_reset=True, learned_reset=True)
+    config = ProtocolConfig(80, curriculum=[(650_000, 320)], heuristic_reset=True, learned_reset=True)
     _, _, loop, _ = run(config, 1_300_000, num_streams=64, env=FastEnv(64))
     assert loop.b == 64 * (31 + 8) == 2496
 

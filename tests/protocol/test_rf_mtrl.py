@@ -52,7 +52,7 @@ class FastEnv(DummyEnv):
 
 def run(protocol, steps, num_streams=2, env=None, loop=None, seed=0):
     env = env or DummyEnv(num_streams)
-    task_set = TaskSet.of(env.scene, protocol)
+    task_set = TaskSet.of(env, protocol)
     loop = loop or task_set.new_loop(num_streams)
     agent = DummyAgent(num_streams, env.calls)
     rng = NamedGenerators(seed).for_numpy
@@ -165,7 +165,7 @@ def test_random_order_is_uniform_and_seeded():
 @pytest.mark.parametrize(("interval", "expected"), [(80, 16_250), (320, 4_062), (1280, 1_015)])
 def test_interventions_of_the_papers_run(interval, expected):
     """1.3 M interaction steps of 64 streams; the paper counts steps / T, up to one whole reset per stream."""
-    config = ProtocolConfig(scene_reset_interval=interval)
+    config = ProtocolConfig(80, scene_reset_interval=interval)
     _, _, loop, _ = run(config, 1_300_000, num_streams=64, env=FastEnv(64))
     assert 1_300_000 <= loop.n <= 1_300_000 + 64 * 80
     assert loop.b % 64 == 0
@@ -175,7 +175,7 @@ def test_interventions_of_the_papers_run(interval, expected):
 
 def test_curriculum_spends_its_resets_early():
     """T = 320 up to 0.65 M steps (10,156 of each stream: 31 resets), then T = 1280 (8 resets)."""
-    config = ProtocolConfig(scene_reset_interval=1280, curriculum=[(650_000, 320)])
+    config = ProtocolConfig(80, scene_reset_interval=1280, curriculum=[(650_000, 320)])
     _, _, loop, _ = run(config, 1_300_000, num_streams=64, env=FastEnv(64))
     early = 650_000 // 64 // 320
     late = sum(1 for t in range(80, loop.t + 1, 80) if t * 64 > 650_000 and t % 1280 == 0)

@@ -4,7 +4,7 @@ import json
 
 import pytest
 from draccus.utils import ParsingError
-from dummies import DummyPolicyConfig
+from dummies import DummyEnv, DummyPolicyConfig
 from lerobot.policies import make_policy
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot_env_cronos import CronosEnvConfig
@@ -18,6 +18,7 @@ from cronos_lerobot.training.config import (
     PeriodicEvaluationConfig,
     RecordConfig,
     check,
+    check_world,
     complete,
 )
 from cronos_lerobot.training.reading import load, read_config
@@ -57,15 +58,14 @@ def test_a_saved_config_reads_back_and_takes_flags(name, tmp_path):
 
 
 def test_steps_are_rounded_up_to_whole_updates():
-    assert CronosTrainConfig(steps=1).total_steps == 64 * 160
-    assert CronosTrainConfig(steps=1_300_000).total_steps == 127 * 64 * 160
+    assert CronosTrainConfig(steps=1, protocol=ProtocolConfig(80)).total_steps == 64 * 160
+    assert CronosTrainConfig(steps=1_300_000, protocol=ProtocolConfig(80)).total_steps == 127 * 64 * 160
 
 
 WRONG = {
     "--steps": {"steps": 0},
     "--torch_threads": {"torch_threads": 0},
     "--eval.split": {"eval": PeriodicEvaluationConfig(split="test")},
-    "--eval.n_episodes must be <= 64": {"eval": PeriodicEvaluationConfig(n_episodes=65)},
     "--eval.repetitions": {"eval": PeriodicEvaluationConfig(repetitions=2, temperature=0)},
     "--eval_at_interventions": {"eval_at_interventions": [5, 0]},
     "--resume": {"resume": "maybe"},
@@ -75,14 +75,13 @@ WRONG = {
         "save_checkpoint": False,
     },
     "--policy.use_amp": {"policy": DummyPolicyConfig(use_amp=True)},
-    "--protocol.num_configurations": {"protocol": ProtocolConfig(num_configurations=65)},
     "--protocol.reward=level": {
         "algorithm": ImitationConfig(weighting="return"),
         "protocol": ProtocolConfig(reward="level"),
     },
     "--record.streams": {"record": RecordConfig("me/stream", streams="65")},
     "--record.flush_interval_s": {"record": RecordConfig(flush_interval_s=0)},
-    "--env.observation_height": {
+    "observation.images.front": {
         "record": RecordConfig("me/stream"),
         "env": CronosEnvConfig(observation_height=127),
     },
@@ -100,6 +99,41 @@ def test_what_would_train_something_else_than_it_says_is_named():
         complete(cfg)
         with pytest.raises(ValueError, match=flag):
             check(cfg)
+
+
+class Bare(DummyEnv):
+    """A world without anything that is optional."""
+
+    end_effector_reset = put_back = None
+
+
+LACKING = {
+    "--eval.n_episodes must be <= 64": (DummyEnv, {"eval": PeriodicEvaluationConfig(n_episodes=65)}),
+    "--protocol.num_configurations": (DummyEnv, {"protocol": ProtocolConfig(num_configurations=65)}),
+    "--protocol.end_effector_reset": (Bare, {}),
+    "--protocol.heuristic_reset": (
+        Bare,
+        {"protocol": ProtocolConfig(end_effector_reset=False, heuristic_reset=True)},
+    ),
+}
+
+
+def test_what_a_world_lacks_is_named_with_the_flag_that_needs_it():
+    for flag, (world, options) in LACKING.items():
+        with pytest.raises(ValueError, match=flag):
+            check_world(CronosTrainConfig(**options), world(1))
+    check_world(CronosTrainConfig(), DummyEnv(1))
+
+
+def test_intervals_that_are_not_given_are_those_of_the_worlds_tasks():
+    cfg = CronosTrainConfig(env=CronosEnvConfig(), policy=DummyPolicyConfig())
+    complete(cfg)
+    found = cfg.protocol
+    assert (found.task_switch_interval, found.update_interval, found.scene_reset_interval) == (80, 160, 1280)
+    given = ProtocolConfig(scene_reset_interval=None).resolve(480)
+    assert (given.task_switch_interval, given.update_interval, given.scene_reset_interval) == (480, 960, None)
+    with pytest.raises(ValueError, match="scene_reset_interval"):
+        ProtocolConfig(scene_reset_interval=1280).resolve(480)
 
 
 def test_what_is_missing_is_asked_for():

@@ -98,12 +98,12 @@ def test_an_evaluation_repeats_with_its_seed(tmp_path):
     policy = PocketVLAPolicy.from_pretrained(checkpoint)
     processors = make_processors(policy, *make_pre_post_processors(policy.config, str(checkpoint)))
     env = CronosVectorEnv(2, **STATE)
-    options = {"n_episodes": 1, "split": "train", "temperature": 0.6, "keeps_states": True}
+    options = {"n_episodes": 1, "split": "train", "temperature": 0.6, "states": env.positions}
     paths = []
     for seed in (3, 3, 4):
         torch.rand(1)  # Whatever else was drawn.
         results = run_independent(env, policy, processors, seed=seed, **options)
-        paths.append(np.stack([result.trajectory.qpos for result in results]))
+        paths.append(np.stack([result.trajectory.states for result in results]))
     assert np.array_equal(paths[0], paths[1])
     assert not np.array_equal(paths[0], paths[2])
 

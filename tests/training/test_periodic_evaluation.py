@@ -51,7 +51,7 @@ def of_cronos_eval(checkpoint):
 
 def by_episode(ended):
     return {
-        (e["number"], e["configuration"]): (e, result.trajectory.qpos)
+        (e["number"], e["configuration"]): (e, result.trajectory.states)
         for e, result in zip(describe_episodes(ended, SEED), ended, strict=True)
     }
 
@@ -69,7 +69,7 @@ def of_cronos_train(ranks, checkpoint, batch_size):
     env = make_eval_env(config, batch_size, ranks.local_count)
     results = run_independent(
         env, network, make_processors(network, *pipelines), n_episodes=N_EPISODES, split="held_out",
-        temperature=TEMPERATURE, seed=SEED, ranks=ranks, keeps_states=True,
+        temperature=TEMPERATURE, seed=SEED, ranks=ranks, states=env.positions,
     )  # fmt: skip
     return by_episode(results)
 

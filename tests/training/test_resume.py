@@ -6,8 +6,10 @@ import pickle
 
 import pytest
 import torch
+from dummies import DummyEnv
 from runs import (
     STEPS_PER_UPDATE,
+    STREAMS,
     assert_same_run,
     config,
     killed,
@@ -19,6 +21,7 @@ from runs import (
 
 from cronos_lerobot.agents.ppo.config import PaperPPOConfig, PPOConfig
 from cronos_lerobot.protocol.config import ProtocolConfig
+from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.training.checkpoint import read_state
 from cronos_lerobot.training.config import PeriodicEvaluationConfig, RecordConfig
 from cronos_lerobot.training.reading import check_resumed
@@ -88,29 +91,50 @@ def test_what_a_run_must_keep_is_named(tmp_path):
     check_resumed(longer, state)
 
 
-def test_another_benchmark_is_refused_whatever_release_it_came_with(tmp_path, monkeypatch):
+def test_another_world_is_refused_whatever_release_it_came_with(tmp_path):
     train(config(tmp_path, steps=STEPS_PER_UPDATE, eval_freq=0))
-    state = read_state(tmp_path / "checkpoints/last")
-    state["benchmark"] = {"source": "lerobot_env_cronos 0.2.0", "fingerprint": "abc"}
-    for fingerprint in ("abc", "abd"):
-        now = {"benchmark": {"source": "lerobot_env_cronos 0.2.1", "fingerprint": fingerprint}}
-        monkeypatch.setattr("cronos_lerobot.training.reading.describe_environment", lambda env, now=now: now)
-        if fingerprint == "abc":
-            check_resumed(resumed(tmp_path), state)
-        else:
-            with pytest.raises(ValueError, match=r"0\.2\.0.*'abc'.*0\.2\.1.*'abd'"):
-                check_resumed(resumed(tmp_path), state)
-
-
-def test_another_version_of_the_environment_or_the_format_is_refused(tmp_path):
-    train(config(tmp_path, steps=STEPS_PER_UPDATE, eval_freq=0))
+    resume = resumed(tmp_path, steps=2 * STEPS_PER_UPDATE, eval_freq=0)
     path = tmp_path / "checkpoints/last/training_state/state.pt"
     saved = torch.load(path)
-    changes = {"environment": "lerobot_env_cronos/kitchen_2x2-v0", "format": 99}
-    for (name, value), named in zip(changes.items(), ("kitchen_2x2-v0", "format 99"), strict=True):
+    fingerprint = saved["benchmark"]["fingerprint"]
+    torch.save(saved | {"benchmark": {"source": "dummies 0.2", "fingerprint": fingerprint}}, path)
+    make_trainer(resume)
+    others = {"environment": "dummies/line-v2", "benchmark": {"source": "", "fingerprint": "abc"}}
+    for name, value in others.items():
         torch.save(saved | {name: value}, path)
-        with pytest.raises(ValueError, match=named):
-            read_state(tmp_path / "checkpoints/last")
+        with pytest.raises(ValueError, match=name):
+            make_trainer(resume)
+
+
+class Forgetful(DummyEnv):
+    """Keeps no state, as a robot."""
+
+    get_state = set_state = None
+
+
+def test_a_world_that_keeps_no_state_is_placed_anew(tmp_path, caplog):
+    """The rest of the run resumes; the new placement is INITIAL, which is free."""
+    train(config(tmp_path, steps=STEPS_PER_UPDATE, eval_freq=0), env=Forgetful(STREAMS))
+    resume = resumed(tmp_path, steps=2 * STEPS_PER_UPDATE, eval_freq=0)
+    env = Forgetful(STREAMS)
+    trainer = make_trainer(resume, env=env)
+    assert "keeps no state" in caplog.text
+    assert env.calls == [("scene_reset", list(range(STREAMS)))]
+    loop = trainer.loop
+    assert (loop.preceded_by == Intervention.INITIAL).all()
+    before = loop.b
+    assert loop.interventions[:, Intervention.INITIAL].tolist() == [2] * STREAMS
+    assert trainer.train()
+    assert loop.n == 2 * STEPS_PER_UPDATE
+    assert before == 0
+
+
+def test_another_format_is_refused(tmp_path):
+    train(config(tmp_path, steps=STEPS_PER_UPDATE, eval_freq=0))
+    path = tmp_path / "checkpoints/last/training_state/state.pt"
+    torch.save(torch.load(path) | {"format": 99}, path)
+    with pytest.raises(ValueError, match="format 99"):
+        read_state(tmp_path / "checkpoints/last")
 
 
 class Harmful:

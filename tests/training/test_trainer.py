@@ -174,7 +174,7 @@ def test_resuming_with_other_vector_instructions_is_told(was, is_told, tmp_path,
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
     manifest = tmp_path / "manifest.json"
     manifest.write_text(json.dumps({"starts": [{"machine": {"cpu_capability": was}}]}))
-    note_start(config(tmp_path))
+    note_start(config(tmp_path), DummyEnv.identity)
     assert ("AVX2" in caplog.text) == is_told
     assert len(json.loads(manifest.read_text())["starts"]) == 2
 

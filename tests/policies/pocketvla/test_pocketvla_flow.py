@@ -35,7 +35,7 @@ def test_the_head_decides_the_class():
     assert not isinstance(flow, TrainablePolicy)
     for policy, actor in ((flow, SelectingPolicy), (tokens, SamplingPolicy)):
         processors = type("Processors", (), {"device": torch.device("cpu"), "preprocessor": None})()
-        assert type(make_actor(policy, processors, 0.6)) is actor
+        assert type(make_actor(policy, processors, 0.6, 7)) is actor
     assert type(copy.deepcopy(flow)) is PocketVLAFlowPolicy
 
 

@@ -130,7 +130,7 @@ class CronosEnvConfig(EnvConfig):
 
     @property
     def steps_per_task(self) -> int:
-        """Control steps that a task has: the window of an evaluation, and K of a training unless it says another."""
+        """Control steps that a task has: the window of an evaluation, and K of a training by default."""
         return get_scene(self.scene).steps_per_task
 
     @property

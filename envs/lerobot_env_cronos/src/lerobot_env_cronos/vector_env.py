@@ -70,7 +70,6 @@ class CronosVectorEnv(gym.vector.VectorEnv):
 
     Attributes:
         fps: control steps a second.
-        steps_per_task: control steps that a task has, the window of an evaluation and a training's K by default.
         robot_type: LeRobot's, of datasets.
         tasks, reset_tasks: of the scene; `current_tasks` has the one of each stream.
         state_names, action_names: one for each number of `agent_pos` and of an action.
@@ -126,11 +125,10 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
         self.fps = self.scene.fps
-        self.steps_per_task = self.scene.steps_per_task
         self.robot_type = self.scene.robot_type
         self.tasks, self.reset_tasks = self.scene.tasks, self.scene.reset_tasks
         self.action_names = list(ACTION_NAMES)
-        self.num_starts = {split: len(poses) for split, poses in self.benchmark.configurations.items()}
+        self.num_starts = self.benchmark.num_starts
         self.identity = EnvIdentity(gymnasium_id(scene), self.benchmark.fingerprint, self.benchmark.source)
         self.current_tasks: list[Task] = [self.scene.tasks[0]] * num_envs
         self.is_success = np.zeros(num_envs, dtype=bool)
@@ -269,18 +267,18 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             )
         return ids
 
-    def scene_reset(self, ids: np.ndarray, configurations: np.ndarray, split: str = "train") -> None:
-        """Put every body of streams `ids` at benchmark configurations (k,) of a split, and the arm home.
+    def scene_reset(self, ids: np.ndarray, starts: np.ndarray, split: str = "train") -> None:
+        """Put every body of streams `ids` at benchmark configurations `starts` (k,) of a split, and the arm home.
 
         Raises:
             ValueError: unknown split, or there is no such configuration or stream.
         """
         check_split(split)
         poses = self.benchmark.configurations[split]
-        if np.max(configurations, initial=0) >= len(poses) or np.min(configurations, initial=0) < 0:
+        if np.max(starts, initial=0) >= len(poses) or np.min(starts, initial=0) < 0:
             valid = f"0 to {len(poses) - 1} of {split}, benchmark {self.benchmark.source}"
-            raise ValueError(f"configurations must be {valid}, got {np.asarray(configurations).tolist()}")
-        self.place_bodies(ids, poses[configurations])
+            raise ValueError(f"configurations must be {valid}, got {np.asarray(starts).tolist()}")
+        self.place_bodies(ids, poses[starts])
 
     def place_bodies(self, ids: np.ndarray, poses: np.ndarray) -> None:
         """Put every body of streams `ids` at `poses` (k, bodies, 7), and the arm home."""
@@ -300,14 +298,14 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         """Bodies that no task can reach any more, (n, bodies) bool; see `workspace.find_unsuitable`."""
         return np.any(list(find_unsuitable(self.simulation).values()), axis=0)
 
-    def put_back(self, stream: int, body: str, rng: np.random.Generator) -> None:
-        """Put one body of a stream at a free place of the spawn area, drawn from `rng`.
+    def put_back(self, stream: int, body: int, rng: np.random.Generator) -> None:
+        """Put one body of a stream, by its number in the scene, at a free place drawn from `rng`.
 
         On a table without a free place it is let fall over a random one.
         """
-        ids = self._check_ids([stream])
-        pose = find_free_pose(self.simulation, stream, body, rng)
-        self.simulation.move_body(ids, body, pose[None])
+        ids, name = self._check_ids([stream]), self.scene.bodies[body]
+        pose = find_free_pose(self.simulation, stream, name, rng)
+        self.simulation.move_body(ids, name, pose[None])
         self._judge(ids)
 
     def set_task(self, ids: Iterable[int], tasks: Sequence[Task]) -> None:
@@ -338,7 +336,11 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         """
         valid = self.scene.tasks + self.scene.reset_tasks
         own = {name: array.copy() for name, array in self._state_arrays().items()}
-        return self.simulation.get_state() | {"task": np.array([valid.index(task) for task in self.current_tasks])} | own
+        return (
+            self.simulation.get_state()
+            | {"task": np.array([valid.index(task) for task in self.current_tasks])}
+            | own
+        )
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Continue, bit for bit, from a state taken by `get_state`.

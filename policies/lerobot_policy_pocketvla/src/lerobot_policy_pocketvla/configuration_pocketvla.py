@@ -16,7 +16,7 @@ from lerobot_policy_pocketvla.precision import Precision
 Observation = Literal["auto", "image", "environment_state"]
 CriticObservation = Literal["actor", "environment_state"]
 Head = Literal["gaussian", "categorical", "flow"]
-BoundsSource = Literal["bridge_orig", "dataset"]
+BoundsSource = Literal["bridge_orig", "dataset", "unit"]
 
 DEFAULT_CHUNK_SIZE = 4
 """Of the `flow` head: 0.8 s at 5 control steps a second."""
@@ -77,7 +77,8 @@ class PocketVLAConfig(PreTrainedConfig):
     which begins with noise, has none."""
     action_bounds: BoundsSource = "bridge_orig"
     """Physical actions that -1 and 1 stand for: the 1st and 99th percentile of BridgeData V2, as in OpenVLA
-    (7 dimensions), or the data set's own minimum and maximum. Fixed at the first training."""
+    (7 dimensions), the data set's own minimum and maximum, or, with `unit`, -1 and 1. Fixed at the first
+    training."""
 
     chunk_size: int | None = None
     """Actions that the `flow` head predicts at once, H; null is 4. The other heads predict one."""
@@ -243,6 +244,8 @@ class PocketVLAConfig(PreTrainedConfig):
         """
         if self.action_bounds == "bridge_orig":
             low, high = (list(side) for side in BRIDGE_ORIG_BOUNDS)
+        elif self.action_bounds == "unit":
+            low, high = [-1.0] * self.action_dim, [1.0] * self.action_dim
         elif stats is None or "action" not in stats:
             raise ValueError("action_bounds='dataset' needs the data set's statistics of 'action'")
         else:

@@ -67,6 +67,16 @@ class Benchmark:
     source: str
     """Where it comes from: `<repository>@<commit>`, a folder, or this package with its version."""
 
+    @property
+    def tasks(self) -> tuple[Task, ...]:
+        """Of the scene."""
+        return self.scene.tasks
+
+    @property
+    def num_starts(self) -> dict[str, int]:
+        """Configurations by split."""
+        return {split: len(poses) for split, poses in self.configurations.items()}
+
     def groups(self, suite: str, split: str) -> tuple[EpisodeGroup, ...]:
         """The episodes of a suite on a split; a ValueError names the valid ones."""
         check_split(split)

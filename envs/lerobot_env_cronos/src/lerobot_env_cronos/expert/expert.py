@@ -147,7 +147,8 @@ class ScriptedExpert:
         """The body to move and where to, (n,) indices; an object held by mistake goes to the table first."""
         bodies = self.scene.bodies
         tasks = [
-            (bodies.index(t.object), bodies.index(t.receptacle) if t.receptacle else -1) for t in self.env.current_tasks
+            (bodies.index(t.object), bodies.index(t.receptacle) if t.receptacle else -1)
+            for t in self.env.current_tasks
         ]
         goal = np.array(tasks)[self._mine]
         self.reset(np.flatnonzero((goal != self._task).any(1)))
