@@ -41,8 +41,8 @@ def test_imports_point_one_way(package):
 FLOORS = {
     "cronos_lerobot": (
         "lazy", "stopwatch", "registry", "ranks", "provenance", "locks", "whole_files", "ranges",
-        "command_line", "dataset_metadata", "statistics", "bases", "agents", "protocol", "data", "evaluation",
-        "training", "film", "report", "experiments", "hub", "scripts", "__init__",
+        "command_line", "dataset_metadata", "statistics", "environment_id", "bases", "agents", "protocol",
+        "data", "evaluation", "training", "film", "report", "experiments", "hub", "scripts", "__init__",
     ),
     "lerobot_env_cronos": (
         "scene", "benchmark", "simulation", "vector_env", "episodic", "autoreset",

@@ -17,6 +17,7 @@ from hub_repositories import Faults, Hub
 from hub_stand_in import serve
 
 HERE = Path(__file__).parent
+EXAMPLES = HERE.parents[1] / "examples"
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class Commands:
         off = ("XET", "TELEMETRY", "UPDATE_CHECK", "PROGRESS_BARS")
         environment = os.environ | {f"HF_HUB_DISABLE_{name}": "1" for name in off}
         environment |= {"HF_ENDPOINT": hub.url, "HF_TOKEN": "any", "HF_HOME": str(home), "OMP_NUM_THREADS": "1"}
+        environment |= {"PYTHONPATH": str(EXAMPLES)}
         for name in ("HF_HUB_CACHE", "HF_LEROBOT_HOME", "HF_DATASETS_CACHE"):
             environment.pop(name, None)
         self._server = subprocess.Popen(
