@@ -20,8 +20,15 @@ from pathlib import Path
 import numpy as np
 from lerobot_env_cronos import CronosVectorEnv, Task, get_scene
 from lerobot_env_cronos.expert.body_boxes import SceneBoxes, WorldBoxes
+from lerobot_env_cronos.scene.arms.widowx.geometry import (
+    EE_HIGH,
+    EE_LOW,
+    FINGER_CLOSED,
+    FINGER_OPEN,
+    FINGERTIP_REACH,
+    HOME_QPOS,
+)
 from lerobot_env_cronos.scene.model import TABLE, hand_sensor, support_sensor
-from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, FINGER_CLOSED, FINGER_OPEN, FINGERTIP_REACH, HOME_QPOS
 from lerobot_env_cronos.scene.scenes import BODIES, Scene
 from lerobot_env_cronos.simulation.kinematics import (
     forward_kinematics,
@@ -29,7 +36,7 @@ from lerobot_env_cronos.simulation.kinematics import (
     matrix_to_rotation_vector,
     quaternion_to_matrix,
 )
-from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW, NUM_ARM_JOINTS, Simulation
+from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW, Simulation
 from PIL import Image
 
 KINDS = ("push", "press", "drop")
@@ -264,7 +271,7 @@ def _move_hand(sim: Simulation, position: np.ndarray, yaw: np.ndarray, opened: n
     for way in np.linspace(0.1, 1.0, 10):
         q = inverse_kinematics(q, start + way * (position - start), _orientation(yaw))
     sim.gripper_target[:] = np.where(opened, FINGER_OPEN, FINGER_CLOSED)
-    sim.qpos[:, NUM_ARM_JOINTS], sim.qpos[:, NUM_ARM_JOINTS + 1] = sim.gripper_target, -sim.gripper_target
+    sim.qpos[:, 6], sim.qpos[:, 7] = sim.gripper_target, -sim.gripper_target
     sim.move_arm(np.arange(len(yaw)), q)
 
 

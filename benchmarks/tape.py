@@ -60,7 +60,9 @@ def rollout_hash(scene: str, actor: str) -> str:
     for step in range(STEPS):
         if step % 50 == 0:
             env.set_task(ids, [tasks[(i + step // 50) % len(tasks)] for i in ids])
-        actions = expert.act() if actor == "expert" else rng.uniform(space.low, space.high, (NUM_ENVS, len(space.low)))
+        actions = (
+            expert.act() if actor == "expert" else rng.uniform(space.low, space.high, (NUM_ENVS, len(space.low)))
+        )
         if step == 60:
             env.end_effector_reset(ids[::2])
         if step in (90, 130):

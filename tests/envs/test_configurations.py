@@ -14,7 +14,7 @@ from lerobot_env_cronos.benchmark.configurations import (
     footprint_gap,
     load_configurations,
 )
-from lerobot_env_cronos.scene.cameras import is_in_view
+from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
 from lerobot_env_cronos.scene.scenes import BODIES
 
 DATA = resources.files("lerobot_env_cronos").joinpath("data")
@@ -59,4 +59,4 @@ def test_every_body_is_in_the_picture(scene):
         yaws = 2 * np.arctan2(poses[:, i, 6], poses[:, i, 3])
         corners = np.stack([footprint_corners(name, p[:2], yaw) for p, yaw in zip(poses[:, i], yaws)])
         for height in (0.0, BODIES[name].size[2]):
-            assert is_in_view(np.concatenate([corners, np.full((*corners.shape[:2], 1), height)], -1)).all()
+            assert WIDOWX.sees(np.concatenate([corners, np.full((*corners.shape[:2], 1), height)], -1)).all()

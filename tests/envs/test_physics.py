@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from env_rollouts import make
 from lerobot_env_cronos import SCENES, get_scene
+from lerobot_env_cronos.scene.arms.widowx.geometry import EE_SITE, HOME_QPOS
 from lerobot_env_cronos.scene.model import build_model
-from lerobot_env_cronos.scene.robot import EE_SITE, HOME_QPOS
 from lerobot_env_cronos.scene.scenes import BODIES
 from lerobot_env_cronos.simulation.kinematics import (
     forward_kinematics,

@@ -7,8 +7,8 @@ import pytest
 from env_rollouts import STILL, keep_still, make
 from lerobot_env_cronos import CronosVectorEnv, Task, get_scene
 from lerobot_env_cronos.expert.expert import ScriptedExpert
+from lerobot_env_cronos.scene.arms.widowx.geometry import FINGERTIP_REACH, HOME_QPOS
 from lerobot_env_cronos.scene.model import TABLE, hand_sensor, support_sensor
-from lerobot_env_cronos.scene.robot import FINGERTIP_REACH, HOME_QPOS
 from lerobot_env_cronos.scene.scenes import BODIES, SCENES
 from lerobot_env_cronos.simulation.kinematics import forward_kinematics, inverse_kinematics
 

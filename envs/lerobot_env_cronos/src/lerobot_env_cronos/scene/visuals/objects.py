@@ -174,5 +174,11 @@ LOOKS: dict[str, Callable[[mujoco.MjSpec, mujoco.MjsBody, Body], None]] = {
     "newspaper": _dress_newspaper,
     "box": _dress_box,
     "disc": _dress_disc,
+    "brick": _dress_box,
+    "marker": _dress_box,
+    "tape": _dress_disc,
+    "lid": _dress_box,
+    "dish": _dress_disc,
+    "mat": _dress_box,
 }
 """How to draw a body, by `Body.shape`."""
