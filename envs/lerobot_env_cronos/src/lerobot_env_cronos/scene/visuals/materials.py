@@ -21,6 +21,12 @@ COLOURS: dict[str, tuple[tuple[float, float, float], float, float]] = {
     "bead": ((0.06, 0.05, 0.05), 0.5, 0.6),
     "clear plastic": ((0.50, 0.82, 0.95), 0.7, 0.7),
     "bottle label": ((0.07, 0.25, 0.72), 0.2, 0.3),
+    "white print": ((0.93, 0.93, 0.91), 0.2, 0.3),
+    "servo": ((0.09, 0.09, 0.10), 0.4, 0.4),
+    "servo horn": ((0.20, 0.20, 0.22), 0.4, 0.4),
+    "cardboard": ((0.70, 0.53, 0.35), 0.05, 0.1),
+    "cardboard edge": ((0.56, 0.41, 0.26), 0.05, 0.1),
+    "masking tape": ((0.90, 0.78, 0.50), 0.1, 0.2),
     "oak": ((0.74, 0.67, 0.58), 0.1, 0.3),
     "light oak": ((0.77, 0.70, 0.605), 0.1, 0.3),
     "dark oak": ((0.71, 0.64, 0.55), 0.1, 0.3),
@@ -33,7 +39,7 @@ def add_materials(spec: mujoco.MjSpec) -> None:
     """Add every material and texture that the visuals name."""
     for name, (rgb, specular, shininess) in COLOURS.items():
         spec.add_material(name=name, rgba=[*rgb, 1.0], specular=specular, shininess=shininess)
-    for name, image in {"cloth": _gingham(64), "carpet": _rug(64), "newspaper": _front_page(64)}.items():
+    for name, image in {"cloth": _gingham(64), "carpet": _rug(64), "newspaper": _front_page(64), "mat": _cutting_mat(64)}.items():
         _add_textured(spec, name, image)
 
 
@@ -56,6 +62,13 @@ def _gingham(n: int) -> np.ndarray:
     stripe = (np.arange(n) * 5 // n) % 2 == 0
     cover = (stripe[:, None] * 0.5 + stripe[None] * 0.5)[..., None]
     return (1 - cover) * np.array([0.97, 0.96, 0.99]) + cover * np.array([0.44, 0.27, 0.72])
+
+
+def _cutting_mat(n: int) -> np.ndarray:
+    """A dark green mat (n, n, 3) with a pale grid of eight cells."""
+    green, line = np.array([0.09, 0.30, 0.25]), np.array([0.45, 0.65, 0.55])
+    on_line = np.arange(n) % (n // 8) == n // 16
+    return np.where((on_line[:, None] | on_line[None])[..., None], line, green)
 
 
 def _rug(n: int) -> np.ndarray:
