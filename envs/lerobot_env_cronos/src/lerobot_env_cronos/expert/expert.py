@@ -15,6 +15,7 @@ from lerobot_env_cronos.expert.grasping import choose_grasps, find_blocker, gras
 from lerobot_env_cronos.expert.hands import CLOSE, HANDS, OPEN, Command, horizontal
 from lerobot_env_cronos.expert.placement import Held, choose_places
 from lerobot_env_cronos.scene.rotations import quaternion_to_matrix
+from lerobot_env_cronos.simulation.judging import IN_HAND
 from lerobot_env_cronos.vector_env import CronosVectorEnv
 
 FUNNEL_SLOPE = 1.5
@@ -290,11 +291,18 @@ class ScriptedExpert:
         low = self._p[:, 2] - position[:, 2]
         # The target is down but the hand is not: the object rests on something.
         rests = (self._target_p[:, 2] - position[:, 2] < 0.004) & (self._p[:, 2] - self._target_p[:, 2] > 0.005)
-        release = (error < ALIGNED + 0.006) & ((low < 0.006) | rests)
+        carried = self._is_carried() | (self._hand.lift == 0.0)
+        release = carried & (error < ALIGNED + 0.006) & ((low < 0.006) | rests)
         self._letting_go[self._holding & release] = self._let_go_steps
         gripper = np.where(release, OPEN, CLOSE)[:, None]
-        none = np.zeros(len(i))
-        return Command(self._funnel(position, error, none, none), closing, gripper)
+        lift, none = np.where(carried, 0.0, self._hand.lift), np.zeros(len(i))
+        return Command(self._funnel(position, error, lift, none), closing, gripper)
+
+    def _is_carried(self) -> np.ndarray:
+        """Whether the judge has seen what is held (n,) long enough in the air."""
+        carried_to = self.sim.judge.carried_to[self._mine]
+        objects = np.minimum(self._goal[:, 0], len(self.scene.objects) - 1)
+        return carried_to[np.arange(len(objects)), objects] == IN_HAND
 
     def _finish(self) -> Command:
         """The object is put down: open, go straight up and wait."""

@@ -60,6 +60,8 @@ class Hand(ABC):
     """Widest graspable side, with room for each finger."""
     hover: float
     """Height above the grasp or the place at which the hand travels."""
+    lift = 0.0
+    """Height above the place to which what is held is lifted until that counts as carried; a fast arm needs it."""
     retreat: float
     """Height at which the hand waits once the task is complete."""
     near, far = 0.0, 0.0
@@ -246,7 +248,7 @@ class SO101Hand(Hand):
     palm_height = 0.049
     tip_reach, tip_clearance = SO101_FINGERTIP_REACH, 0.005
     max_width = 0.0455
-    hover, retreat = 0.05, 0.075
+    hover, lift, retreat = 0.05, 0.03, 0.075
     near, far = 0.11, 0.285
     empty_opening, widest_opening = 0.03, 0.45
     closes_along = 0
