@@ -4,7 +4,7 @@ import copy
 
 import numpy as np
 import pytest
-from env_rollouts import STILL, keep_still, make
+from env_rollouts import STILL, WIDOWX_SCENES, keep_still, make
 from lerobot_env_cronos import CronosVectorEnv, Task, get_scene
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.scene.arms.widowx.geometry import FINGERTIP_REACH, HOME_QPOS
@@ -64,7 +64,7 @@ def lies_on(env: CronosVectorEnv, task: Task) -> np.ndarray:
     return (borne > 0.05) & (rest == 0) & (sim.force(hand_sensor(task.object))[:, 0] == 0)
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("scene", WIDOWX_SCENES)
 def test_no_push_along_the_table_counts(scene):
     # Each pair of bodies once: those of kitchen_2x2 are in kitchen_3x3, too.
     tasks = [t for t in get_scene(scene).tasks if scene != "kitchen_3x3" or t not in SCENES["kitchen_2x2"].tasks]

@@ -53,8 +53,8 @@ class CronosEnvConfig(EnvConfig):
     """Scene: kitchen_2x2, kitchen_3x3, playroom_2x2, or a registered one; by default the benchmark's, or
     kitchen_2x2."""
     suite: str = "independent"
-    """Evaluation suite: independent (every task from every configuration, within the steps of a task), or sequential (chains of all
-    tasks without a reset in between, in ten orderings)."""
+    """Evaluation suite: independent (every task from every configuration, within the steps of a task), or
+    sequential (chains of all tasks without a reset in between, in ten orderings)."""
     split: str = "train"
     """Configurations: train or held_out, 64 each."""
     benchmark: str | None = None
@@ -131,7 +131,7 @@ class CronosEnvConfig(EnvConfig):
 
     @property
     def steps_per_task(self) -> int:
-        """Control steps that a task has: the window of an evaluation, and K of a training unless it says another."""
+        """Control steps that a task has: the window of an evaluation, and by default K of a training."""
         return get_scene(self.scene).steps_per_task
 
     @property

@@ -157,9 +157,9 @@ class CronosEnv(gym.Env):
 
     `reset(options={"configuration": i})` picks the i-th of `configurations`; otherwise the seeded generator draws.
     An episode is terminated when its task is complete. `gymnasium.make` truncates it after `max_episode_steps`, by
-    default the steps of a task; this class alone has no limit. What is terminated stays so until the next `reset`: further steps
-    change nothing, pay nothing, and return the same observation. `info["task"]` is the number of the task in the
-    scene's `tasks`; `task_description` is its instruction.
+    default the steps of a task; this class alone has no limit. What is terminated stays so until the next
+    `reset`: further steps change nothing, pay nothing, and return the same observation. `info["task"]` is the
+    number of the task in the scene's `tasks`; `task_description` is its instruction.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": CronosVectorEnv.metadata["render_fps"]}  # noqa: RUF012

@@ -6,8 +6,6 @@ clearing away: one that lies on top of the object to move, or that takes up the 
 on the table first.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from lerobot_env_cronos.expert.body_boxes import SceneBoxes, WorldBoxes
@@ -62,7 +60,9 @@ class ScriptedExpert:
         n, bodies = env.num_envs if streams is None else len(streams), self.scene.bodies
         self._mine = slice(None) if streams is None else streams
         self._boxes = SceneBoxes.from_model(self.sim.model, self.scene)
-        self._candidates = {i: grasp_candidates(self._hand, self._boxes, i) for i in range(len(self.scene.objects))}
+        self._candidates = {
+            i: grasp_candidates(self._hand, self._boxes, i) for i in range(len(self.scene.objects))
+        }
         self._corners = {i: self._boxes.corners(i) for i in range(len(self.scene.objects))}
         self._is_support = np.array([name in self.scene.receptacles for name in bodies])
         # Indices of the object to move and of where to (-1: the table): by the task, and what is done first.
@@ -191,7 +191,14 @@ class ScriptedExpert:
             R = self._object_R[mine]
             hand = self._object[mine, :3] + np.einsum("nij,nj->ni", R, self._grasp_point[mine])
             closing = np.einsum("nij,nj->ni", R, self._grasp_axis[mine])
-            held = Held(self._object[mine, :3], R, hand, np.arctan2(closing[:, 1], closing[:, 0]), self._arm[mine], self._grasp_width[mine])
+            held = Held(
+                self._object[mine, :3],
+                R,
+                hand,
+                np.arctan2(closing[:, 1], closing[:, 0]),
+                self._arm[mine],
+                self._grasp_width[mine],
+            )
             places = choose_places(
                 self._hand, self.scene, obj, target, WorldBoxes.at(self._boxes, self._poses[mine]),
                 self._poses[mine, target, :2], held,

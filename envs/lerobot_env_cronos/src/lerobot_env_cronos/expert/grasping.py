@@ -124,11 +124,7 @@ def choose_grasps(
     closing = axis * [1, 1, 0]
     closing /= np.maximum(np.linalg.norm(closing, axis=-1, keepdims=True), 1e-6)
     width = _width(world, candidates, R, closing)
-    cost = (
-        2.0 * np.abs(axis[..., 2])
-        + 50.0 * (np.abs(axis[..., 2]) > 0.7)
-        + 10.0 * (width > hand.max_width)
-    )
+    cost = 2.0 * np.abs(axis[..., 2]) + 50.0 * (np.abs(axis[..., 2]) > 0.7) + 10.0 * (width > hand.max_width)
     floor = _floor(hand, world, point, closing, is_support, width)
     centre = point.copy()
     centre[..., 2] = np.maximum(point[..., 2], floor + hand.tip_clearance + hand.pad_half[0])
@@ -155,7 +151,12 @@ def _width(world: WorldBoxes, candidates: GraspCandidates, R: np.ndarray, closin
 
 
 def _floor(
-    hand: Hand, world: WorldBoxes, point: np.ndarray, closing: np.ndarray, is_support: np.ndarray, width: np.ndarray
+    hand: Hand,
+    world: WorldBoxes,
+    point: np.ndarray,
+    closing: np.ndarray,
+    is_support: np.ndarray,
+    width: np.ndarray,
 ) -> np.ndarray:
     """Height (n, c) of the receptacle under the fingers, 0 on the table."""
     across = np.stack([-closing[..., 1], closing[..., 0], 0 * closing[..., 0]], -1) * hand.pad_half[2]

@@ -231,7 +231,7 @@ JAW_OPENING_M = np.array([0.0019, 0.0158, 0.030, 0.044, 0.058, 0.071, 0.110])
 JAW_ANGLE_DEG = np.array([-10, 0, 10, 20, 30, 40, 100])
 """Of the jaws at their tips, by the angle of the gripper's joint."""
 PREFERRED_TILTS = (np.array([0.225, 0.285]), np.deg2rad([0.0, 15.0]))
-"""Distance from the pan axis, and tilt at which the fingers reach the table there: farther out they lean outwards."""
+"""Distance from the pan axis [m], and tilt of the fingers there [rad]: far out they lean outwards."""
 MORE_TILT = np.deg2rad(np.arange(0, 42.5, 2.5))
 """What the wrist needs on top where it cannot bend as far, high up."""
 MAX_STEP_M, MAX_STEP_RAD, MAX_ROLL_RAD = 0.007, 0.035, 0.08

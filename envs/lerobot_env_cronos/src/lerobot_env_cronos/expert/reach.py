@@ -19,6 +19,7 @@ SPACING_M = 0.02
 HAND_YAWS = np.deg2rad([0.0, 45.0, 90.0, 135.0])
 """Of the closing axis; the hand has to get there with all of them [rad]."""
 
+
 @dataclass(frozen=True)
 class Reach:
     """Where on the table bodies of a scene may lie for the arm to do its tasks."""

@@ -23,8 +23,8 @@ CARRIES, CARRIES_NOTHING = 0.5, 0.05
 """Shares of an object's weight: what carries it, and what does not take part in carrying it."""
 
 STILL_DISTANCE = 0.004
-"""No point of an object that lies still moves further between two readings: 0.02 m/s. The speed at one moment would
-not do: light objects may tremble in place [m]."""
+"""No point of an object that lies still moves further between two readings: 0.02 m/s. The speed at one moment
+would not do: light objects may tremble in place [m]."""
 
 RESTING_GAP = 0.001
 """Height above its resting pose up to which a body that was put there counts as lying on the table [m]."""

@@ -73,9 +73,17 @@ class Reading(Protocol):
 
     qpos: np.ndarray
 
-    def end_effector(self) -> tuple[np.ndarray, np.ndarray]: ...
-    def target_position(self) -> np.ndarray: ...
-    def gripper_opening(self) -> np.ndarray: ...
+    def end_effector(self) -> tuple[np.ndarray, np.ndarray]:
+        """Measured position (n, 3) [m] and rotation (n, 3, 3)."""
+        ...
+
+    def target_position(self) -> np.ndarray:
+        """Commanded position (n, 3) [m]."""
+        ...
+
+    def gripper_opening(self) -> np.ndarray:
+        """(n,), 0 closed to 1 open."""
+        ...
 
 
 Pose = tuple[np.ndarray, ...]
@@ -104,7 +112,7 @@ class Arm(ABC):
     """Bound of every number of a state observation; a body further away [m] has left the room."""
 
     num_joints: int
-    """Of the arm without its gripper: the first ones of qpos, and of the actuators. The gripper's actuator follows."""
+    """Of the arm without its gripper: the first ones of qpos and of the actuators; the gripper's comes next."""
     home_qpos: np.ndarray
     """Joint positions at home, those of the open gripper last."""
     home_gripper: float
@@ -115,8 +123,8 @@ class Arm(ABC):
     """Of a control step: the share of the way from the last joint target to the next one at which the actuators
     are, and physics steps. The contacts are looked at after each."""
     steps_per_reading: int
-    """Control steps between two readings of what lies where: 0.2 s, whatever the arm. Thresholds on what lies still
-    and what is carried hold for this time."""
+    """Control steps between two readings of what lies where: 0.2 s, whatever the arm. Thresholds on what lies
+    still and what is carried hold for this time."""
 
     cameras: Mapping[str, Camera]
     """By name; `front` decides what is seen."""
@@ -143,7 +151,7 @@ class Arm(ABC):
         return self.steps_per_reading * len(self.chunks)
 
     def sees(self, points: np.ndarray) -> np.ndarray:
-        """Whether the front camera sees points (..., 3) in the base frame [m]; it decides, whatever is observed."""
+        """Whether the front camera sees points (..., 3) in the base frame [m], whatever is observed."""
         return self.cameras["front"].sees(points)
 
     def serves(self, xy: np.ndarray) -> np.ndarray:

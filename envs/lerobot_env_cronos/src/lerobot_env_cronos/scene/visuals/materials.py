@@ -39,7 +39,12 @@ def add_materials(spec: mujoco.MjSpec) -> None:
     """Add every material and texture that the visuals name."""
     for name, (rgb, specular, shininess) in COLOURS.items():
         spec.add_material(name=name, rgba=[*rgb, 1.0], specular=specular, shininess=shininess)
-    for name, image in {"cloth": _gingham(64), "carpet": _rug(64), "newspaper": _front_page(64), "mat": _cutting_mat(64)}.items():
+    for name, image in {
+        "cloth": _gingham(64),
+        "carpet": _rug(64),
+        "newspaper": _front_page(64),
+        "mat": _cutting_mat(64),
+    }.items():
         _add_textured(spec, name, image)
 
 

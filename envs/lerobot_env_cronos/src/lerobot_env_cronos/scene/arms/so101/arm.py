@@ -1,7 +1,7 @@
 """The SO-101 as a value: LeRobot's features and units, where it gets to.
 
-Actions and proprioception are LeRobot's of a calibrated arm: joint positions in degrees, the gripper from 0 (closed)
-to 100 (open). An action is an absolute target, which the servos try to reach from the moment they hear it.
+Actions and proprioception are LeRobot's of a calibrated arm: joint positions in degrees, the gripper from 0
+(closed) to 100 (open). An action is an absolute target, which the servos try to reach at once.
 """
 
 from collections.abc import Callable
@@ -59,7 +59,7 @@ class SO101(Arm):
     chunks = ((1.0, 4), (1.0, 4))
     steps_per_reading = 6
 
-    cameras = {  # noqa: RUF012 - a value like the others
+    cameras = {  # noqa: RUF012 - a value, the same for every scene
         # From the front, 42 degrees down: it sees all that the hand gets to.
         "front": Camera((0.98, 0.0, 0.80), (0, 1, 0, -0.667, 0, 0.745), 32.5),
         # Above the fingers, on the hand: it looks at their tips.

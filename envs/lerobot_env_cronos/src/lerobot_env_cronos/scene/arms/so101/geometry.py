@@ -1,4 +1,4 @@
-"""The SO-101: link frames and inertias of TheRobotStudio's model with the new calibration (Apache-2.0), and its servo.
+"""The SO-101: link frames and inertias of TheRobotStudio's model (new calibration, Apache-2.0), and its servo.
 
 Lengths in m, masses in kg, inertias in kg m^2, angles in rad, quaternions (w, x, y, z), everything in the parent's
 frame. The base frame is the world frame: x forward, y left, z up, table surface at z = 0; the pan axis is at its
@@ -45,12 +45,12 @@ JOINT_LOW, JOINT_HIGH = (np.array([link.range[i] for link in LINKS]) for i in ra
 
 EE_SITE = "end_effector"
 EE_OFFSET = np.array([-0.0079, -0.000218, -0.098127])
-"""The end effector in the frame of `gripper`: on the fixed jaw's inner face [m]. Fingers along -z, closing along x."""
+"""The end effector in the frame of `gripper`: on the fixed jaw's inner face [m]. Fingers point along -z."""
 FINGERTIP_REACH = 0.0063
 """How far the fingertips extend beyond the end effector along the fingers [m]."""
 
-# Rhoban's identification of the STS3215 has 18.8 N m/rad at P = 32 and 7.4 V; LeRobot writes P = 16, and half of the
-# torque to the gripper. Other public models are 50 times as stiff and do not fit the measured step response.
+# Rhoban's identification of the STS3215 has 18.8 N m/rad at P = 32 and 7.4 V; LeRobot writes P = 16, and half of
+# the torque to the gripper. Other public models are 50 times as stiff, which does not fit the measured law.
 SERVO_KP, SERVO_DAMPING, SERVO_FRICTIONLOSS, SERVO_ARMATURE = 8.9, 0.6, 0.052, 0.028
 """N m/rad, N m s/rad, N m, kg m^2."""
 SERVO_TORQUE, GRIPPER_TORQUE = 3.35, 1.67
@@ -83,4 +83,4 @@ HOUSINGS: dict[str, tuple[Box, ...]] = {
     ),
     "moving_jaw": (((-0.0100, -0.0210, -0.0040), (0.0085, 0.0, 0.0420)),),
 }
-"""What else of the arm collides, by body: absolute joint targets have no workspace that would keep it in the air."""
+"""What else of the arm collides, by body: no workspace keeps absolute joint targets above the table."""

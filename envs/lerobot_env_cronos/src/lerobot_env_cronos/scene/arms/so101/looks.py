@@ -1,14 +1,23 @@
 """Looks of the SO-101: white printed parts around dark servos, in each link's own frame.
 
 Sizes are the bounding boxes of the printed parts and servos. Link frames are those of
-`lerobot_env_cronos.scene.arms.so101.geometry`: every joint turns about the z axis of its link. Each link is one white
-mesh and one dark one.
+`geometry`: every joint turns about the z axis of its link. Each link is one white mesh and one dark one.
 """
 
 import mujoco
 import numpy as np
 
-from lerobot_env_cronos.scene.visuals.meshes import Surface, add_visual, box, circle, cylinder, loft, merge, prism, stadium
+from lerobot_env_cronos.scene.visuals.meshes import (
+    Surface,
+    add_visual,
+    box,
+    circle,
+    cylinder,
+    loft,
+    merge,
+    prism,
+    stadium,
+)
 
 PRINT, SERVO, HORN = "white print", "servo", "servo horn"
 # Sections of the jaws, from the tip to the root: height along the jaw, and lowest and highest corner across it.
@@ -58,7 +67,11 @@ def _base() -> dict[str, Surface]:
     )
     servo = box((0.0075, -0.0333, 0.0560), (0.0341, 0.0121, 0.0964), caps="last")
     board = box((-0.0049, 0.0429, 0.0589), (0.0461, 0.0467, 0.1009))
-    return {PRINT: white, SERVO: merge(servo, board), HORN: cylinder(0.010, 0.0964, 0.1015, pos=(0.0208, -0.0231, 0))}
+    return {
+        PRINT: white,
+        SERVO: merge(servo, board),
+        HORN: cylinder(0.010, 0.0964, 0.1015, pos=(0.0208, -0.0231, 0)),
+    }
 
 
 def _shoulder() -> dict[str, Surface]:

@@ -42,7 +42,7 @@ class WidowX(Arm):
 
     action_names = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
     # q01 and q99 of `bridge_orig`, the range that OpenVLA's action tokens span: m, rad, gripper (1 open).
-    # Rotations here are a rotation vector. Those of `bridge_orig` are Euler angles: up to .77 degrees apart a step.
+    # Rotations here are a rotation vector. Those of `bridge_orig` are Euler angles, up to .77 degrees apart.
     action_low = np.array([-0.028727253, -0.0417035, -0.026093859, -0.08092105, -0.092886995, -0.20718276, 0.0])
     action_high = np.array([0.028309678, 0.040855255, 0.040161587, 0.0819204776, 0.0779285, 0.203825745, 1.0])
     # End-effector position [m], the first two columns of its rotation matrix, gripper opening (0 closed, 1 open),
@@ -62,7 +62,7 @@ class WidowX(Arm):
     chunks = _ramp(fps)
     steps_per_reading = 1
 
-    cameras = {
+    cameras = {  # noqa: RUF012 - a value, the same for every scene
         # A front view, 45 degrees down through a long lens: bodies at the edges of the widened spawn area just fit
         # the width of a square picture, and little is lost behind the arm.
         "front": Camera((1.03, 0, 0.82), (0, 1, 0, -1, 0, 1), 27.0),

@@ -1,6 +1,6 @@
 """Looks of the WidowX-250S: black links around Dynamixel servos, in each link's own frame.
 
-Link axes at the zero pose: x forward, y left, z up; every joint frame is that of `lerobot_env_cronos.scene.arms.widowx.geometry`.
+Link axes at the zero pose: x forward, y left, z up; every joint frame is that of `geometry`.
 Each link is one dark mesh, one of a lighter black that sets plates apart from servos, and a few metal accents.
 """
 
