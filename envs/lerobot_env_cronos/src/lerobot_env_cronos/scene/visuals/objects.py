@@ -164,7 +164,7 @@ def _dress_brick(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> 
     """A building block of the body's colour with a pale stripe across its middle."""
     hx, hy, hz = (s / 2 for s in body.size)
     _add_plain(spec, spec_body, body, box((-hx, -hy, -hz), (hx, hy, hz), 0.002))
-    stripe = box((-hx - 1e-4, -0.2 * hy, -hz), (hx + 1e-4, 0.2 * hy, hz + 1e-4), caps="last")
+    stripe = box((-hx - 5e-5, -0.2 * hy, -hz), (hx + 5e-5, 0.2 * hy, hz + 5e-5), caps="last")
     add_visual(spec, spec_body, f"{body.name}/stripe", "white plastic", stripe)
 
 
