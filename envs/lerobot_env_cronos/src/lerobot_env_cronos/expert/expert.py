@@ -70,6 +70,7 @@ class ScriptedExpert:
         self._grasp_known, self._place_known = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         self._grasp_point, self._grasp_axis, self._grasp_floor = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
         self._grasp_pose, self._grasp_width = np.zeros((n, 7)), np.zeros(n)
+        self._held_width = np.zeros(n)
         # The last grasp points that failed, and for how long the hand has been at the current one in vain.
         self._failed, self._vain = np.full((n, NUM_FAILED, 3), np.inf), np.zeros(n, dtype=int)
         self._was_holding = np.zeros(n, dtype=bool)
@@ -92,6 +93,7 @@ class ScriptedExpert:
         """Actions (n, a) in physical units, within the action bounds."""
         self._look()
         self._update_goals()
+        self._measure_held()
         self._update_grasps()
         self._update_places()
         command, place = self._pick(), self._place()
@@ -100,7 +102,8 @@ class ScriptedExpert:
         for applies, other in ((self._holding, place), (done, self._finish())):
             mask = applies[:, None]
             command = Command(*(np.where(mask, theirs, ours) for theirs, ours in zip(other, command)))
-        return self._hand.act(self._arm_target, command, self._grasp_width)
+        width = np.where(self._holding | done, self._held_width, self._grasp_width)
+        return self._hand.act(self._arm_target, command, width)
 
     # Perception -------------------------------------------------------------------------------------------
 
@@ -145,6 +148,11 @@ class ScriptedExpert:
         self._holding = self._held_objects[i, goal[:, 0]]
         self._object = self._poses[i, goal[:, 0]]
         self._object_R = quaternion_to_matrix(self._object[:, 3:])
+
+    def _measure_held(self) -> None:
+        """How wide what is held is, until the fingers let go of it: they have to open further than that."""
+        mine = self._holding & (self._letting_go == 0)
+        self._held_width[mine] = self._hand.held_width(self._opening)[mine]
 
     def _update_clearing(self, goal: np.ndarray) -> None:
         """Stop clearing what was put down, or is not in the way of the `goal` (n, 2) of the task any more."""
@@ -220,7 +228,7 @@ class ScriptedExpert:
         wanted = self._holding & (moved | ~self._place_known)
         for obj, target in np.unique(self._goal[wanted], axis=0):
             ids = np.flatnonzero(wanted & (self._goal == (obj, target)).all(1))
-            width = self._grasp_width[ids]
+            width = self._held_width[ids]
             middle = self._hand.to_middle(self._p[ids], horizontal(self._closing[ids]), width)
             held = Held(self._object[ids, :3], self._object_R[ids], middle, self._yaw[ids], self._arm[ids], width)
             places = choose_places(
@@ -314,7 +322,7 @@ class ScriptedExpert:
     def _finish(self) -> Command:
         """The object is put down: open, go straight up and wait."""
         position = self._target_p.copy()
-        opened = self._hand.has_let_go(self._opening, self._grasp_width)
+        opened = self._hand.has_let_go(self._opening, self._held_width)
         height = np.maximum(self._target_p[:, 2], self._hand.retreat)
         position[:, 2] = np.where(opened, height, position[:, 2])
         return Command(position, self._target_closing, np.full((len(position), 1), OPEN))

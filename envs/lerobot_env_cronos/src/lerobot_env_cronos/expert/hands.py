@@ -111,6 +111,10 @@ class Hand(ABC):
         """The end effector's pose that joint targets (n, j) are meant for."""
 
     @abstractmethod
+    def held_width(self, opening: np.ndarray) -> np.ndarray:
+        """Width (n,) of what is between closed fingers, from their opening (n,)."""
+
+    @abstractmethod
     def still_opening(self, opening: np.ndarray, width: np.ndarray) -> np.ndarray:
         """Height (n,) above the grasp at which fingers that are still opening wait."""
 
@@ -187,6 +191,10 @@ class WidowXHand(Hand):
         """See `Hand`."""
         return forward_kinematics(target)[:2]
 
+    def held_width(self, opening: np.ndarray) -> np.ndarray:
+        """See `Hand`."""
+        return 2 * (FINGER_Y - PAD_HALF_SIZE[1]) * opening
+
     def still_opening(self, opening: np.ndarray, width: np.ndarray) -> np.ndarray:
         """See `Hand`."""
         return 0.05 * np.clip(0.9 - opening, 0.0, 0.5) / 0.5
@@ -236,6 +244,8 @@ MORE_TILT = np.deg2rad(np.arange(0, 42.5, 2.5))
 """What the wrist needs on top where it cannot bend as far, high up."""
 MAX_STEP_M, MAX_STEP_RAD, MAX_ROLL_RAD = 0.007, 0.035, 0.08
 """Of the target in a control step: along and up, around the pan axis, and of the wrist."""
+SAG_ROUNDS = 4
+"""A round comes seven times as close to what a target with its sag was meant for."""
 PAD_ABOVE_EE = 0.0037
 """Height of the middle of the pads above the end effector when the SO-101's hand points down."""
 
@@ -271,17 +281,25 @@ class SO101Hand(Hand):
         return position + (width / 2)[:, None] * closing + np.array([0, 0, PAD_ABOVE_EE])
 
     def target_pose(self, target: np.ndarray) -> Pose:
-        """See `Hand`: the servos are asked for more than is wanted."""
-        return so101.forward_kinematics(self._without_sag(target))
+        """See `Hand`: the servos are asked for more than is wanted. The closing axis is that of no tilt."""
+        q = self._without_sag(target)
+        return so101.forward_kinematics(q)[0], so101.hand_rotation(-q[:, 0], q[:, 4], np.zeros(len(q)))
 
     def _without_sag(self, target: np.ndarray) -> np.ndarray:
-        wanted = target - so101.gravity_torque(target) / SERVO_KP
-        return target - so101.gravity_torque(wanted) / SERVO_KP
+        q = target
+        for _ in range(SAG_ROUNDS):
+            q = target - so101.gravity_torque(q) / SERVO_KP
+        return q
 
     def _opening(self, width: np.ndarray) -> np.ndarray:
         """Opening (n,), 0 to 1, at which the jaws have their gaps to a side of a width (n,)."""
         degrees = np.interp(width + FIXED_GAP + MOVING_GAP, JAW_OPENING_M, JAW_ANGLE_DEG)
         return (degrees - JAW_ANGLE_DEG[0]) / (JAW_ANGLE_DEG[-1] - JAW_ANGLE_DEG[0])
+
+    def held_width(self, opening: np.ndarray) -> np.ndarray:
+        """See `Hand`."""
+        degrees = JAW_ANGLE_DEG[0] + opening * (JAW_ANGLE_DEG[-1] - JAW_ANGLE_DEG[0])
+        return np.interp(degrees, JAW_ANGLE_DEG, JAW_OPENING_M)
 
     def still_opening(self, opening: np.ndarray, width: np.ndarray) -> np.ndarray:
         """See `Hand`."""
@@ -299,7 +317,8 @@ class SO101Hand(Hand):
         x, y, height = command.position.T
         r_goal, azimuth_goal = np.hypot(x, y), np.arctan2(y, x)
         closing = np.arctan2(command.closing[:, 1], command.closing[:, 0])
-        roll = q[:, 4] + np.clip(self.wrist_at(azimuth_goal, closing) - q[:, 4], -MAX_ROLL_RAD, MAX_ROLL_RAD)
+        roll = q[:, 4] - q[:, 0] - azimuth
+        roll = roll + np.clip(self.wrist_at(azimuth_goal, closing) - roll, -MAX_ROLL_RAD, MAX_ROLL_RAD)
         r = r + np.clip(np.maximum(r_goal, self.near - 0.03) - r, -MAX_STEP_M, MAX_STEP_M)
         azimuth = azimuth + np.clip(azimuth_goal - azimuth, -MAX_STEP_RAD, MAX_STEP_RAD)
         z = z + np.clip(height - z, -MAX_STEP_M, MAX_STEP_M)

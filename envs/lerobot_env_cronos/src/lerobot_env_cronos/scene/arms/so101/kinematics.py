@@ -74,6 +74,8 @@ _UPPER, _FORE = (float(np.hypot(*segment)) for segment in _SEGMENTS)
 _UPPER_ANGLE, _FORE_ANGLE = (float(np.arctan2(z, r)) for r, z in _SEGMENTS)
 _WRIST_TO_HAND = float(np.linalg.norm(_POS[4][:2]))
 """From the wrist's axis to the origin of the hand's frame, along the fingers [m]."""
+_ASIDE = float(_frames(np.zeros((1, NUM_JOINTS)))[0][4][0, 1])
+"""Of that origin from the plane through the pan axis in which the arm bends [m]."""
 
 
 def inverse_kinematics(p: np.ndarray, yaw: np.ndarray, tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -90,8 +92,8 @@ def inverse_kinematics(p: np.ndarray, yaw: np.ndarray, tilt: np.ndarray) -> tupl
     azimuth = np.arctan2(p[:, 1], p[:, 0])
     # The end effector is 8 mm off the plane in which the arm bends: three rounds are exact to a hundredth of that.
     for _ in range(3):
-        hand = p - _hand_rotation(azimuth, yaw - azimuth, tilt) @ EE_OFFSET
-        azimuth = np.arctan2(hand[:, 1], hand[:, 0])
+        hand = p - hand_rotation(azimuth, yaw - azimuth, tilt) @ EE_OFFSET
+        azimuth = np.arctan2(hand[:, 1], hand[:, 0]) - np.arcsin(_ASIDE / np.hypot(hand[:, 0], hand[:, 1]))
     r = np.hypot(hand[:, 0], hand[:, 1]) - _WRIST_TO_HAND * np.sin(tilt) - _SHOULDER[0]
     z = hand[:, 2] + _WRIST_TO_HAND * np.cos(tilt) - _SHOULDER[1]
     distance, angle = np.maximum(np.hypot(r, z), 1e-6), np.arctan2(z, r)
@@ -106,7 +108,7 @@ def inverse_kinematics(p: np.ndarray, yaw: np.ndarray, tilt: np.ndarray) -> tupl
     return within, (within == q).all(1) & (np.abs(upper) <= 1) & (np.abs(fore) <= 1)
 
 
-def _hand_rotation(azimuth: np.ndarray, roll: np.ndarray, tilt: np.ndarray) -> np.ndarray:
+def hand_rotation(azimuth: np.ndarray, roll: np.ndarray, tilt: np.ndarray) -> np.ndarray:
     """Rotation (n, 3, 3) of a hand in the arm's plane at `azimuth`, tilted outwards and then rolled."""
     ca, sa, ct, st = np.cos(azimuth), np.sin(azimuth), np.cos(tilt), np.sin(tilt)
     # At no roll: closing outwards along the plane, fingers down along -z.
