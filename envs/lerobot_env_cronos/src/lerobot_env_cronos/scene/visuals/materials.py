@@ -21,31 +21,46 @@ COLOURS: dict[str, tuple[tuple[float, float, float], float, float]] = {
     "bead": ((0.06, 0.05, 0.05), 0.5, 0.6),
     "clear plastic": ((0.50, 0.82, 0.95), 0.7, 0.7),
     "bottle label": ((0.07, 0.25, 0.72), 0.2, 0.3),
-    "white print": ((0.93, 0.93, 0.91), 0.2, 0.3),
-    "servo": ((0.09, 0.09, 0.10), 0.4, 0.4),
-    "servo horn": ((0.20, 0.20, 0.22), 0.4, 0.4),
-    "cardboard": ((0.70, 0.53, 0.35), 0.05, 0.1),
-    "cardboard edge": ((0.56, 0.41, 0.26), 0.05, 0.1),
-    "masking tape": ((0.90, 0.78, 0.50), 0.1, 0.2),
     "oak": ((0.74, 0.67, 0.58), 0.1, 0.3),
     "light oak": ((0.77, 0.70, 0.605), 0.1, 0.3),
     "dark oak": ((0.71, 0.64, 0.55), 0.1, 0.3),
     "table edge": ((0.50, 0.43, 0.36), 0.1, 0.2),
     "wall": ((0.88, 0.90, 0.91), 0.0, 0.0),
 }
+"""Of every scene, used or not: the models of the first scenes stay what they were."""
+MORE_COLOURS: dict[str, tuple[tuple[float, float, float], float, float]] = {
+    "white print": ((0.93, 0.93, 0.91), 0.2, 0.3),
+    "servo": ((0.09, 0.09, 0.10), 0.4, 0.4),
+    "servo horn": ((0.20, 0.20, 0.22), 0.4, 0.4),
+    "cardboard": ((0.70, 0.53, 0.35), 0.05, 0.1),
+    "cardboard edge": ((0.56, 0.41, 0.26), 0.05, 0.1),
+    "masking tape": ((0.90, 0.78, 0.50), 0.1, 0.2),
+}
+"""Added where they are used."""
 
 
 def add_materials(spec: mujoco.MjSpec) -> None:
-    """Add every material and texture that the visuals name."""
-    for name, (rgb, specular, shininess) in COLOURS.items():
-        spec.add_material(name=name, rgba=[*rgb, 1.0], specular=specular, shininess=shininess)
-    for name, image in {
-        "cloth": _gingham(64),
-        "carpet": _rug(64),
-        "newspaper": _front_page(64),
-        "mat": _cutting_mat(64),
-    }.items():
+    """Add the materials and textures of `COLOURS`; `use_material` adds the others."""
+    for name, look in COLOURS.items():
+        _add_colour(spec, name, *look)
+    for name, image in {"cloth": _gingham(64), "carpet": _rug(64), "newspaper": _front_page(64)}.items():
         _add_textured(spec, name, image)
+
+
+def use_material(spec: mujoco.MjSpec, name: str) -> None:
+    """Add a material of `MORE_COLOURS`, or the texture of a mat, unless it is there."""
+    if spec.material(name) is not None:
+        return
+    if name == "mat":
+        _add_textured(spec, name, _cutting_mat(64))
+    else:
+        _add_colour(spec, name, *MORE_COLOURS[name])
+
+
+def _add_colour(
+    spec: mujoco.MjSpec, name: str, rgb: tuple[float, float, float], specular: float, shininess: float
+) -> None:
+    spec.add_material(name=name, rgba=[*rgb, 1.0], specular=specular, shininess=shininess)
 
 
 def add_plain_material(spec: mujoco.MjSpec, name: str, colour: tuple[float, float, float]) -> None:
