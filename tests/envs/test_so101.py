@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from env_rollouts import HOME, keep_still, make, run_expert
 from lerobot.envs import make_env_config
-from lerobot_env_cronos import ScriptedExpert, Task, gymnasium_id
+from lerobot_env_cronos import Scene, ScriptedExpert, Task, gymnasium_id, register_scene
 from lerobot_env_cronos.expert.hands import point_down
 from lerobot_env_cronos.scene.arms.so101 import kinematics
 from lerobot_env_cronos.scene.arms.so101.arm import SO101_ARM, from_joints, to_joints
@@ -264,3 +264,13 @@ def test_a_moving_camera_has_no_projection():
     details = env.observation_details
     assert "observation.images.wrist" not in details
     assert np.shape(details["observation.images.front"]["projection"]) == (3, 4)
+
+
+def test_a_scene_of_your_own_declares_the_arm(monkeypatch):
+    monkeypatch.setattr("lerobot_env_cronos.benchmark.registry.SCENES", {})
+    with pytest.raises(ValueError, match="unknown arm 'so100'"):
+        Scene("shelf", ("cube",), ("mat",), arm="so100")
+    with pytest.raises(ValueError, match="spawn_low"):
+        register_scene(Scene("shelf", ("cube",), ("mat",), arm="so101"))
+    with pytest.raises(ValueError, match="the gripper takes less than 45 mm"):
+        register_scene(Scene("shelf", ("mat",), ("plate",), (0.1, -0.2), (0.25, 0.2), arm="so101"))

@@ -99,8 +99,8 @@ def _check_spawn_area(scene: Scene, bodies: dict[str, Body]) -> None:
         if not is_spawn_area_in_view(scene, bodies[name]):
             raise ValueError(
                 f"spawn area of {scene.name}: in a corner of {scene.spawn_low} to {scene.spawn_high} the front "
-                f"camera does not see the middle of the {name}, which counts as lost; x 0.17 to 0.42 and y -0.15 "
-                "to 0.15 m are in view with room for large bodies"
+                f"camera does not see the middle of the {name}, which counts as lost; "
+                f"{arm.roomy_spawn} m are in view with room for large bodies"
             )
 
 

@@ -65,6 +65,9 @@ class Task:
 class Scene:
     """Objects and receptacles that share one table, and the name of the arm that stands at it.
 
+    `arm` is `widowx` or `so101`, a key of `scene.arms.registry.ARMS`. Nothing is put where it does not serve the
+    spawn area.
+
     The reference scatters ONE object and ONE receptacle over a square of 0.15 m. A shared scene holds all of
     them without overlap, so `spawn_low` and `spawn_high` widen it to 0.20 x 0.30 m, all within reach [m]; six
     bodies need 0.25 x 0.30 m.

@@ -139,6 +139,8 @@ class Arm(ABC):
     """(3,) corners of a box around the workspace, the end effector's [m]."""
     workspace: str
     """The same in words, seen from above, for messages."""
+    roomy_spawn: str
+    """A spawn area in which large bodies are seen, for messages."""
 
     @property
     def num_robot_joints(self) -> int:

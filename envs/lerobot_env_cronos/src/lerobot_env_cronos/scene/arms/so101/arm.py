@@ -74,6 +74,8 @@ class SO101(Arm):
         f"{REACH_NEAR_M} to {REACH_FAR_M} from the pan axis, up to {np.rad2deg(REACH_AZIMUTH):.0f} degrees aside"
     )
 
+    roomy_spawn = "x 0.02 to 0.28 and y -0.28 to 0.28"
+
     def is_within(self, xy: np.ndarray) -> np.ndarray:
         """See `Arm`."""
         return _is_in_sector(xy, REACH_NEAR_M, REACH_FAR_M, REACH_AZIMUTH)

@@ -75,6 +75,8 @@ class WidowX(Arm):
     low, high = EE_LOW, EE_HIGH
     workspace = f"x {EE_LOW[0]} to {EE_HIGH[0]}, y {EE_LOW[1]} to {EE_HIGH[1]}"
 
+    roomy_spawn = "x 0.17 to 0.42 and y -0.15 to 0.15"
+
     def is_within(self, xy: np.ndarray) -> np.ndarray:
         """See `Arm`: in the box that the end effector's target is clamped to."""
         return np.asarray(((xy >= EE_LOW[:2]) & (xy <= EE_HIGH[:2])).all(-1))
