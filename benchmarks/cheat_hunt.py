@@ -37,6 +37,8 @@ KINDS = ("push", "press", "drop")
 """How a trial begins: the hand beside the object, or above it; the object let fall at the receptacle's rim."""
 LEG_S, RETREAT_S = 1.6, 1.2
 """Two straight legs of the hand, and a retreat [s]."""
+ALONE_S = 0.6
+"""Time that what was paid has to stay once the hand is gone [s]: light things tremble when they are woken."""
 POPULATION, ELITE_SHARE = 128, 1 / 8
 """Trials of a generation, and the share of them that the next one is drawn from."""
 MIN_SPREAD = 0.08
@@ -147,6 +149,8 @@ def run_trials(sim: WatchedSimulation, task: Task, kind: str, x: np.ndarray) -> 
         # The same once more, up to the payment; then the hand is gone, and the object is left alone.
         _run(sim, task, kind, x, np.where(trials.first_paid < sim.trial_steps, trials.first_paid + 1, 0))
         sim.send_arm_home(paid)
+        for _ in range(round(ALONE_S * sim.scene.fps)):
+            sim.step(np.tile(sim.hands.still, (len(paid), 1)), paid)
         trials.unsteady[paid] = ~sim.is_on(task.object, task.receptacle)[paid]
     return trials
 
@@ -263,6 +267,8 @@ class WidowXHands:
     centre, aside = np.array([0.31, 0.0]), -0.12
     """Where a pair is, and the x of what is far away [m]."""
     tip_reach = FINGERTIP_REACH
+    still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    """The action that does nothing."""
 
     def move(self, sim: Simulation, position: np.ndarray, yaw: np.ndarray, opened: np.ndarray) -> None:
         """Teleport the hands to `position` (n, 3), turned by `yaw` (n,), their fingers `opened` (n,) or closed."""
@@ -293,6 +299,7 @@ class SO101Hands:
 
     centre, aside = np.array([0.20, 0.0]), 0.50
     tip_reach = so101.FINGERTIP_REACH
+    still = from_joints(SO101_ARM.home_qpos[None])[0]
     step_rad, opening = 0.04, 55.0
 
     def move(self, sim: Simulation, position: np.ndarray, yaw: np.ndarray, opened: np.ndarray) -> None:

@@ -113,7 +113,6 @@ class Simulation:
         diverged = broken[ids] | self._is_diverged(ids)
         if diverged.any():
             self._restore(ids[diverged], before[diverged])
-            self.judge.forget(ids[diverged])
         due = self.judge.is_due(ids)
         self._read(ids[due])
         self._read_grasps(ids[~due])
@@ -153,6 +152,7 @@ class Simulation:
     def _restore(self, ids: np.ndarray, qpos: np.ndarray) -> None:
         """Put the simulations into `qpos` at rest, everything awake, targets where the arm is."""
         self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.judge.forget(ids)
         self.qpos[ids] = qpos
         self.qvel[ids] = 0.0
         self.arm_target[ids] = qpos[:, : self._joints]
