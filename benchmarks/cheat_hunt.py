@@ -20,29 +20,30 @@ from pathlib import Path
 import numpy as np
 from lerobot_env_cronos import CronosVectorEnv, Task, get_scene
 from lerobot_env_cronos.expert.body_boxes import SceneBoxes, WorldBoxes
+from lerobot_env_cronos.expert.hands import point_down
+from lerobot_env_cronos.scene.arms.so101 import geometry as so101
+from lerobot_env_cronos.scene.arms.so101.arm import SO101_ARM, from_joints, to_joints
+from lerobot_env_cronos.scene.arms.so101.kinematics import gravity_torque
+from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
+from lerobot_env_cronos.scene.arms.widowx.geometry import FINGER_CLOSED, FINGER_OPEN, FINGERTIP_REACH, HOME_QPOS
+from lerobot_env_cronos.scene.arms.widowx.kinematics import forward_kinematics, inverse_kinematics
 from lerobot_env_cronos.scene.model import TABLE, hand_sensor, support_sensor
-from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, FINGER_CLOSED, FINGER_OPEN, FINGERTIP_REACH, HOME_QPOS
+from lerobot_env_cronos.scene.rotations import matrix_to_rotation_vector, quaternion_to_matrix
 from lerobot_env_cronos.scene.scenes import BODIES, Scene
-from lerobot_env_cronos.simulation.kinematics import (
-    forward_kinematics,
-    inverse_kinematics,
-    matrix_to_rotation_vector,
-    quaternion_to_matrix,
-)
-from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW, NUM_ARM_JOINTS, Simulation
+from lerobot_env_cronos.simulation.simulation import Simulation
 from PIL import Image
 
 KINDS = ("push", "press", "drop")
 """How a trial begins: the hand beside the object, or above it; the object let fall at the receptacle's rim."""
-LEG_STEPS, RETREAT_STEPS = 8, 6
-NUM_STEPS = 2 * LEG_STEPS + RETREAT_STEPS
-"""Two straight legs of the hand, and a retreat [control steps]."""
+LEG_S, RETREAT_S = 1.6, 1.2
+"""Two straight legs of the hand, and a retreat [s]."""
+ALONE_S = 0.6
+"""Time that what was paid has to stay once the hand is gone [s]: light things tremble when they are woken."""
 POPULATION, ELITE_SHARE = 128, 1 / 8
 """Trials of a generation, and the share of them that the next one is drawn from."""
 MIN_SPREAD = 0.08
 """Standard deviation that the search keeps in every number of a trial."""
 NUM_PARAMETERS = 22
-CENTRE = np.array([0.31, 0.0])
 CLEAR, POINT_SPACING = 0.001, 0.01
 """Gap that separates an object from what does not carry it, and between points of its surface [m]."""
 QUARTER_TURN = np.sqrt(0.5)
@@ -55,6 +56,7 @@ class Trials:
 
     n: int
     nq: int
+    num_steps: int
     paid: np.ndarray = field(init=False)
     """bool: judged a success before the object was ever carried."""
     grasped: np.ndarray = field(init=False)
@@ -64,7 +66,7 @@ class Trials:
     unsteady: np.ndarray = field(init=False)
     """bool: judged a success, but without the hand the object did not stay."""
     first_paid: np.ndarray = field(init=False)
-    """Control step of the first success, carried or not; NUM_STEPS if there was none."""
+    """Control step of the first success, carried or not; `num_steps` if there was none."""
     score: np.ndarray = field(init=False)
     """2 if it was paid without carrying, plus how close it came to that."""
     positions: np.ndarray = field(init=False)
@@ -72,7 +74,7 @@ class Trials:
 
     def __post_init__(self) -> None:
         self.paid, self.grasped, self.lay, self.unsteady = np.zeros((4, self.n), dtype=bool)
-        self.first_paid, self.score = np.full(self.n, NUM_STEPS), np.full(self.n, -np.inf)
+        self.first_paid, self.score = np.full(self.n, self.num_steps), np.full(self.n, -np.inf)
         self.positions = np.zeros((self.n, self.nq))
 
 
@@ -84,6 +86,9 @@ class WatchedSimulation(Simulation):
 
     def __init__(self, scene: Scene, num_sims: int):
         super().__init__(scene, num_sims)
+        self.hands = HANDS[scene.arm]
+        self.leg_steps = round(LEG_S * scene.fps)
+        self.trial_steps = 2 * self.leg_steps + round(RETREAT_S * scene.fps)
         self._boxes = SceneBoxes.from_model(self.model, scene)
         self._points = {o: self._boxes.surface(i, POINT_SPACING) for i, o in enumerate(scene.objects)}
         self._receptacle_boxes = np.flatnonzero(self._boxes.body >= len(scene.objects))
@@ -138,12 +143,14 @@ class Search:
 
 def run_trials(sim: WatchedSimulation, task: Task, kind: str, x: np.ndarray) -> Trials:
     """Run the trials `x` (n, NUM_PARAMETERS) of one of `KINDS` for a task, one in each simulation."""
-    trials = _run(sim, task, kind, x, np.full(len(x), NUM_STEPS))
-    paid = np.flatnonzero(trials.first_paid < NUM_STEPS)
+    trials = _run(sim, task, kind, x, np.full(len(x), sim.trial_steps))
+    paid = np.flatnonzero(trials.first_paid < sim.trial_steps)
     if len(paid):
         # The same once more, up to the payment; then the hand is gone, and the object is left alone.
-        _run(sim, task, kind, x, np.where(trials.first_paid < NUM_STEPS, trials.first_paid + 1, 0))
+        _run(sim, task, kind, x, np.where(trials.first_paid < sim.trial_steps, trials.first_paid + 1, 0))
         sim.send_arm_home(paid)
+        for _ in range(round(ALONE_S * sim.scene.fps)):
+            sim.step(np.tile(sim.hands.still, (len(paid), 1)), paid)
         trials.unsteady[paid] = ~sim.is_on(task.object, task.receptacle)[paid]
     return trials
 
@@ -151,11 +158,11 @@ def run_trials(sim: WatchedSimulation, task: Task, kind: str, x: np.ndarray) -> 
 def _run(sim: WatchedSimulation, task: Task, kind: str, x: np.ndarray, num_steps: np.ndarray) -> Trials:
     """Run every trial for `num_steps` (n,) control steps."""
     legs, grippers = _begin(sim, task, kind, x)
-    trials = Trials(len(x), sim.model.nq)
+    trials = Trials(len(x), sim.model.nq, sim.trial_steps)
     for step in range(int(num_steps.max())):
         ids = np.flatnonzero(num_steps > step)
-        leg = min(step // LEG_STEPS, 2)
-        sim.step(_hand_action(sim, legs[leg], grippers[leg])[ids], ids)
+        leg = min(step // sim.leg_steps, 2)
+        sim.step(sim.hands.act(sim, legs[leg], grippers[leg])[ids], ids)
         _count(sim, task, kind, trials, step)
     return trials
 
@@ -167,7 +174,7 @@ def _count(sim: WatchedSimulation, task: Task, kind: str, trials: Trials, step: 
     trials.paid |= paid & alone
     trials.grasped |= sim.is_grasped(task.object) & alone
     trials.lay |= alone & (sim.judge.confirmed[:, i] == place)
-    trials.first_paid[paid & (trials.first_paid == NUM_STEPS)] = step
+    trials.first_paid[paid & (trials.first_paid == sim.trial_steps)] = step
     weight = sim.model.body(task.object).mass[0] * GRAVITY
     borne = sim.force(support_sensor(task.object, task.receptacle))[:, 2] / weight
     table = np.linalg.norm(sim.force(support_sensor(task.object, TABLE)), axis=1) / weight
@@ -183,7 +190,7 @@ def _begin(sim: WatchedSimulation, task: Task, kind: str, x: np.ndarray) -> tupl
     sim.watched = task.object
     angle = 2 * np.pi * x[:, 0]
     away = np.stack([np.cos(angle), np.sin(angle)], 1)
-    obj = _place(sim, task, kind, x, CENTRE - 0.07 * away, away)
+    obj = _place(sim, task, kind, x, sim.hands.centre - 0.07 * away, away)
     # The hand's frame: towards the receptacle, across, up; from the object's middle.
     across = np.stack([away[:, 1], -away[:, 0]], 1)
     half = np.array(BODIES[task.object].size) / 2
@@ -191,8 +198,9 @@ def _begin(sim: WatchedSimulation, task: Task, kind: str, x: np.ndarray) -> tupl
 
     def point(along: np.ndarray, aside: np.ndarray, z: np.ndarray) -> np.ndarray:
         xy = obj - away * along[:, None] + across * aside[:, None]
-        tips = np.stack([xy[:, 0], xy[:, 1], z + FINGERTIP_REACH], 1)
-        return np.clip(tips, EE_LOW + np.array([0.02, 0.02, 0.002]), EE_HIGH - np.array([0.02, 0.02, 0.0]))
+        tips = np.stack([xy[:, 0], xy[:, 1], z + sim.hands.tip_reach], 1)
+        low, high = sim.arm.low + np.array([0.02, 0.02, 0.002]), sim.arm.high - np.array([0.02, 0.02, 0.0])
+        return np.clip(tips, low, high)
 
     beside = -(half[:2].min() + 0.03 + 0.05 * x[:, 6])
     start = {
@@ -205,7 +213,7 @@ def _begin(sim: WatchedSimulation, task: Task, kind: str, x: np.ndarray) -> tupl
     leave = second + np.stack([(0.16 * x[:, 15] - 0.08), (0.16 * x[:, 16] - 0.08), 0.02 + 0.08 * x[:, 17]], 1)
     yaw = angle + np.pi * x[:, 18]
     turned, opened = yaw + (2 * x[:, 19] - 1) * 0.8, x[:, 20] > 0.5
-    _move_hand(sim, start[kind], yaw, opened)
+    sim.hands.move(sim, start[kind], yaw, opened)
     sim.was_carried[:] = False
     targets = [np.column_stack([p, w]) for p, w in ((first, yaw), (second, turned), (leave, turned))]
     return targets, [opened, np.where(x[:, 21] < 0.2, ~opened, opened), np.ones(len(x), dtype=bool)]
@@ -219,7 +227,7 @@ def _place(
     poses = np.zeros((n, len(bodies), 7))
     poses[..., 3] = 1.0
     for i, name in enumerate(bodies):
-        poses[:, i, :3] = [-0.12, 0.16 * i - 0.40, BODIES[name].size[2] / 2]
+        poses[:, i, :3] = [sim.hands.aside, 0.16 * i - 0.40, BODIES[name].size[2] / 2]
     size, base = np.array(BODIES[task.object].size), np.array(BODIES[task.receptacle].size)
     o, r = bodies.index(task.object), bodies.index(task.receptacle)
     poses[:, r, :2] = receptacle
@@ -250,30 +258,74 @@ def _half_extent(direction: np.ndarray, yaw: np.ndarray, width: np.ndarray, leng
     return (along * width + across * length) / 2
 
 
-def _orientation(yaw: np.ndarray) -> np.ndarray:
-    """A hand that points down, its fingers closing along `yaw` (n,), either one first: (n, 3, 3)."""
-    yaw, zero = np.mod(yaw, np.pi), np.zeros_like(yaw)
-    down, closing = np.stack([zero, zero, zero - 1], 1), np.stack([np.cos(yaw), np.sin(yaw), zero], 1)
-    return np.stack([down, closing, np.cross(down, closing)], 2)
+# Hands ---------------------------------------------------------------------------------------------------
 
 
-def _move_hand(sim: Simulation, position: np.ndarray, yaw: np.ndarray, opened: np.ndarray) -> None:
-    """Teleport the hands to `position` (n, 3), turned by `yaw` (n,), their fingers `opened` (n,) or closed."""
-    q = np.tile(HOME_QPOS, (len(yaw), 1))
-    start, _, _ = forward_kinematics(q)
-    for way in np.linspace(0.1, 1.0, 10):
-        q = inverse_kinematics(q, start + way * (position - start), _orientation(yaw))
-    sim.gripper_target[:] = np.where(opened, FINGER_OPEN, FINGER_CLOSED)
-    sim.qpos[:, NUM_ARM_JOINTS], sim.qpos[:, NUM_ARM_JOINTS + 1] = sim.gripper_target, -sim.gripper_target
-    sim.move_arm(np.arange(len(yaw)), q)
+class WidowXHands:
+    """How a trial moves the WidowX: by bounded steps towards a pose."""
+
+    centre, aside = np.array([0.31, 0.0]), -0.12
+    """Where a pair is, and the x of what is far away [m]."""
+    tip_reach = FINGERTIP_REACH
+    still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    """The action that does nothing."""
+
+    def move(self, sim: Simulation, position: np.ndarray, yaw: np.ndarray, opened: np.ndarray) -> None:
+        """Teleport the hands to `position` (n, 3), turned by `yaw` (n,), their fingers `opened` (n,) or closed."""
+        q = np.tile(HOME_QPOS, (len(yaw), 1))
+        start, _, _ = forward_kinematics(q)
+        for way in np.linspace(0.1, 1.0, 10):
+            q = inverse_kinematics(q, start + way * (position - start), self._orientation(yaw))
+        sim.gripper_target[:] = np.where(opened, FINGER_OPEN, FINGER_CLOSED)
+        sim.qpos[:, 6], sim.qpos[:, 7] = sim.gripper_target, -sim.gripper_target
+        sim.move_arm(np.arange(len(yaw)), q)
+
+    def act(self, sim: Simulation, target: np.ndarray, opened: np.ndarray) -> np.ndarray:
+        """One control step (n, 7) towards `target` (n, 4), place and turn, with `opened` fingers (n,)."""
+        p, R, _ = forward_kinematics(sim.arm_target)
+        turn = matrix_to_rotation_vector(self._orientation(target[:, 3]) @ R.transpose(0, 2, 1))
+        action = np.concatenate([target[:, :3] - p, np.clip(turn, -0.08, 0.08), opened[:, None]], 1)
+        return np.clip(action, WIDOWX.action_low, WIDOWX.action_high)
+
+    def _orientation(self, yaw: np.ndarray) -> np.ndarray:
+        """A hand that points down, its fingers closing along `yaw` (n,), either one first: (n, 3, 3)."""
+        yaw, zero = np.mod(yaw, np.pi), np.zeros_like(yaw)
+        down, closing = np.stack([zero, zero, zero - 1], 1), np.stack([np.cos(yaw), np.sin(yaw), zero], 1)
+        return np.stack([down, closing, np.cross(down, closing)], 2)
 
 
-def _hand_action(sim: Simulation, target: np.ndarray, opened: np.ndarray) -> np.ndarray:
-    """One control step (n, 7) of the hands towards `target` (n, 4), place and turn, with `opened` fingers (n,)."""
-    p, R, _ = forward_kinematics(sim.arm_target)
-    turn = matrix_to_rotation_vector(_orientation(target[:, 3]) @ R.transpose(0, 2, 1))
-    action = np.concatenate([target[:, :3] - p, np.clip(turn, -0.08, 0.08), opened[:, None]], 1)
-    return np.clip(action, ACTION_LOW, ACTION_HIGH)
+class SO101Hands:
+    """How a trial moves the SO-101: every other one at once, as fast as it goes, the others in small steps."""
+
+    centre, aside = np.array([0.20, 0.0]), 0.50
+    tip_reach = so101.FINGERTIP_REACH
+    still = from_joints(SO101_ARM.home_qpos[None])[0]
+    step_rad, opening = 0.04, 55.0
+
+    def move(self, sim: Simulation, position: np.ndarray, yaw: np.ndarray, opened: np.ndarray) -> None:
+        """See `WidowXHands`."""
+        gripper = to_joints(np.where(opened, self.opening, 0.0)[:, None].repeat(6, 1))[:, 5]
+        sim.gripper_target[:], sim.qpos[:, 5] = gripper, gripper
+        sim.move_arm(np.arange(len(yaw)), self._joints(position, yaw))
+
+    def act(self, sim: Simulation, target: np.ndarray, opened: np.ndarray) -> np.ndarray:
+        """One control step (n, 6); see `WidowXHands`."""
+        goal = self._joints(target[:, :3], target[:, 3])
+        goal = goal + gravity_torque(goal) / so101.SERVO_KP
+        slow = sim.arm_target + np.clip(goal - sim.arm_target, -self.step_rad, self.step_rad)
+        goal[::2] = slow[::2]
+        action = from_joints(np.concatenate([goal, np.zeros((len(goal), 1))], 1))
+        action[:, 5] = np.where(opened, self.opening, 0.0)
+        return np.clip(action, SO101_ARM.action_low, SO101_ARM.action_high)
+
+    def _joints(self, position: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+        # Either jaw first, the wrist far from its limits.
+        azimuth = np.arctan2(position[:, 1], position[:, 0])
+        roll = np.mod(yaw - azimuth + np.pi / 2, np.pi) - np.pi / 2
+        return point_down(position, azimuth + roll)[0]
+
+
+HANDS = {WIDOWX.name: WidowXHands(), SO101_ARM.name: SO101Hands()}
 
 
 # The hunt ------------------------------------------------------------------------------------------------

@@ -226,5 +226,6 @@ def task_observation_of(features: Features, env: CronosEnvConfig) -> str:
 
 def _size(name: str, scene: str, env: CronosEnvConfig, task_observation: str) -> int:
     """Of a vector in another scene."""
-    other = replace(env, scene=scene, benchmark=None, task=None, task_observation=task_observation)
+    others = {"fps": 0, "camera_name": "front", "benchmark": None, "task": None}
+    other = replace(env, scene=scene, task_observation=task_observation, **others)
     return next(other.features[key].shape[0] for key, feature in other.features_map.items() if feature == name)

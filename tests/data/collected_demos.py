@@ -4,7 +4,7 @@ import numpy as np
 from lerobot.datasets import LeRobotDataset
 from lerobot_env_cronos.config import CronosEnvConfig
 from lerobot_env_cronos.expert.expert import ScriptedExpert
-from lerobot_env_cronos.scene.robot import HOME_QPOS
+from lerobot_env_cronos.scene.arms.widowx.geometry import HOME_QPOS
 
 from cronos_lerobot.data.demos import DemoCollector, DemoConfig
 from cronos_lerobot.data.schema import demonstration_features

@@ -3,10 +3,10 @@
 import mujoco
 import numpy as np
 import pytest
-from env_rollouts import make
-from lerobot_env_cronos import SCENES, get_scene
+from env_rollouts import WIDOWX_SCENES, make
+from lerobot_env_cronos import get_scene
+from lerobot_env_cronos.scene.arms.widowx.geometry import EE_SITE, HOME_QPOS
 from lerobot_env_cronos.scene.model import build_model
-from lerobot_env_cronos.scene.robot import EE_SITE, HOME_QPOS
 from lerobot_env_cronos.scene.scenes import BODIES
 from lerobot_env_cronos.simulation.kinematics import (
     forward_kinematics,
@@ -70,7 +70,7 @@ def test_tasks_sizes_and_masses_are_the_papers():
         "put the kitchen shovel on the cloth",
     ]
     masses = {}
-    for scene in SCENES:
+    for scene in WIDOWX_SCENES:
         model = build_model(get_scene(scene), looks=False)
         masses |= {body: model.body(body).mass[0] for body in get_scene(scene).bodies}
     # Volumes by hand, times the published densities.

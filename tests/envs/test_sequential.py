@@ -154,7 +154,7 @@ def test_lerobot_builds_ten_orderings_of_every_scene(scene):
     env, ordering = envs[7], load_orderings(scene)[7]
     env.reset(seed=[0, 1], options={"lerobot_new_rollout": True})
     assert env.call("task_description") == (ordering[0].instruction,) * 2
-    assert env.call("_max_episode_steps") == (80 * len(ordering),) * 2
+    assert env.call("_max_episode_steps") == (get_scene(scene).steps_per_task * len(ordering),) * 2
     assert (env.ordering, env.advance) == (ordering, "on_success")
     assert list(CronosEnvConfig(scene=scene, suite="sequential", task="7").create_envs(1)["sequential_train"]) == [
         7

@@ -3,7 +3,7 @@
 import numpy as np
 from env_rollouts import make
 from lerobot_env_cronos import SequentialVectorEnv, Task, get_scene
-from lerobot_env_cronos.simulation.observations import AGENT_POS_NAMES
+from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
 
 SCENE = get_scene("kitchen_2x2")
 TOLD = {"obs_type": "environment_state_agent_pos", "task_observation": "one_hot"}
@@ -20,7 +20,7 @@ def test_two_tasks_in_one_state_differ_there_and_nowhere_else():
     env.set_task(range(3), [SCENE.tasks[0], SCENE.tasks[3], Task("kitchen shovel", None)])
     observation = env.observe()
     state = observation["agent_pos"]
-    assert tuple(env.state_names) == AGENT_POS_NAMES + NAMES
+    assert tuple(env.state_names) == WIDOWX.state_names + NAMES
     np.testing.assert_array_equal(untold.observe()["agent_pos"], state[:, :13])
     np.testing.assert_array_equal(untold.observe()["environment_state"], observation["environment_state"])
     # Bottle on the plate; shovel on the cloth; shovel on the table.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from env_rollouts import STILL, keep_still, make
 from lerobot_env_cronos import ACTION_HIGH, ACTION_LOW, CronosVectorEnv, Task
-from lerobot_env_cronos.scene.robot import HOME_QPOS
+from lerobot_env_cronos.scene.arms.widowx.geometry import HOME_QPOS
 from lerobot_env_cronos.simulation import rendering
 
 BOTTLE, PLATE = "ketchup bottle", "yellow plate"

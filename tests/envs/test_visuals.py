@@ -46,7 +46,7 @@ def visual_vertices(model: mujoco.MjModel, body: str) -> np.ndarray:
 @pytest.mark.parametrize("scene", SCENES)
 def test_changes_no_dynamics(models, scene, monkeypatch):
     dressed = models[scene]
-    monkeypatch.setattr(model_module.visuals, "dress", lambda spec, bodies: None)
+    monkeypatch.setattr(model_module.visuals, "dress", lambda *_: None)
     bare = build_model(SCENES[scene])
     for field in DYNAMIC_FIELDS:
         np.testing.assert_array_equal(getattr(dressed, field), getattr(bare, field), err_msg=field)

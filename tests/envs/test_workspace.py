@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.benchmark import configurations
-from lerobot_env_cronos.scene.cameras import is_in_view
+from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
 from lerobot_env_cronos.scene.scenes import BODIES
 from lerobot_env_cronos.simulation.workspace import Unsuitable, find_free_pose, find_unsuitable
 
@@ -50,7 +50,7 @@ def test_view_is_that_of_the_rendered_picture():
     env.reset(seed=0)
     y = np.linspace(0.1, 0.3, 201)
     line = np.stack([np.full_like(y, 0.30), y, np.full_like(y, 0.011)], axis=1)
-    edge = y[is_in_view(line)].max()
+    edge = y[WIDOWX.sees(line)].max()
 
     def picture(offset):
         pose = np.array([[0.30, edge + offset, 0.011, *UPRIGHT]])
@@ -68,7 +68,7 @@ def test_put_back_makes_the_scene_suitable_and_touches_nothing_else(env):
     before = env.simulation.body_poses().copy()
     ids = np.array([0])
     env.simulation.move_body(ids, "cloth", np.array([[0.8, 0.5, -0.74, *UPRIGHT]]))
-    env.put_back(0, "cloth", np.random.default_rng(0))
+    env.put_back(0, env.scene.bodies.index("cloth"), np.random.default_rng(0))
     assert not env.unsuitable_bodies().any()
     k = env.scene.bodies.index("cloth")
     after = env.simulation.body_poses()
@@ -87,7 +87,7 @@ def test_put_back_keeps_clear_of_a_low_hand(env):
     assert hand[2] < 0.12
     rng = np.random.default_rng(0)
     for _ in range(20):
-        env.put_back(0, "ketchup bottle", rng)
+        env.put_back(0, env.scene.bodies.index("ketchup bottle"), rng)
         pose = env.simulation.body_pose("ketchup bottle")[0]
         assert np.abs(pose[:2] - hand[:2]).max() > 0.06
 
@@ -106,4 +106,4 @@ def test_bodies_are_put_back_where_the_camera_sees_them(env, monkeypatch, has_ro
     assert ((poses[:, 2] < 0.1) == has_room).all()
     assert np.abs(poses[:, 1]).max() > 0.2
     poses[:, 2] = BODIES["ketchup bottle"].size[2] / 2
-    assert is_in_view(poses[:, :3]).all()
+    assert WIDOWX.sees(poses[:, :3]).all()

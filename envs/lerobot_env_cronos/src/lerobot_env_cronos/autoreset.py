@@ -18,7 +18,8 @@ from lerobot_env_cronos.vector_env import LEROBOT_OPTIONS, as_one_seed, check_op
 class CronosGymVectorEnv(IndependentVectorEnv):
     """`num_envs` episodes at a time, each the same as `CronosEnv`'s of its seed, reset by Gymnasium's rules.
 
-    An episode is `terminated` when its task is complete and `truncated` after `max_episode_steps`, by default 80.
+    An episode is `terminated` when its task is complete and `truncated` after `max_episode_steps`, by default the
+    steps of a task.
     `info["task"]` (n,) has the numbers of the tasks in the scene's `tasks`; `instructions` says what they mean.
 
     Args:

@@ -16,7 +16,7 @@ from lerobot_env_cronos.benchmark.configurations import SPLITS
 from lerobot_env_cronos.benchmark.files import check_tag, fetch_benchmark
 from lerobot_env_cronos.benchmark.load import benchmark_scene, load_benchmark
 from lerobot_env_cronos.episodic import EpisodicVectorEnv, IndependentVectorEnv, LazyVectorEnv
-from lerobot_env_cronos.scene.scenes import CONTROL_HZ, get_scene
+from lerobot_env_cronos.scene.scenes import get_scene
 from lerobot_env_cronos.sequential import ADVANCES, SequentialVectorEnv
 from lerobot_env_cronos.simulation.observations import (
     OBS_TYPES,
@@ -26,7 +26,6 @@ from lerobot_env_cronos.simulation.observations import (
     parse_cameras,
 )
 from lerobot_env_cronos.simulation.rendering import RENDERERS
-from lerobot_env_cronos.simulation.simulation import ACTION_NAMES
 from lerobot_env_cronos.vector_env import CronosVectorEnv
 
 DEFAULT_SCENE = "kitchen_2x2"
@@ -43,26 +42,26 @@ CHOICES = {
 @EnvConfig.register_subclass("cronos")
 @dataclass
 class CronosEnvConfig(EnvConfig):
-    """Shared-scene pick and place on the Bridge table (CRONOS, Section 4)."""
+    """Shared-scene pick and place (CRONOS, Section 4), by the arm that the scene has."""
 
     task: str | None = None
     """What to evaluate of the suite: an instruction (independent), or the number of an ordering, 0 to 9
     (sequential); null for all."""
-    fps: int = CONTROL_HZ
-    """Control frequency [Hz]; fixed by the protocol."""
+    fps: int = 0
+    """Control frequency [Hz]: the scene's, 5 or 30; 0 for that. No other is valid."""
     scene: str = ""
     """Scene: kitchen_2x2, kitchen_3x3, playroom_2x2, or a registered one; by default the benchmark's, or
     kitchen_2x2."""
     suite: str = "independent"
-    """Evaluation suite: independent (every task from every configuration, 80 steps), or sequential (chains of all
-    tasks without a reset in between, in ten orderings, 80 steps for each task)."""
+    """Evaluation suite: independent (every task from every configuration, within the steps of a task), or
+    sequential (chains of all tasks without a reset in between, in ten orderings)."""
     split: str = "train"
     """Configurations: train or held_out, 64 each."""
     benchmark: str | None = None
     """A benchmark of its author's own configurations and chains: <owner>/<repository>[@<revision>] of a dataset on
     the Hub, or a folder; null for this package's."""
     advance: str = "window"
-    """When a chain (--env.suite=sequential) continues to its next task: window (when the 80 steps are over) or
+    """When a chain (--env.suite=sequential) continues to its next task: window (when the task's steps are over) or
     on_success (at once)."""
     end_effector_reset: bool = False
     """Send the arm home between the tasks of a chain (--env.suite=sequential)."""
@@ -78,7 +77,8 @@ class CronosEnvConfig(EnvConfig):
     observation_width: int = 64
     """Width of the observed image [px]."""
     camera_name: str = "front"
-    """Camera(s), comma-separated: front (sees every body), bridge (the Bridge set-up's third-person view)."""
+    """Camera(s), comma-separated: front (sees every body); bridge (the Bridge set-up's third-person view) of the
+    WidowX, wrist (moves with the gripper) of the SO-101."""
     render_size: tuple[int, int] = (480, 640)
     """Height and width of videos [px]."""
     renderer: str = "classic"
@@ -103,9 +103,10 @@ class CronosEnvConfig(EnvConfig):
         for name, valid in CHOICES.items():
             if getattr(self, name) not in valid:
                 raise ValueError(f"unknown env.{name} {getattr(self, name)!r}; valid values: {list(valid)}")
-        cameras = parse_cameras(self.camera_name)
-        if self.fps != CONTROL_HZ:
-            raise ValueError(f"env.fps is fixed at {CONTROL_HZ} Hz by the protocol, got {self.fps}")
+        cameras = parse_cameras(scene, self.camera_name)
+        if self.fps not in (0, scene.fps):
+            raise ValueError(f"env.fps of {scene.name} is fixed at {scene.fps} Hz by the protocol, got {self.fps}")
+        self.fps = scene.fps
         if self.max_parallel_tasks != 1:
             raise ValueError(
                 f"env.max_parallel_tasks must be 1, got {self.max_parallel_tasks}: parallel threads would share "
@@ -113,7 +114,7 @@ class CronosEnvConfig(EnvConfig):
             )
         self._chosen()
         pixels = self.obs_type == "pixels_agent_pos"
-        self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),))}
+        self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (len(scene.robot.action_names),))}
         self.features["agent_pos"] = PolicyFeature(
             FeatureType.STATE, (len(agent_pos_names(scene, self.task_observation)),)
         )

@@ -1,16 +1,16 @@
-"""Episodes for evaluation: independent tasks, each from a benchmark configuration within 80 steps.
+"""Episodes for evaluation: independent tasks, each from a benchmark configuration within the steps of a task.
 
 These environments are what `lerobot-eval` and `gym.make` run; training streams use `CronosVectorEnv` itself.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 
 from lerobot_env_cronos.benchmark.configurations import check_split
-from lerobot_env_cronos.scene.scenes import STEPS_PER_TASK, Task, get_scene
+from lerobot_env_cronos.scene.scenes import Task, get_scene
 from lerobot_env_cronos.vector_env import LEROBOT_OPTIONS, CronosVectorEnv, as_one_seed, check_options
 
 
@@ -71,7 +71,7 @@ class IndependentVectorEnv(EpisodicVectorEnv):
 
     Args:
         task: the task of every episode.
-        max_episode_steps: None for no limit.
+        max_episode_steps: `task` for the steps that the scene gives a task, None for no limit.
         **kwargs: see `EpisodicVectorEnv`.
     """
 
@@ -81,9 +81,11 @@ class IndependentVectorEnv(EpisodicVectorEnv):
         scene: str = "kitchen_2x2",
         *,
         task: Task,
-        max_episode_steps: int | None = STEPS_PER_TASK,
+        max_episode_steps: int | Literal["task"] | None = "task",
         **kwargs,
     ):
+        if max_episode_steps == "task":
+            max_episode_steps = get_scene(scene).steps_per_task
         if max_episode_steps is not None and max_episode_steps < 1:
             raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps}")
         self.task = task
@@ -155,9 +157,9 @@ class CronosEnv(gym.Env):
 
     `reset(options={"configuration": i})` picks the i-th of `configurations`; otherwise the seeded generator draws.
     An episode is terminated when its task is complete. `gymnasium.make` truncates it after `max_episode_steps`, by
-    default 80; this class alone has no limit. What is terminated stays so until the next `reset`: further steps
-    change nothing, pay nothing, and return the same observation. `info["task"]` is the number of the task in the
-    scene's `tasks`; `task_description` is its instruction.
+    default the steps of a task; this class alone has no limit. What is terminated stays so until the next
+    `reset`: further steps change nothing, pay nothing, and return the same observation. `info["task"]` is the
+    number of the task in the scene's `tasks`; `task_description` is its instruction.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": CronosVectorEnv.metadata["render_fps"]}  # noqa: RUF012
@@ -171,9 +173,10 @@ class CronosEnv(gym.Env):
         render_mode: str | None = None,
         **kwargs,
     ):
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"unknown render_mode {render_mode!r}; valid: {self.metadata['render_modes']}")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"unknown render_mode {render_mode!r}; valid: None, 'rgb_array'")
         self.render_mode = render_mode
+        self.metadata = self.metadata | {"render_fps": get_scene(scene).fps}
         chosen = find_task(scene, task)
         self._tasks = get_scene(scene).tasks if chosen is None else (chosen,)
         self._env = IndependentVectorEnv(
@@ -201,7 +204,7 @@ class CronosEnv(gym.Env):
         return take_row(observation, 0), self._describe(info)
 
     def step(self, action: np.ndarray):
-        """Apply an action (7,) in physical units."""
+        """Apply an action (a,) in physical units."""
         if np.shape(action) != self.action_space.shape:
             raise ValueError(f"the action must have shape {self.action_space.shape}, got {np.shape(action)}")
         observation, reward, terminated, truncated, info = self._env.step(np.asarray(action)[None])

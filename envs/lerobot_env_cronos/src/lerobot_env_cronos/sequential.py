@@ -1,7 +1,7 @@
 """Chains of tasks without a reset in between: the sequential suite, after CALVIN (Mees et al. 2022).
 
 An episode is one chain: a scene reset to a benchmark configuration, then the tasks of an ordering, each with a
-window of 80 control steps. The first task that is not complete in its window fails, and so do all after it.
+window of control steps. The first task that is not complete in its window fails, and so do all after it.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from lerobot_env_cronos.episodic import EpisodicVectorEnv
-from lerobot_env_cronos.scene.scenes import STEPS_PER_TASK, Task
+from lerobot_env_cronos.scene.scenes import Task, get_scene
 from lerobot_env_cronos.vector_env import LEROBOT_OPTIONS, as_one_seed, check_options
 
 ADVANCES = ("window", "on_success")
@@ -27,10 +27,10 @@ class SequentialVectorEnv(EpisodicVectorEnv):
 
     Args:
         ordering: the tasks of every chain.
-        advance: `window` starts the next task when the 80 steps are over; `on_success` (CALVIN's) as soon as the
+        advance: `window` starts the next task when its window is over; `on_success` (CALVIN's) as soon as the
             task is complete.
         end_effector_reset: send the arm home, gripper open, between tasks.
-        window: control steps for each task.
+        window: control steps for each task; None for the scene's.
         **kwargs: see `EpisodicVectorEnv`.
 
     Attributes:
@@ -46,11 +46,12 @@ class SequentialVectorEnv(EpisodicVectorEnv):
         ordering: Sequence[Task],
         advance: str = "window",
         end_effector_reset: bool = False,
-        window: int = STEPS_PER_TASK,
+        window: int | None = None,
         **kwargs,
     ):
         if advance not in ADVANCES:
             raise ValueError(f"unknown advance {advance!r}; valid values: {list(ADVANCES)}")
+        window = get_scene(scene).steps_per_task if window is None else window
         if window < 1 or not ordering:
             raise ValueError(f"need a window of at least 1 step and a task, got {window} and {list(ordering)}")
         super().__init__(num_envs, scene, **kwargs)

@@ -14,18 +14,9 @@ import numpy as np
 from lerobot_env_cronos.benchmark.configurations import check_split
 from lerobot_env_cronos.benchmark.load import load_benchmark
 from lerobot_env_cronos.benchmark.version import gymnasium_id
-from lerobot_env_cronos.scene.cameras import camera_projection
 from lerobot_env_cronos.scene.scenes import BODIES, CONTROL_HZ, Task, get_scene
 from lerobot_env_cronos.simulation.observations import ObservationBuilder, environment_state_names
-from lerobot_env_cronos.simulation.simulation import (
-    ACTION_HIGH,
-    ACTION_HIGH_F32,
-    ACTION_LOW,
-    ACTION_LOW_F32,
-    ACTION_NAMES,
-    Simulation,
-    check_state,
-)
+from lerobot_env_cronos.simulation.simulation import Simulation, check_state
 from lerobot_env_cronos.simulation.workspace import find_free_pose, find_unsuitable
 
 GRASP_REWARD, SUCCESS_REWARD = 0.1, 1.0
@@ -53,7 +44,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         obs_type: `pixels_agent_pos` or `environment_state_agent_pos`.
         privileged_state: add `environment_state` to pixel observations (for an asymmetric critic).
         observation_height, observation_width: size of the rendered observation [px].
-        camera_name: camera(s) of the observation, comma-separated: `front`, `bridge`.
+        camera_name: camera(s) of the observation, comma-separated; `front`, and `bridge` or `wrist`, by the arm.
         reward: `level` pays 0.1 while the right object is grasped and 1.0 on success each step (paper, Section
             4); `difference` pays the change of that level between two steps (RL4VLA's code).
         num_threads: physics threads, and processes that draw in software; 0 for all cores; results do not depend
@@ -121,13 +112,17 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         )  # fmt: skip
         self.state_names = list(self._observations.agent_pos_names)
         self.single_observation_space = self._observations.space
-        self.single_action_space = gym.spaces.Box(ACTION_LOW_F32, ACTION_HIGH_F32, dtype=np.float32)
+        arm = self.scene.robot
+        # Rounded outwards: an action that was clipped to the bounds as float32 does exactly the same again.
+        self._bounds = _round_outwards(arm.action_low, -np.inf), _round_outwards(arm.action_high, np.inf)
+        self.single_action_space = gym.spaces.Box(*self._bounds, dtype=np.float32)
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
         self.fps = self.scene.fps
         self.robot_type = self.scene.robot_type
+        self.metadata = self.metadata | {"render_fps": self.fps}
         self.tasks, self.reset_tasks = self.scene.tasks, self.scene.reset_tasks
-        self.action_names = list(ACTION_NAMES)
+        self.action_names = list(arm.action_names)
         self.num_starts = self.benchmark.num_starts
         self.identity = EnvIdentity(gymnasium_id(scene), self.benchmark.fingerprint, self.benchmark.source)
         self.current_tasks: list[Task] = [self.scene.tasks[0]] * num_envs
@@ -150,8 +145,11 @@ class CronosVectorEnv(gym.vector.VectorEnv):
             }
         }
         for camera in self._observations.cameras:
-            projection = camera_projection(camera, *self._observations.size)
-            details[f"observation.images.{camera}"] = {"projection": projection.tolist()}
+            chosen = self.scene.robot.cameras[camera]
+            # That of a camera that moves is another one in every picture.
+            if chosen.body is None:
+                projection = chosen.projection(*self._observations.size)
+                details[f"observation.images.{camera}"] = {"projection": projection.tolist()}
         return details
 
     # Gymnasium --------------------------------------------------------------------------------------------
@@ -176,18 +174,18 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         return starts[seeds % len(starts)]
 
     def step(self, actions: np.ndarray):
-        """Apply actions (n, 7) in physical units; out-of-bounds values are clipped.
+        """Apply actions (n, a) in physical units; out-of-bounds values are clipped.
 
         Returns the observation under the task that was acted on, the reward (n,), all-False `terminated` and
         `truncated`, and `info` with (n,) arrays `is_success`, `is_grasped`, `diverged`, and `executed_action`
-        (n, 7) float32: what was applied after clipping. Applied to the same state it does the same again.
+        (n, a) float32: what was applied after clipping. Applied to the same state it does the same again.
 
         Raises:
             ValueError: wrong shape, or an action that is not finite.
         """
         reward, diverged = self.step_streams(actions, self._all)
         never = np.zeros(self.num_envs, dtype=bool)
-        executed = np.clip(np.asarray(actions, dtype=np.float32), ACTION_LOW_F32, ACTION_HIGH_F32)
+        executed = np.clip(np.asarray(actions, dtype=np.float32), *self._bounds)
         info = self._info() | {"diverged": diverged, "executed_action": executed}
         return self.observe(), reward, never, never.copy(), info
 
@@ -198,15 +196,16 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         """
         ids = self._check_ids(ids, rising=True)
         actions = np.asarray(actions, dtype=np.float64)
-        if actions.shape != (self.num_envs, 7):
-            raise ValueError(f"actions must have shape ({self.num_envs}, 7), got {actions.shape}")
+        shape = (self.num_envs, len(self.action_names))
+        if actions.shape != shape:
+            raise ValueError(f"actions must have shape {shape}, got {actions.shape}")
         bad = ~np.isfinite(actions[ids]).all(axis=1)
         if bad.any():
             raise ValueError(f"actions of environments {ids[bad].tolist()} are not finite: {actions[ids[bad]]}")
-        diverged = np.zeros(self.num_envs, dtype=bool)
+        arm, diverged = self.scene.robot, np.zeros(self.num_envs, dtype=bool)
         before = self._level.copy()
         with self.timer("physics"):
-            diverged[ids] = self.simulation.step(np.clip(actions[ids], ACTION_LOW, ACTION_HIGH), ids)
+            diverged[ids] = self.simulation.step(np.clip(actions[ids], arm.action_low, arm.action_high), ids)
             self._judge(ids)
         reward = self._level - before if self.reward == "difference" else self._level.copy()
         return reward, diverged
@@ -406,6 +405,12 @@ class CronosVectorEnv(gym.vector.VectorEnv):
     def close_extras(self, **kwargs) -> None:
         """Free the renderers."""
         self._observations.close()
+
+
+def _round_outwards(bound: np.ndarray, towards: float) -> np.ndarray:
+    nearest = bound.astype(np.float32)
+    inside = nearest > bound if towards < 0 else nearest < bound
+    return np.where(inside, np.nextafter(nearest, np.float32(towards)), nearest)
 
 
 def as_one_seed(seed: int | Sequence[int | None] | None) -> int | None:

@@ -24,7 +24,7 @@ from lerobot_env_cronos.benchmark.configurations import (
 from lerobot_env_cronos.benchmark.orderings import draw_balanced, is_training_cycle, load_orderings
 from lerobot_env_cronos.benchmark.version import gymnasium_id
 from lerobot_env_cronos.scene.bodies import describe_collisions
-from lerobot_env_cronos.scene.scenes import BODIES, STEPS_PER_TASK, Scene, Task, get_scene
+from lerobot_env_cronos.scene.scenes import BODIES, Scene, Task, get_scene
 
 SUITES = ("independent", "sequential")
 DRAWN = 7351
@@ -94,7 +94,7 @@ class Benchmark:
         content = {
             "environment": gymnasium_id(self.scene.name),
             "bodies": describe_bodies(self.scene),
-            "window_steps": STEPS_PER_TASK,
+            "window_steps": self.scene.steps_per_task,
             "episodes": {
                 f"{suite}/{split}": [
                     [g.number, g.instructions, g.configurations] for g in self.groups(suite, split)

@@ -132,11 +132,13 @@ DrawPlace = Callable[[str, np.random.Generator], Place]
 
 
 def draw_spawn_place(scene: Scene, body: str, rng: np.random.Generator) -> Place:
-    """Uniform over the scene's spawn area, at one of the yaws that benchmark configurations have."""
+    """Uniform over what the arm serves of the scene's spawn area, at one of the yaws that configurations have."""
     (x_low, y_low), (x_high, y_high) = scene.spawn_low, scene.spawn_high
     yaws = OBJECT_YAWS if body in scene.objects else RECEPTACLE_YAWS
     # The numbers that `rng.uniform` of arrays and `rng.choice` would draw, in a quarter of their time.
     xy = np.array([rng.uniform(x_low, x_high), rng.uniform(y_low, y_high)])
+    while not scene.robot.serves(xy):
+        xy = np.array([rng.uniform(x_low, x_high), rng.uniform(y_low, y_high)])
     return xy, yaws[rng.integers(len(yaws))]
 
 

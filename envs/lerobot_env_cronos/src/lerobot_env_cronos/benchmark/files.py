@@ -22,7 +22,7 @@ from lerobot_env_cronos.benchmark.configurations import SPLITS
 from lerobot_env_cronos.benchmark.orderings import is_training_cycle
 from lerobot_env_cronos.benchmark.poses import find_bad_row, find_shared_row
 from lerobot_env_cronos.benchmark.version import check_environment_id, gymnasium_id
-from lerobot_env_cronos.scene.scenes import STEPS_PER_TASK, Scene, Task, get_scene
+from lerobot_env_cronos.scene.scenes import Scene, Task, get_scene
 
 CONFIGURATIONS = "configurations"
 CONFIGS = (CONFIGURATIONS, *SUITES)
@@ -92,7 +92,7 @@ def _episode_rows(benchmark: Benchmark, suite: str, split: str) -> Iterator[dict
             row = {
                 "environment": gymnasium_id(benchmark.scene.name),
                 "configuration": configuration,
-                "window_steps": STEPS_PER_TASK,
+                "window_steps": benchmark.scene.steps_per_task,
             }
             if suite == "independent":
                 task = group.tasks[0]
@@ -334,8 +334,8 @@ def _read_groups(table: _Table, scene: Scene, suite: str, num_configurations: in
     rows = zip(*map(table.column, (key, "configuration", "window_steps", texts)), strict=True)
     for i, (number, configuration, window, said) in enumerate(rows):
         instructions = [said] if suite == "independent" else said
-        if window != STEPS_PER_TASK:
-            raise table.fail(i, f"window_steps must be {STEPS_PER_TASK}, got {window}")
+        if window != scene.steps_per_task:
+            raise table.fail(i, f"window_steps must be {scene.steps_per_task}, got {window}")
         if not 0 <= configuration < num_configurations:
             raise table.fail(i, f"configuration must be 0 to {num_configurations - 1}, got {configuration}")
         if unknown := [text for text in instructions if text not in valid]:

@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator
 import mujoco
 import numpy as np
 
+from lerobot_env_cronos.scene.arms.arm import Arm
 from lerobot_env_cronos.scene.model import build_model
-from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, FINGER_OPEN, HOME_QPOS
 from lerobot_env_cronos.scene.scenes import Scene
 
 SAME_PLACE_M, SAME_ANGLE_RAD = 0.005, np.deg2rad(5)
@@ -15,15 +15,14 @@ MAX_OVERLAP_M = 0.0015
 """How deep bodies may stand in one another; at rest on something they sink in by less than a millimetre."""
 
 
-def find_fault(pose: np.ndarray) -> str | None:
-    """What is wrong with the pose (7,) of a body by itself, if anything."""
+def find_fault(arm: Arm, pose: np.ndarray) -> str | None:
+    """What is wrong with the pose (7,) of a body by itself, for an arm, if anything."""
     if not np.isfinite(pose).all():
         return f"has a pose that is not finite: {pose.tolist()}"
-    if (pose[:2] < EE_LOW[:2]).any() or (pose[:2] > EE_HIGH[:2]).any():
-        valid = f"x {EE_LOW[0]} to {EE_HIGH[0]}, y {EE_LOW[1]} to {EE_HIGH[1]}"
-        return f"at {pose[:2].tolist()} m is out of the arm's reach ({valid} m)"
-    if not 0 <= pose[2] <= EE_HIGH[2]:
-        return f"must be between the table and the top of the workspace, 0 to {EE_HIGH[2]} m, got z = {pose[2]} m"
+    if not arm.is_within(pose[:2]):
+        return f"at {pose[:2].tolist()} m is out of the arm's reach ({arm.workspace} m)"
+    if not 0 <= pose[2] <= arm.high[2]:
+        return f"must be between the table and the top of the workspace, 0 to {arm.high[2]} m, got z = {pose[2]} m"
     norm = np.linalg.norm(pose[3:])
     return None if abs(norm - 1) < 1e-3 else f"has a quaternion of length {norm:.4f}, not 1"
 
@@ -57,7 +56,7 @@ def make_overlap_finder(scene: Scene) -> Callable[[np.ndarray], str | None]:
     data = mujoco.MjData(model)
 
     def find_overlap(configuration: np.ndarray) -> str | None:
-        data.qpos[:] = [*HOME_QPOS, FINGER_OPEN, -FINGER_OPEN, *configuration.ravel()]
+        data.qpos[:] = [*scene.robot.home_qpos, *configuration.ravel()]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
         touching = [c for c in data.contact if set(scene.bodies) & {_name(model, geom) for geom in c.geom}]
@@ -76,7 +75,7 @@ def find_bad_row(scene: Scene, poses: np.ndarray) -> tuple[int, str] | None:
     """The first of the configurations (n, bodies, 7) that cannot be used, and why."""
     for i, configuration in enumerate(poses):
         for body, pose in zip(scene.bodies, configuration, strict=True):
-            if why := find_fault(pose):
+            if why := find_fault(scene.robot, pose):
                 return i, f"the {body} {why}"
     return next(((i, why) for i, why in enumerate(find_overlaps(scene, poses)) if why is not None), None)
 

@@ -12,16 +12,13 @@ from lerobot_env_cronos.benchmark.configurations import set_configurations_file
 from lerobot_env_cronos.benchmark.version import register_gymnasium
 from lerobot_env_cronos.scene.bodies import SHAPES, narrowest_width
 from lerobot_env_cronos.scene.cameras import is_spawn_area_in_view
-from lerobot_env_cronos.scene.model import TABLE
-from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, add_robot
+from lerobot_env_cronos.scene.model import ADD_ROBOT, TABLE
 from lerobot_env_cronos.scene.scenes import BODIES, SCENES, Body, Scene
 from lerobot_env_cronos.scene.visuals.objects import LOOKS
 
 # Part of Gymnasium's environment ids and of file names.
 NAME_PATTERN = re.compile(r"[a-z0-9_]+")
 ROUND_SHAPES = ("disc", "plate")
-MAX_WIDTH_M = 0.044
-"""What the gripper takes between its fingers."""
 
 
 def register_scene(scene: Scene, bodies: Sequence[Body] = (), configurations: Path | str | None = None) -> None:
@@ -64,7 +61,7 @@ def _check(scene: Scene, new_bodies: dict[str, Body]) -> None:
     if not scene.objects or not scene.receptacles or len(set(scene.bodies)) < len(scene.bodies):
         raise ValueError(f"a scene needs objects and receptacles, each once; {scene.name} has {scene.bodies}")
     for body in new_bodies.values():
-        _check_body(body)
+        _check_body(body, scene.arm)
     bodies = BODIES | new_bodies
     if unknown := set(scene.bodies) - bodies.keys():
         raise ValueError(f"unknown bodies {sorted(unknown)}; valid bodies: {sorted(bodies)}")
@@ -73,15 +70,15 @@ def _check(scene: Scene, new_bodies: dict[str, Body]) -> None:
         raise ValueError(f"names that differ only by a space or underscore: {scene.bodies}")
     _check_spawn_area(scene, bodies)
     for name in scene.objects:
-        if (width := narrowest_width(bodies[name])) >= MAX_WIDTH_M:
+        if (width := narrowest_width(bodies[name])) >= scene.robot.max_width_m:
             raise ValueError(
                 f"the {name} is {1000 * width:.0f} mm wide where it is narrowest; the gripper takes less than "
-                f"{1000 * MAX_WIDTH_M:.0f} mm"
+                f"{1000 * scene.robot.max_width_m:.0f} mm"
             )
 
 
-def _check_body(body: Body) -> None:
-    name, reserved, valid_shapes = body.name, _reserved_names(), sorted(SHAPES.keys() & LOOKS.keys())
+def _check_body(body: Body, arm: str) -> None:
+    name, reserved, valid_shapes = body.name, _reserved_names(arm), sorted(SHAPES.keys() & LOOKS.keys())
     if BODIES.get(name, body) != body or name in reserved or not name.strip() or "/" in name:
         taken = sorted({*BODIES, *reserved})
         raise ValueError(f"a body needs a name without a slash that is not in use, got {name!r}; in use: {taken}")
@@ -92,24 +89,24 @@ def _check_body(body: Body) -> None:
 
 
 def _check_spawn_area(scene: Scene, bodies: dict[str, Body]) -> None:
-    low, high = np.array(scene.spawn_low), np.array(scene.spawn_high)
-    if not ((EE_LOW[:2] <= low) & (low < high) & (high <= EE_HIGH[:2])).all():
+    arm, low, high = scene.robot, np.array(scene.spawn_low), np.array(scene.spawn_high)
+    if not ((arm.low[:2] <= low) & (low < high) & (high <= arm.high[:2])).all():
         raise ValueError(
             f"spawn_low={scene.spawn_low} of {scene.name} must be below spawn_high={scene.spawn_high}, both in "
-            f"{EE_LOW[:2].tolist()} to {EE_HIGH[:2].tolist()} m"
+            f"{arm.low[:2].tolist()} to {arm.high[:2].tolist()} m"
         )
     for name in scene.bodies:
         if not is_spawn_area_in_view(scene, bodies[name]):
             raise ValueError(
                 f"spawn area of {scene.name}: in a corner of {scene.spawn_low} to {scene.spawn_high} the front "
-                f"camera does not see the middle of the {name}, which counts as lost; x 0.17 to 0.42 and y -0.15 "
-                "to 0.15 m are in view with room for large bodies"
+                f"camera does not see the middle of the {name}, which counts as lost; "
+                f"{arm.roomy_spawn} m are in view with room for large bodies"
             )
 
 
 @cache
-def _reserved_names() -> frozenset[str]:
+def _reserved_names(arm: str) -> frozenset[str]:
     """Of the table and of the robot's bodies and joints: MuJoCo drops a second joint of a name without a word."""
     robot = mujoco.MjSpec()
-    add_robot(robot)
+    ADD_ROBOT[arm](robot)
     return frozenset({TABLE, *(part.name for part in (*robot.bodies, *robot.joints))})

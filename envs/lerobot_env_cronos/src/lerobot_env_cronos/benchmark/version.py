@@ -8,7 +8,7 @@ import re
 
 import gymnasium as gym
 
-from lerobot_env_cronos.scene.scenes import SCENES, STEPS_PER_TASK
+from lerobot_env_cronos.scene.scenes import SCENES
 
 VERSION = 1
 """Of all environments."""
@@ -28,7 +28,7 @@ def register_gymnasium(*scenes: str) -> None:
             gymnasium_id(scene),
             "lerobot_env_cronos.episodic:CronosEnv",
             vector_entry_point="lerobot_env_cronos.autoreset:CronosGymVectorEnv",
-            max_episode_steps=STEPS_PER_TASK,
+            max_episode_steps=SCENES[scene].steps_per_task,
             kwargs={"scene": scene},
         )
 

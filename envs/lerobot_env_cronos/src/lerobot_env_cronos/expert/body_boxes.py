@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from lerobot_env_cronos.scene.rotations import quaternion_to_matrix
 from lerobot_env_cronos.scene.scenes import Scene
-from lerobot_env_cronos.simulation.kinematics import quaternion_to_matrix
 
 
 @dataclass(frozen=True)

@@ -6,31 +6,16 @@ clearing away: one that lies on top of the object to move, or that takes up the 
 on the table first.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from lerobot_env_cronos.expert.body_boxes import SceneBoxes, WorldBoxes
-from lerobot_env_cronos.expert.grasping import (
-    PAD_BELOW_EE,
-    TIP_CLEARANCE,
-    choose_grasps,
-    find_blocker,
-    grasp_candidates,
-)
+from lerobot_env_cronos.expert.grasping import choose_grasps, find_blocker, grasp_candidates
+from lerobot_env_cronos.expert.hands import CLOSE, HANDS, OPEN, Command, horizontal
 from lerobot_env_cronos.expert.placement import Held, choose_places
-from lerobot_env_cronos.scene.robot import FINGERTIP_REACH, PAD_HALF_SIZE
-from lerobot_env_cronos.simulation.kinematics import (
-    forward_kinematics,
-    matrix_to_rotation_vector,
-    quaternion_to_matrix,
-)
-from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW, NUM_ARM_JOINTS
+from lerobot_env_cronos.scene.rotations import quaternion_to_matrix
+from lerobot_env_cronos.simulation.judging import IN_HAND
 from lerobot_env_cronos.vector_env import CronosVectorEnv
 
-OPEN, CLOSE = 1.0, 0.0
-HOVER_HEIGHT = 0.07
-"""Height above the grasp or the place at which the hand travels [m]."""
 FUNNEL_SLOPE = 1.5
 """Height above the goal per metre of remaining horizontal error."""
 ALIGNED = 0.008
@@ -39,18 +24,14 @@ YAW_TO_METRES = 0.04
 """A yaw error of 1 rad counts like this horizontal error [m]."""
 GRASP_REACHED = 0.008
 """The fingers close when the hand is this close above the grasp [m]."""
-EMPTY_OPENING = 0.06
-"""Gripper opening below which there is nothing between the fingers."""
 DROP_HEIGHT = 0.003
 """Gap under the object when the hand lets go; more than 12 mm topples objects [m]."""
-RETREAT_HEIGHT = 0.13
-"""Height at which the hand waits once the task is complete [m]."""
-LET_GO_STEPS = 4
-"""Steps for which the hand goes up from what it has put down, until that counts as lying still."""
-NUM_FAILED, MAX_VAIN_STEPS = 3, 5
-"""Failed grasps that are remembered, and steps at a grasp after which it has failed."""
-MAX_CLEARED, MAX_CLEARING_STEPS = 3, 40
-"""Objects that are cleared away for one task, and steps after which clearing one is given up."""
+LET_GO_S = 0.8
+"""Time for which the hand goes up from what it has put down, until that counts as lying still [s]."""
+NUM_FAILED, MAX_VAIN_S = 3, 1.0
+"""Failed grasps that are remembered, and time at a grasp after which it has failed [s]."""
+MAX_CLEARED, MAX_CLEARING_S = 3, 8.0
+"""Objects that are cleared away for one task, and time after which clearing one is given up [s]."""
 NEARBY = 0.09
 """Distance at which the open hand may run into a tall object on its way down [m]."""
 PRESSING = 0.010
@@ -59,17 +40,6 @@ TOUCHING = 0.004
 """Distance at which something keeps a hand that does not get down to its grasp from it [m]."""
 STALE_DISTANCE, STALE_ANGLE = 0.015, 0.2
 """An object or receptacle that moved further than this is looked at again [m, rad]."""
-
-
-class Command(NamedTuple):
-    """What the hands of n streams should do."""
-
-    position: np.ndarray
-    """(n, 3) where the end effector should go [m]."""
-    closing: np.ndarray
-    """(n, 3) the horizontal direction that its closing axis should have."""
-    gripper: np.ndarray
-    """(n, 1) OPEN or CLOSE."""
 
 
 class ScriptedExpert:
@@ -84,17 +54,23 @@ class ScriptedExpert:
 
     def __init__(self, env: CronosVectorEnv, streams: np.ndarray | None = None):
         self.env, self.sim, self.scene = env, env.simulation, env.scene
+        self._hand, self._arm_kind, fps = HANDS[env.scene.arm], env.scene.robot, env.scene.fps
+        self._let_go_steps, self._max_vain_steps = round(LET_GO_S * fps), round(MAX_VAIN_S * fps)
+        self._max_clearing_steps = round(MAX_CLEARING_S * fps)
         n, bodies = env.num_envs if streams is None else len(streams), self.scene.bodies
         self._mine = slice(None) if streams is None else streams
         self._boxes = SceneBoxes.from_model(self.sim.model, self.scene)
-        self._candidates = {i: grasp_candidates(self._boxes, i) for i in range(len(self.scene.objects))}
+        self._candidates = {
+            i: grasp_candidates(self._hand, self._boxes, i) for i in range(len(self.scene.objects))
+        }
         self._corners = {i: self._boxes.corners(i) for i in range(len(self.scene.objects))}
         self._is_support = np.array([name in self.scene.receptacles for name in bodies])
         # Indices of the object to move and of where to (-1: the table): by the task, and what is done first.
         self._task, self._goal = np.full((n, 2), -2), np.full((n, 2), -2)
         self._grasp_known, self._place_known = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         self._grasp_point, self._grasp_axis, self._grasp_floor = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
-        self._grasp_pose = np.zeros((n, 7))
+        self._grasp_pose, self._grasp_width = np.zeros((n, 7)), np.zeros(n)
+        self._held_width = np.zeros(n)
         # The last grasp points that failed, and for how long the hand has been at the current one in vain.
         self._failed, self._vain = np.full((n, NUM_FAILED, 3), np.inf), np.zeros(n, dtype=int)
         self._was_holding = np.zeros(n, dtype=bool)
@@ -114,9 +90,10 @@ class ScriptedExpert:
         self._failed[ids], self._vain[ids], self._letting_go[ids] = np.inf, 0, 0
 
     def act(self) -> np.ndarray:
-        """Actions (n, 7) in physical units, within the action bounds."""
+        """Actions (n, a) in physical units, within the action bounds."""
         self._look()
         self._update_goals()
+        self._measure_held()
         self._update_grasps()
         self._update_places()
         command, place = self._pick(), self._place()
@@ -125,7 +102,8 @@ class ScriptedExpert:
         for applies, other in ((self._holding, place), (done, self._finish())):
             mask = applies[:, None]
             command = Command(*(np.where(mask, theirs, ours) for theirs, ours in zip(other, command)))
-        return self._action(command)
+        width = np.where(self._holding | done, self._held_width, self._grasp_width)
+        return self._hand.act(self._arm_target, command, width)
 
     # Perception -------------------------------------------------------------------------------------------
 
@@ -134,13 +112,15 @@ class ScriptedExpert:
         sim = self.sim
         mine = self._mine
         self._poses = sim.body_poses()[mine]
-        self._arm, self._arm_target = sim.qpos[mine, :NUM_ARM_JOINTS], sim.arm_target[mine]
-        self._p, self._R, _ = forward_kinematics(self._arm)
-        self._target_p, self._target_R, _ = forward_kinematics(self._arm_target)
-        self._yaw = np.arctan2(self._R[:, 1, 1], self._R[:, 0, 1])
+        along = self._hand.closes_along
+        self._arm, self._arm_target = sim.qpos[mine, : self._arm_kind.num_joints], sim.arm_target[mine]
+        self._p, self._R = self._arm_kind.forward_kinematics(self._arm)[:2]
+        self._target_p, target_R = self._hand.target_pose(self._arm_target)
+        self._closing, self._target_closing = self._R[:, :, along], target_R[:, :, along]
+        self._yaw = np.arctan2(self._closing[:, 1], self._closing[:, 0])
         self._opening = sim.gripper_opening()[mine]
         # Fingers that cannot close press on a side too wide for them: that is not a grasp.
-        closed = (self._opening < 0.95)[:, None]
+        closed = (self._opening < self._hand.widest_opening)[:, None]
         self._held_objects = closed & np.stack([sim.is_grasped(name)[mine] for name in self.scene.objects], 1)
 
     def _update_goals(self) -> None:
@@ -169,6 +149,11 @@ class ScriptedExpert:
         self._object = self._poses[i, goal[:, 0]]
         self._object_R = quaternion_to_matrix(self._object[:, 3:])
 
+    def _measure_held(self) -> None:
+        """How wide what is held is, until the fingers let go of it: they have to open further than that."""
+        mine = self._holding & (self._letting_go == 0)
+        self._held_width[mine] = self._hand.held_width(self._opening)[mine]
+
     def _update_clearing(self, goal: np.ndarray) -> None:
         """Stop clearing what was put down, or is not in the way of the `goal` (n, 2) of the task any more."""
         i, active = np.arange(len(goal)), self._clear >= 0
@@ -177,7 +162,7 @@ class ScriptedExpert:
         put_down = self._clear_held & ~held
         self._clear_held = held
         done = put_down | self._success | self._held_objects[i, goal[:, 0]] & ~held
-        done |= (self._clear_steps > MAX_CLEARING_STEPS) & ~held
+        done |= (self._clear_steps > self._max_clearing_steps) & ~held
         self._clear[active & done] = -1
 
     def _start_clearing(self, ids: np.ndarray, blocker: np.ndarray) -> None:
@@ -196,11 +181,12 @@ class ScriptedExpert:
         for obj in np.unique(self._goal[wanted, 0]):
             ids = np.flatnonzero(wanted & (self._goal[:, 0] == obj))
             grasps = choose_grasps(
+                self._hand,
                 self._candidates[obj], obj, WorldBoxes.at(self._boxes, self._poses[ids]),
                 (self._object[ids, :3], self._object_R[ids]), self._arm[ids], self._failed[ids], self._is_support,
             )  # fmt: skip
             self._grasp_point[ids], self._grasp_axis[ids] = grasps.point, grasps.axis
-            self._grasp_floor[ids] = grasps.floor
+            self._grasp_floor[ids], self._grasp_width[ids] = grasps.floor, grasps.width
             self._grasp_pose[ids] = self._object[ids]
             self._grasp_known[ids] = True
             self._start_clearing(ids, grasps.blocker)
@@ -213,9 +199,16 @@ class ScriptedExpert:
             R = self._object_R[mine]
             hand = self._object[mine, :3] + np.einsum("nij,nj->ni", R, self._grasp_point[mine])
             closing = np.einsum("nij,nj->ni", R, self._grasp_axis[mine])
-            held = Held(self._object[mine, :3], R, hand, np.arctan2(closing[:, 1], closing[:, 0]), self._arm[mine])
+            held = Held(
+                self._object[mine, :3],
+                R,
+                hand,
+                np.arctan2(closing[:, 1], closing[:, 0]),
+                self._arm[mine],
+                self._grasp_width[mine],
+            )
             places = choose_places(
-                self.scene, obj, target, WorldBoxes.at(self._boxes, self._poses[mine]),
+                self._hand, self.scene, obj, target, WorldBoxes.at(self._boxes, self._poses[mine]),
                 self._poses[mine, target, :2], held,
             )  # fmt: skip
             self._start_clearing(mine, places.blocker)
@@ -235,12 +228,11 @@ class ScriptedExpert:
         wanted = self._holding & (moved | ~self._place_known)
         for obj, target in np.unique(self._goal[wanted], axis=0):
             ids = np.flatnonzero(wanted & (self._goal == (obj, target)).all(1))
-            held = Held(
-                self._object[ids, :3], self._object_R[ids], self._p[ids] - [0, 0, PAD_BELOW_EE],
-                self._yaw[ids], self._arm[ids],
-            )  # fmt: skip
+            width = self._held_width[ids]
+            middle = self._hand.to_middle(self._p[ids], horizontal(self._closing[ids]), width)
+            held = Held(self._object[ids, :3], self._object_R[ids], middle, self._yaw[ids], self._arm[ids], width)
             places = choose_places(
-                self.scene, obj, target, WorldBoxes.at(self._boxes, self._poses[ids]), xy[ids], held
+                self._hand, self.scene, obj, target, WorldBoxes.at(self._boxes, self._poses[ids]), xy[ids], held
             )
             self._place_xy[ids], self._place_anchor[ids] = places.xy, places.anchor
             self._place_closing[ids] = places.closing
@@ -251,24 +243,25 @@ class ScriptedExpert:
     def _pick(self) -> Command:
         """Hover, align, descend and close."""
         point = self._object[:, :3] + np.einsum("nij,nj->ni", self._object_R, self._grasp_point)
-        closing = _horizontal(np.einsum("nij,nj->ni", self._object_R, self._grasp_axis))
-        grasp = point + np.array([0, 0, PAD_BELOW_EE])
-        lowest = self._grasp_floor + TIP_CLEARANCE + FINGERTIP_REACH - 0.002
+        closing = horizontal(np.einsum("nij,nj->ni", self._object_R, self._grasp_axis))
+        hand, width = self._hand, self._grasp_width
+        grasp = hand.to_end_effector(point, closing, width)
+        lowest = self._grasp_floor + hand.tip_clearance + hand.tip_reach - 0.002
         grasp[:, 2] = np.maximum(grasp[:, 2], lowest)
         error = self._misalignment(grasp, closing)
         low = self._p[:, 2] - grasp[:, 2]
         aligned = error < ALIGNED + 0.004
-        empty = self._opening < EMPTY_OPENING
+        empty = self._opening < hand.empty_opening
         missed = aligned & (low < GRASP_REACHED) & empty
         close = aligned & (low < GRASP_REACHED) & ~empty
         down = aligned & (self._target_p[:, 2] - grasp[:, 2] < GRASP_REACHED)
         pressing = self._p[:, 2] - self._target_p[:, 2] > PRESSING
         self._notice_failures(missed, empty, down | pressing)
         # Fingers that are still opening do not go down on the object.
-        still_opening = np.where(close, 0.0, 0.05 * np.clip(0.9 - self._opening, 0.0, 0.5) / 0.5)
+        still_opening = np.where(close, 0.0, hand.still_opening(self._opening, width))
         gripper = np.where(close, CLOSE, OPEN)[:, None]
         # Nor does a hand that is not aligned yet: it would knock over what is tall.
-        tall = np.maximum(self._top_nearby(point) - point[:, 2] - PAD_HALF_SIZE[0], 0.0)
+        tall = np.maximum(self._top_nearby(point) - point[:, 2] - hand.pad_half[0], 0.0)
         return Command(self._funnel(grasp, error, still_opening, tall), closing, gripper)
 
     def _notice_failures(self, missed: np.ndarray, empty: np.ndarray, there: np.ndarray) -> None:
@@ -277,7 +270,7 @@ class ScriptedExpert:
         self._vain = np.where(there & trying, self._vain + 1, 0)
         slipped = self._was_holding & trying & empty
         self._was_holding = self._holding.copy()
-        stuck = self._vain > MAX_VAIN_STEPS
+        stuck = self._vain > self._max_vain_steps
         self._clear_from_under_hand(np.flatnonzero(stuck))
         self._give_up(missed & ~self._holding | slipped | stuck)
 
@@ -285,9 +278,11 @@ class ScriptedExpert:
         """Where the hand does not get down to the grasp, clear away what it stands on."""
         for obj in np.unique(self._goal[ids, 0]):
             mine = ids[self._goal[ids, 0] == obj]
+            closing, width = horizontal(self._closing[mine]), self._grasp_width[mine]
+            middle = self._hand.to_middle(self._p[mine], closing, width)
             blocker = find_blocker(
-                WorldBoxes.at(self._boxes, self._poses[mine]), self._p[mine] - [0, 0, PAD_BELOW_EE],
-                _horizontal(self._R[mine, :, 1]), obj, self._is_support, TOUCHING,
+                self._hand, WorldBoxes.at(self._boxes, self._poses[mine]), middle, closing, obj,
+                self._is_support, width, TOUCHING,
             )  # fmt: skip
             self._start_clearing(mine, blocker)
 
@@ -305,25 +300,32 @@ class ScriptedExpert:
         position[:, 1] = goal_xy[:, 1] - (s * offset[:, 0] + c * offset[:, 1])
         top = np.where(receptacle >= 0, self._receptacle_top(receptacle), 0.0)
         position[:, 2] = self._p[:, 2] + top - self._bottom() + DROP_HEIGHT
-        tips = top + TIP_CLEARANCE + FINGERTIP_REACH - 0.002
+        tips = top + self._hand.tip_clearance + self._hand.tip_reach - 0.002
         position[:, 2] = np.maximum(position[:, 2], tips)
         error = self._misalignment(position, closing)
         low = self._p[:, 2] - position[:, 2]
         # The target is down but the hand is not: the object rests on something.
         rests = (self._target_p[:, 2] - position[:, 2] < 0.004) & (self._p[:, 2] - self._target_p[:, 2] > 0.005)
-        release = (error < ALIGNED + 0.006) & ((low < 0.006) | rests)
-        self._letting_go[self._holding & release] = LET_GO_STEPS
+        carried = self._is_carried() | (self._hand.lift == 0.0)
+        release = carried & (error < ALIGNED + 0.006) & ((low < 0.006) | rests)
+        self._letting_go[self._holding & release] = self._let_go_steps
         gripper = np.where(release, OPEN, CLOSE)[:, None]
-        none = np.zeros(len(i))
-        return Command(self._funnel(position, error, none, none), closing, gripper)
+        lift, none = np.where(carried, 0.0, self._hand.lift), np.zeros(len(i))
+        return Command(self._funnel(position, error, lift, none), closing, gripper)
+
+    def _is_carried(self) -> np.ndarray:
+        """Whether the judge has seen what is held (n,) long enough in the air."""
+        carried_to = self.sim.judge.carried_to[self._mine]
+        objects = np.minimum(self._goal[:, 0], len(self.scene.objects) - 1)
+        return carried_to[np.arange(len(objects)), objects] == IN_HAND
 
     def _finish(self) -> Command:
         """The object is put down: open, go straight up and wait."""
         position = self._target_p.copy()
-        opened = self._opening > 0.5
-        height = np.maximum(self._target_p[:, 2], RETREAT_HEIGHT)
+        opened = self._hand.has_let_go(self._opening, self._held_width)
+        height = np.maximum(self._target_p[:, 2], self._hand.retreat)
         position[:, 2] = np.where(opened, height, position[:, 2])
-        return Command(position, self._target_R[:, :, 1], np.full((len(position), 1), OPEN))
+        return Command(position, self._target_closing, np.full((len(position), 1), OPEN))
 
     def _misalignment(self, goal: np.ndarray, closing: np.ndarray) -> np.ndarray:
         """Horizontal error (n,) of the hand, a yaw error counting as metres [m]."""
@@ -336,7 +338,7 @@ class ScriptedExpert:
 
         It stays `least` (n,) above the goal, and `tall` (n,) higher than usual until it is aligned [m].
         """
-        rise = np.clip(FUNNEL_SLOPE * (error - ALIGNED), 0.0, HOVER_HEIGHT)
+        rise = np.clip(FUNNEL_SLOPE * (error - ALIGNED), 0.0, self._hand.hover)
         rise += tall * np.clip((error - ALIGNED) / ALIGNED, 0.0, 1.0)
         height = goal[:, 2] + np.maximum(rise, least)
         too_low = height - self._target_p[:, 2]
@@ -364,25 +366,3 @@ class ScriptedExpert:
             mine = self._goal[:, 0] == obj
             bottom[mine] = np.einsum("ni,pi->np", self._object_R[mine, 2], corners).min(1)
         return bottom + self._object[:, 2]
-
-    def _action(self, command: Command) -> np.ndarray:
-        """Steps (n, 7) of the target pose towards the command, the hand pointing down, within bounds."""
-        closing = _horizontal(command.closing)
-        zeros = np.zeros(len(closing))
-        down = np.stack([zeros, zeros, zeros - 1], 1)
-        across = np.stack([closing[:, 1], -closing[:, 0], zeros], 1)
-        goal_R = np.stack([down, closing, across], 2)
-        turn = matrix_to_rotation_vector(goal_R @ self._target_R.transpose(0, 2, 1))
-        turn[:, 2] = self._away_from_wrist_limit(turn[:, 2])
-        action = np.concatenate([command.position - self._target_p, turn, command.gripper], 1)
-        return np.clip(action, ACTION_LOW, ACTION_HIGH)
-
-    def _away_from_wrist_limit(self, turn: np.ndarray) -> np.ndarray:
-        """Turn (n,) the long way round where the short one would hit the wrist's limit."""
-        blocked = (self._target_R[:, 2, 0] < -0.7) & (np.abs(self._arm_target[:, 5] - turn) > 3.1)
-        return np.where(blocked, turn - 2 * np.pi * np.sign(turn), turn)
-
-
-def _horizontal(v: np.ndarray) -> np.ndarray:
-    v = v * [1, 1, 0]
-    return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-6)

@@ -8,30 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_env_cronos.expert.body_boxes import SceneBoxes, WorldBoxes
-from lerobot_env_cronos.scene.robot import (
-    EE_OFFSET,
-    FINGER_OPEN,
-    FINGER_POS,
-    FINGERTIP_REACH,
-    PAD_HALF_SIZE,
-    PAD_POS,
-)
+from lerobot_env_cronos.expert.hands import Hand
 
-PAD_BELOW_EE = FINGER_POS[0] + PAD_POS[0] - EE_OFFSET[0]
-"""Height of the end-effector site above the centre of the pads when the hand points down [m]."""
-FINGER_Y = FINGER_OPEN - abs(PAD_POS[1])
-"""Distance of an open pad from the middle of the hand [m]."""
-MAX_WIDTH = 2 * (FINGER_Y - PAD_HALF_SIZE[1]) - 0.006
-"""Widest graspable side, with 3 mm of room for each finger [m]."""
-TIP_CLEARANCE = 0.002
-"""The fingertips stay this far above what lies under them [m]."""
 FINGER_ROOM, PALM_ROOM = 0.006, 0.004
 """Wanted distance from other things [m]."""
-PALM_HALF_Y, PALM_HALF_Z = 0.045, 0.022
-WRIST_LIMIT = 2.6
-"""Wrist rotation beyond which a grasp or a place is not chosen [rad]."""
-MAX_REACH = 0.44
-"""Distance from the robot's axis up to which a hand that points down goes everywhere with ease [m]."""
 SLOTS = np.array([-0.75, -0.4, 0.0, 0.4, 0.75])
 BLOCKED_DEPTH = 0.002
 """A hand that would be this deep in another object cannot grasp; that object has to be moved first [m]."""
@@ -51,15 +31,15 @@ class GraspCandidates:
     """(c, 3, 3) of that box in the object's frame."""
 
 
-def grasp_candidates(boxes: SceneBoxes, body: int) -> GraspCandidates:
+def grasp_candidates(hand: Hand, boxes: SceneBoxes, body: int) -> GraspCandidates:
     """All grasps across a side of a box that fits between the fingers, at slots along another side."""
     points, axes, indices = [], [], []
     for m in np.flatnonzero(boxes.body == body):
         for closing in range(3):
-            if 2 * boxes.half[m, closing] > MAX_WIDTH:
+            if 2 * boxes.half[m, closing] > hand.max_width:
                 continue
             for along in (k for k in range(3) if k != closing):
-                long_side = boxes.half[m, along] > PAD_HALF_SIZE[2]
+                long_side = boxes.half[m, along] > hand.pad_half[2]
                 for slot in SLOTS if long_side else (0.0,):
                     offset = slot * boxes.half[m, along] * boxes.rotation[m][:, along]
                     for sign in (1.0, -1.0):
@@ -80,61 +60,45 @@ class Grasps:
     """(n, 3) closing axis in the object's frame."""
     floor: np.ndarray
     """(n,) height that the fingertips stay above [m]."""
+    width: np.ndarray
+    """(n,) of the grasped side [m]."""
     blocker: np.ndarray
     """(n,) index of the object that is in the way of the hand, -1 for none."""
 
 
-def wrap(angle: np.ndarray) -> np.ndarray:
-    """Angles wrapped into [-pi, pi)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
-def wrist_cost(arm: np.ndarray, point: np.ndarray, hand_yaw: np.ndarray) -> np.ndarray:
-    """Cost of turning a hand that points down to a yaw of its closing axis, far from the wrist's limits.
-
-    Args:
-        arm: (..., 6) joint positions [rad].
-        point: (..., 2 or 3) where [m].
-        hand_yaw: (...,) [rad].
-    """
-    wrist = wrap(np.arctan2(point[..., 1], point[..., 0]) + np.pi / 2 - hand_yaw)
-    turn = wrist - arm[..., 5]
-    return 0.25 * np.abs(turn) + 0.15 * np.abs(wrist) + 10.0 * (np.abs(wrist) > WRIST_LIMIT)
-
-
-def reach_cost(point: np.ndarray) -> np.ndarray:
-    """Cost (...) of points (..., 2 or 3) that the arm only reaches stretched out [m]."""
-    return 40.0 * np.maximum(np.linalg.norm(point[..., :2], axis=-1) - MAX_REACH, 0.0)
-
-
-def finger_points(centre: np.ndarray, closing: np.ndarray, half_gap: tuple[float, ...] = (FINGER_Y,)):
+def finger_points(
+    hand: Hand, centre: np.ndarray, closing: np.ndarray, offsets: tuple[np.ndarray | float, ...]
+) -> np.ndarray:
     """Points (..., p, 3) on the pads of a hand that points down.
 
     Args:
+        hand: whose pads.
         centre: (..., 3) middle of the pads [m].
         closing: (..., 3) horizontal unit vector.
-        half_gap: distances of the pads from the middle to look at [m].
+        offsets: signed distances (...) of the pads from the middle to look at [m].
     """
     across = np.stack([-closing[..., 1], closing[..., 0], np.zeros_like(closing[..., 0])], -1)
+    length, _, width = hand.pad_half
     points = [
-        centre + side * gap * closing + lateral * PAD_HALF_SIZE[2] * across + [0, 0, level * PAD_HALF_SIZE[0]]
-        for gap in half_gap
-        for side in (-1, 1)
+        centre + np.asarray(offset)[..., None] * closing + lateral * width * across + [0, 0, level * length]
+        for offset in offsets
         for lateral in (-1, 0, 1)
         for level in (-1, 0, 1)
     ]
     return np.stack(points, -2)
 
 
-def palm_points(centre: np.ndarray, closing: np.ndarray) -> np.ndarray:
+def palm_points(hand: Hand, centre: np.ndarray, closing: np.ndarray) -> np.ndarray:
     """Points (..., 5, 3) of the palm's underside, for a hand that points down."""
     across = np.stack([-closing[..., 1], closing[..., 0], np.zeros_like(closing[..., 0])], -1)
-    up = [0, 0, PAD_BELOW_EE + FINGERTIP_REACH]
+    along, aside = hand.palm_half
+    up = [0, 0, hand.palm_height]
     corners = [(0, 0), (-1, -1), (-1, 1), (1, -1), (1, 1)]
-    return np.stack([centre + up + a * PALM_HALF_Y * closing + b * PALM_HALF_Z * across for a, b in corners], -2)
+    return np.stack([centre + up + a * along * closing + b * aside * across for a, b in corners], -2)
 
 
 def choose_grasps(
+    hand: Hand,
     candidates: GraspCandidates,
     obj: int,
     world: WorldBoxes,
@@ -146,10 +110,11 @@ def choose_grasps(
     """Pick the cheapest grasp of an object in each of n streams.
 
     Args:
+        hand: that grasps.
         candidates: of the object; `obj` is its index.
         world: all boxes.
         pose: of the object, position (n, 3) and rotation (n, 3, 3).
-        arm: (n, 6) joint positions [rad].
+        arm: (n, j) joint positions [rad].
         avoid: (n, a, 3) grasp points that failed, in the object's frame; inf where there was none [m].
         is_support: (bodies,) True for receptacles, which the fingers may come close to from above.
     """
@@ -158,25 +123,24 @@ def choose_grasps(
     axis = np.einsum("nij,cj->nci", R, candidates.axis)
     closing = axis * [1, 1, 0]
     closing /= np.maximum(np.linalg.norm(closing, axis=-1, keepdims=True), 1e-6)
-    cost = (
-        2.0 * np.abs(axis[..., 2])
-        + 50.0 * (np.abs(axis[..., 2]) > 0.7)
-        + 10.0 * (_width(world, candidates, R, closing) > MAX_WIDTH)
-    )
-    floor = _floor(world, point, closing, is_support)
+    width = _width(world, candidates, R, closing)
+    cost = 2.0 * np.abs(axis[..., 2]) + 50.0 * (np.abs(axis[..., 2]) > 0.7) + 10.0 * (width > hand.max_width)
+    floor = _floor(hand, world, point, closing, is_support, width)
     centre = point.copy()
-    centre[..., 2] = np.maximum(point[..., 2], floor + TIP_CLEARANCE + PAD_HALF_SIZE[0])
+    centre[..., 2] = np.maximum(point[..., 2], floor + hand.tip_clearance + hand.pad_half[0])
     # Pads that pass over the grasp point by more than their half length do not hold it.
     cost += 200 * np.maximum(centre[..., 2] - point[..., 2] - 0.010, 0.0)
-    cost += _collision_cost(world, candidates, centre, closing, obj, is_support)
-    cost += wrist_cost(arm[:, None], point, np.arctan2(closing[..., 1], closing[..., 0])) + reach_cost(point)
+    cost += _collision_cost(hand, world, candidates, centre, closing, obj, is_support, width)
+    yaw = np.arctan2(closing[..., 1], closing[..., 0])
+    cost += hand.wrist_cost(arm[:, None], point, yaw) + hand.reach_cost(point)
     failed = np.linalg.norm(candidates.point[None, :, None] - avoid[:, None], axis=-1) < 0.012
     cost += 1.5 * failed.sum(-1)
     com = p + np.einsum("nij,j->ni", R, world.boxes.centre_of_mass[obj])
     cost += 8.0 * np.linalg.norm((point - com[:, None])[..., :2], axis=-1)
     best, n = cost.argmin(1), np.arange(len(p))
-    blocker = find_blocker(world, centre[n, best], closing[n, best], obj, is_support)
-    return Grasps(candidates.point[best], candidates.axis[best], floor[n, best], blocker)
+    width = width[n, best]
+    blocker = find_blocker(hand, world, centre[n, best], closing[n, best], obj, is_support, width)
+    return Grasps(candidates.point[best], candidates.axis[best], floor[n, best], width, blocker)
 
 
 def _width(world: WorldBoxes, candidates: GraspCandidates, R: np.ndarray, closing: np.ndarray) -> np.ndarray:
@@ -186,11 +150,20 @@ def _width(world: WorldBoxes, candidates: GraspCandidates, R: np.ndarray, closin
     return 2 * (np.abs(local) * half).sum(-1)
 
 
-def _floor(world: WorldBoxes, point: np.ndarray, closing: np.ndarray, is_support: np.ndarray) -> np.ndarray:
+def _floor(
+    hand: Hand,
+    world: WorldBoxes,
+    point: np.ndarray,
+    closing: np.ndarray,
+    is_support: np.ndarray,
+    width: np.ndarray,
+) -> np.ndarray:
     """Height (n, c) of the receptacle under the fingers, 0 on the table."""
-    across = np.stack([-closing[..., 1], closing[..., 0], 0 * closing[..., 0]], -1) * PAD_HALF_SIZE[2]
-    reach = (FINGER_Y + PAD_HALF_SIZE[1]) * closing
-    feet = np.stack([point + a * reach + b * across for a in (-1, 0, 1) for b in (-1, 1)], -2)
+    across = np.stack([-closing[..., 1], closing[..., 0], 0 * closing[..., 0]], -1) * hand.pad_half[2]
+    near, far = (np.asarray(offset)[..., None] * closing for offset in hand.pad_offsets(width)[:2])
+    thickness = hand.pad_half[1] * closing
+    ends = (near - thickness, 0.0, far + thickness)
+    feet = np.stack([point + end + b * across for end in ends for b in (-1, 1)], -2)
     n, c = point.shape[:2]
     floor = np.zeros((n, c))
     for m in np.flatnonzero(is_support[world.boxes.body]):
@@ -208,23 +181,25 @@ def _floor(world: WorldBoxes, point: np.ndarray, closing: np.ndarray, is_support
 
 
 def _collision_cost(
+    hand: Hand,
     world: WorldBoxes,
     candidates: GraspCandidates,
     centre: np.ndarray,
     closing: np.ndarray,
     obj: int,
     is_support: np.ndarray,
+    width: np.ndarray,
 ) -> np.ndarray:
     n, c = centre.shape[:2]
     support = is_support[world.boxes.body]
-    fingers = finger_points(centre, closing, (FINGER_Y, 0.018))
+    fingers = finger_points(hand, centre, closing, hand.pad_offsets(width))
     gap = world.distance(fingers.reshape(n, -1, 3)).reshape(n, c, fingers.shape[2], -1).min(2)
     # The grasped box itself is between the fingers, and receptacles are handled by the floor.
     ignored = support | (np.arange(len(support)) == candidates.box[:, None])
-    gap = np.where(ignored, np.inf, gap) - PAD_HALF_SIZE[1]
+    gap = np.where(ignored, np.inf, gap) - hand.pad_half[1]
     into_itself = (np.where(world.boxes.body == obj, gap, np.inf) < -BLOCKED_DEPTH).any(-1)
     gap = gap.min(-1)
-    palm = palm_points(centre, closing)
+    palm = palm_points(hand, centre, closing)
     palm_gap = world.distance(palm.reshape(n, -1, 3)).reshape(n, c, palm.shape[2], -1).min(2)
     palm_gap = np.where(support, np.inf, palm_gap).min(-1)
     # Something that lies on top of the object between the fingers comes up with it.
@@ -236,26 +211,31 @@ def _collision_cost(
 
 
 def find_blocker(
+    hand: Hand,
     world: WorldBoxes,
     centre: np.ndarray,
     closing: np.ndarray,
     obj: int,
     is_support: np.ndarray,
+    width: np.ndarray,
     margin: float = -BLOCKED_DEPTH,
 ) -> np.ndarray:
     """Index (n,) of the object that a hand around object `obj`, or what it would lift, runs into; -1 for none.
 
     Args:
+        hand: that grasps.
         world: all boxes.
         centre: (n, 3) middle of the pads [m].
         closing: (n, 3) horizontal unit vector.
         obj: index of the object to grasp.
         is_support: (bodies,) True for receptacles, which block nothing.
+        width: (n,) of the side to grasp [m].
         margin: distance below which another object is in the way [m].
     """
-    fingers, palm = finger_points(centre, closing, (FINGER_Y, 0.018)), palm_points(centre, closing)
+    fingers = finger_points(hand, centre, closing, hand.pad_offsets(width))
+    palm = palm_points(hand, centre, closing)
     above = centre[:, None] + np.array([[0, 0, 0.02], [0, 0, 0.035]])
-    room = np.repeat([PAD_HALF_SIZE[1], 0.0, 0.0], [fingers.shape[1], palm.shape[1], 2])
+    room = np.repeat([hand.pad_half[1], 0.0, 0.0], [fingers.shape[1], palm.shape[1], 2])
     gap = (world.distance(np.concatenate([fingers, palm, above], 1)) - room[:, None]).min(1)
     body = world.boxes.body
     gap = np.where(is_support[body] | (body == obj), np.inf, gap)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_env_cronos.expert.body_boxes import WorldBoxes
-from lerobot_env_cronos.expert.grasping import finger_points, reach_cost, wrist_cost
-from lerobot_env_cronos.scene.robot import PAD_HALF_SIZE
+from lerobot_env_cronos.expert.grasping import finger_points
+from lerobot_env_cronos.expert.hands import Hand
 from lerobot_env_cronos.scene.scenes import Scene
 
 REACH = 0.045
@@ -56,15 +56,18 @@ class Held:
     hand_yaw: np.ndarray
     """(n,) yaw of the closing axis [rad]."""
     arm: np.ndarray
-    """(n, 6) joint positions [rad]."""
+    """(n, j) joint positions [rad]."""
+    width: np.ndarray
+    """(n,) of the side that is held [m]."""
 
 
 def choose_places(
-    scene: Scene, obj: int, receptacle: int, world: WorldBoxes, receptacle_xy: np.ndarray, held: Held
+    kind: Hand, scene: Scene, obj: int, receptacle: int, world: WorldBoxes, receptacle_xy: np.ndarray, held: Held
 ) -> Places:
     """Pick the best spot for object `obj` in each of n streams.
 
     Args:
+        kind: of hand.
         scene: whose bodies are indexed.
         obj: index of the held object.
         receptacle: index of the receptacle, -1 for the table.
@@ -81,9 +84,9 @@ def choose_places(
     turn = np.repeat(TURNS, len(offsets))
     spots = np.tile(spots, (1, len(TURNS), 1))
     goal = anchor[:, None] + spots
-    which, gaps = _clearance(world, obj, receptacle, goal, turn, top, held)
+    which, gaps = _clearance(kind, world, obj, receptacle, goal, turn, top, held)
     cost = 150 * np.maximum(ROOM - gaps.min(-1), 0.0)
-    cost += wrist_cost(held.arm[:, None], goal, held.hand_yaw[:, None] + turn) + reach_cost(goal)
+    cost += kind.wrist_cost(held.arm[:, None], goal, held.hand_yaw[:, None] + turn) + kind.reach_cost(goal)
     distance = np.linalg.norm(spots, axis=-1)
     if on_table:
         cost += 2.0 * np.linalg.norm(goal - held.position[:, None, :2], axis=-1)
@@ -109,7 +112,8 @@ def _inset(world: WorldBoxes, receptacle: int, goal: np.ndarray) -> np.ndarray:
 def _table_grid(scene: Scene) -> np.ndarray:
     x = np.linspace(scene.spawn_low[0], scene.spawn_high[0], 7)
     y = np.linspace(scene.spawn_low[1], scene.spawn_high[1], 9)
-    return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    return grid[scene.robot.serves(grid)]
 
 
 def _turned(v: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -120,6 +124,7 @@ def _turned(v: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def _clearance(
+    kind: Hand,
     world: WorldBoxes,
     obj: int,
     receptacle: int,
@@ -134,7 +139,7 @@ def _clearance(
     body = np.einsum("nij,pj->npi", held.rotation, surface)
     lowest = body[..., 2].min(1)
     closing = np.stack([np.cos(held.hand_yaw), np.sin(held.hand_yaw), 0 * held.hand_yaw], 1)
-    fingers = finger_points(held.hand - held.position, closing)
+    fingers = finger_points(kind, held.hand - held.position, closing, kind.pad_offsets(held.width)[:2])
     n, s = goal.shape[:2]
     height = (top - lowest + 0.002)[:, None, None]
     gaps = []
@@ -142,7 +147,7 @@ def _clearance(
     if receptacle >= 0:
         reach = np.linalg.norm(np.abs(surface).max(0)) + np.sqrt(2) * REACH + ROOM
         others &= world.near(goal.mean(1), reach)
-    for points, thickness in ((body, 0.0), (fingers, PAD_HALF_SIZE[1])):
+    for points, thickness in ((body, 0.0), (fingers, kind.pad_half[1])):
         moved = _turned(points[:, None], turn)
         moved = np.concatenate([moved[..., :2] + goal[:, :, None], moved[..., 2:] + height[..., None]], -1)
         distance = world.distance(moved.reshape(n, -1, 3), np.flatnonzero(others))

@@ -11,21 +11,13 @@ from functools import cache
 import numpy as np
 
 from lerobot_env_cronos.benchmark.configurations import Place, sample_configuration
-from lerobot_env_cronos.expert.expert import HOVER_HEIGHT
-from lerobot_env_cronos.expert.grasping import TIP_CLEARANCE
-from lerobot_env_cronos.scene.cameras import is_in_view
-from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, FINGERTIP_REACH, HOME_QPOS
+from lerobot_env_cronos.expert.hands import HANDS
 from lerobot_env_cronos.scene.scenes import BODIES, Scene
-from lerobot_env_cronos.simulation.kinematics import forward_kinematics, inverse_kinematics
 
 SPACING_M = 0.02
 """Of the places at which the arm is tried [m]."""
 HAND_YAWS = np.deg2rad([0.0, 45.0, 90.0, 135.0])
 """Of the closing axis; the hand has to get there with all of them [rad]."""
-POSITION_TOLERANCE_M, TILT_TOLERANCE_RAD = 0.004, np.deg2rad(5)
-"""The hand is there, and points down, within these."""
-IK_ITERATIONS = 40
-"""Enough to converge from home to anywhere in the workspace."""
 
 
 @dataclass(frozen=True)
@@ -65,31 +57,24 @@ def find_reach(scene: Scene) -> Reach:
     A place is within reach if the end effector may go there, the front camera sees it, and the hand gets there
     pointing down: low enough to grasp what lies flat, and high enough to travel with what stands highest.
     """
-    steps = np.round((EE_HIGH - EE_LOW)[:2] / SPACING_M).astype(int)
-    x, y = (EE_LOW[k] + np.arange(steps[k] + 1) * SPACING_M for k in range(2))
+    arm, hand = scene.robot, HANDS[scene.arm]
+    steps = np.round((arm.high - arm.low)[:2] / SPACING_M).astype(int)
+    x, y = (arm.low[k] + np.arange(steps[k] + 1) * SPACING_M for k in range(2))
     places = np.stack(np.meshgrid(x, y, indexing="ij"), -1)
-    lowest = FINGERTIP_REACH + TIP_CLEARANCE
+    lowest = hand.tip_reach + hand.tip_clearance
     tallest = max(BODIES[name].size[2] for name in scene.objects)
-    seen = is_in_view(np.concatenate([places, np.zeros((*places.shape[:2], 1))], -1))
-    good = seen & _hand_gets_to(places, lowest) & _hand_gets_to(places, lowest + HOVER_HEIGHT + tallest)
-    return Reach(EE_LOW[:2].copy(), good[:-1, :-1] & good[1:, :-1] & good[:-1, 1:] & good[1:, 1:])
+    seen = arm.sees(np.concatenate([places, np.zeros((*places.shape[:2], 1))], -1))
+    good = seen & _hand_gets_to(scene, places, lowest)
+    good &= _hand_gets_to(scene, places, lowest + hand.hover + tallest)
+    return Reach(arm.low[:2].copy(), good[:-1, :-1] & good[1:, :-1] & good[:-1, 1:] & good[1:, 1:])
 
 
-def _hand_gets_to(places: np.ndarray, height: float) -> np.ndarray:
+def _hand_gets_to(scene: Scene, places: np.ndarray, height: float) -> np.ndarray:
     """Whether the end effector gets to `height` [m] over places (nx, ny, 2), pointing down: (nx, ny) bool."""
     flat = places.reshape(-1, 2)
     target = np.concatenate([flat, np.full((len(flat), 1), height)], 1)
-    reached = np.ones(len(flat), dtype=bool)
-    for yaw in HAND_YAWS:
-        c, s = np.cos(yaw), np.sin(yaw)
-        # Columns: the fingers' direction, the closing axis, and what is across both.
-        rotation = np.array([[0.0, c, s], [0.0, s, -c], [-1.0, 0.0, 0.0]])
-        q = np.tile(HOME_QPOS, (len(flat), 1))
-        q = inverse_kinematics(q, target, np.broadcast_to(rotation, (len(flat), 3, 3)), IK_ITERATIONS)
-        p, R, _ = forward_kinematics(q)
-        reached &= np.linalg.norm(p - target, axis=1) < POSITION_TOLERANCE_M
-        reached &= -R[:, 2, 0] > np.cos(TILT_TOLERANCE_RAD)
-    return reached.reshape(places.shape[:2])
+    reached = [HANDS[scene.arm].gets_to(target, yaw) for yaw in HAND_YAWS]
+    return np.all(reached, axis=0).reshape(places.shape[:2])
 
 
 def sample_reach_configuration(scene: Scene, rng: np.random.Generator) -> np.ndarray:

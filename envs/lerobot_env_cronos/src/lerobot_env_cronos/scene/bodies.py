@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lerobot_env_cronos.scene.robot import CONTACT_SOLIMP
+from lerobot_env_cronos.scene.contacts import CONTACT_SOLIMP
 from lerobot_env_cronos.scene.scenes import Body
 
 # Sliding 1.0 as in SimplerEnv; torsional and rolling friction (condim 6) keep round bodies from rolling away.
@@ -83,6 +83,12 @@ SHAPES: dict[str, Callable[[mujoco.MjsBody, Body], None]] = {
     "newspaper": _add_slab,
     "box": _add_slab,
     "disc": _add_plate,
+    "brick": _add_slab,
+    "marker": _add_slab,
+    "tape": _add_plate,
+    "lid": _add_slab,
+    "dish": _add_plate,
+    "mat": _add_slab,
 }
 """How to build a body, by `Body.shape`; another shape is another entry here and in `visuals.objects.LOOKS`."""
 _PACKAGED = dict(SHAPES)

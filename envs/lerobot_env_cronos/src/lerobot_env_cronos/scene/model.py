@@ -1,37 +1,35 @@
 """The MuJoCo model of a scene, built with MjSpec."""
 
+from collections.abc import Callable
+
 import mujoco
 
 from lerobot_env_cronos.scene import visuals
+from lerobot_env_cronos.scene.arms.so101.model import add_robot as add_so101
+from lerobot_env_cronos.scene.arms.widowx.model import add_robot as add_widowx
 from lerobot_env_cronos.scene.bodies import add_body
-from lerobot_env_cronos.scene.cameras import CAMERAS, camera_quaternion
-from lerobot_env_cronos.scene.robot import CONTACT_SOLIMP, add_robot
-from lerobot_env_cronos.scene.scenes import BODIES, CONTROL_HZ, Scene
+from lerobot_env_cronos.scene.cameras import camera_quaternion
+from lerobot_env_cronos.scene.contacts import CONTACT_SOLIMP
+from lerobot_env_cronos.scene.scenes import BODIES, Scene
 
-# The numbers that trade speed against honest physics.
-TIMESTEP_S = 0.008
 # With the implicit integrators what a hand holds slips up to three times as far at long time steps: they damp the
 # arm after the contacts were solved.
 INTEGRATOR = mujoco.mjtIntegrator.mjINT_EULER
-SUBSTEPS = round(1 / (CONTROL_HZ * TIMESTEP_S))
-"""Physics steps of a control step."""
-
-RAMP_CHUNKS, RAMP_SHARE = 8, 0.9
-"""The joint targets move linearly in 8 chunks over most of a control step. Without that, what is held slips."""
-CHUNK_SUBSTEPS = round(RAMP_SHARE * SUBSTEPS / RAMP_CHUNKS)
-"""Physics steps of one chunk of the ramp."""
 
 SETTLE_CHUNK_S = 0.1
 """How often bodies that settle are looked at [s]."""
-SETTLE_SUBSTEPS = round(SETTLE_CHUNK_S / TIMESTEP_S)
 
-SOLREF = (2 * TIMESTEP_S, 1.0)
-"""Time constant [s] and damping ratio of contacts: as stiff as the time step allows, 2 dt."""
+ADD_ROBOT: dict[str, Callable[[mujoco.MjSpec], None]] = {"widowx": add_widowx, "so101": add_so101}
+"""How to build an arm, by its name."""
 
 TABLE_LOW, TABLE_HIGH, TABLE_THICKNESS = (-0.20, -0.45), (0.70, 0.45), 0.30
 """Table top in the base frame, surface at z = 0 [m]. A body pushed over its edge falls to the floor. Contacts push
 out along the shortest way: a hand that leans on a body would press it through the thin board that is drawn."""
 FLOOR_Z = -0.75
+
+
+SIDES = ("left", "right")
+"""Of the hand, in the order of `Arm.fingers`."""
 
 
 def grasp_sensor(side: str, obj: str) -> str:
@@ -54,22 +52,21 @@ def support_sensor(obj: str, support: str) -> str:
 
 
 def build_spec(scene: Scene, looks: bool = True) -> mujoco.MjSpec:
-    """Build the scene's MjSpec: table, floor, WX250S, free bodies, cameras, contact sensors, and their looks."""
+    """Build the scene's MjSpec: table, floor, arm, free bodies, cameras, contact sensors, and their looks."""
     spec = mujoco.MjSpec()
     spec.modelname = scene.name
     spec.compiler.degree = False
     spec.compiler.autolimits = True
-    _set_options(spec)
+    _set_options(spec, scene.robot.timestep_s)
     _add_furniture(spec)
-    add_robot(spec)
+    ADD_ROBOT[scene.arm](spec)
     bodies = {name: add_body(spec, BODIES[name]) for name in scene.bodies}
     _add_contact_sensors(spec, scene)
-    for name, camera in CAMERAS.items():
-        spec.worldbody.add_camera(
-            name=name, pos=camera["pos"], fovy=camera["fovy"], quat=camera_quaternion(camera["xyaxes"])
-        )
+    for name, camera in scene.robot.cameras.items():
+        mount = spec.body(camera.body) if camera.body else spec.worldbody
+        mount.add_camera(name=name, pos=camera.pos, fovy=camera.fovy, quat=camera_quaternion(camera))
     if looks:
-        visuals.dress(spec, bodies)
+        visuals.dress(spec, scene, bodies)
     return spec
 
 
@@ -78,10 +75,11 @@ def build_model(scene: Scene, looks: bool = True) -> mujoco.MjModel:
     return build_spec(scene, looks).compile()
 
 
-def _set_options(spec: mujoco.MjSpec) -> None:
-    spec.default.geom.solref = spec.default.equality.solref = SOLREF
+def _set_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
+    # Time constant [s] and damping ratio of contacts: as stiff as the time step allows.
+    spec.default.geom.solref = spec.default.equality.solref = (2 * timestep_s, 1.0)
     option = spec.option
-    option.timestep = TIMESTEP_S
+    option.timestep = timestep_s
     option.integrator = INTEGRATOR
     # Elliptic cones and a high friction-to-normal impedance ratio: grasped objects do not creep.
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -117,12 +115,14 @@ def _add_furniture(spec: mujoco.MjSpec) -> None:
 
 def _add_contact_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
     """What success and grasp are judged from: net contact forces on each object, world frame [N], and contacts."""
+    arm = scene.robot
     force, found = mujoco.mjtConDataField.mjCONDATA_FORCE, mujoco.mjtConDataField.mjCONDATA_FOUND
     geom, body, subtree = mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY
     for obj in scene.objects:
-        for side in ("left", "right"):
-            _add_contact_sensor(spec, grasp_sensor(side, obj), (geom, f"{side}_pad"), obj, force)
-        _add_contact_sensor(spec, hand_sensor(obj), (subtree, "gripper_link"), obj, found)
+        for side, (kind, name) in zip(SIDES, arm.fingers, strict=True):
+            finger = {"geom": geom, "body": body}[kind], name
+            _add_contact_sensor(spec, grasp_sensor(side, obj), finger, obj, force)
+        _add_contact_sensor(spec, hand_sensor(obj), (subtree, arm.hand), obj, found)
         _add_contact_sensor(spec, support_sensor(obj, TABLE), (geom, TABLE), obj, force)
         for receptacle in scene.receptacles:
             _add_contact_sensor(spec, support_sensor(obj, receptacle), (body, receptacle), obj, force)

@@ -6,13 +6,14 @@ Sizes and densities are those of the SimplerEnv Bridge table and its multi-objec
 package are added by `lerobot_env_cronos.benchmark.registry.register_scene`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-CONTROL_HZ = 5
-"""Control frequency of the environment, of `render_fps` and of every dataset [Hz]."""
+from lerobot_env_cronos.scene.arms.arm import Arm
+from lerobot_env_cronos.scene.arms.registry import get_arm
+from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
 
-STEPS_PER_TASK = 80
-"""K, the task-switch interval and the window of an evaluation episode [control steps] (paper, Section 4)."""
+CONTROL_HZ, STEPS_PER_TASK = WIDOWX.fps, WIDOWX.steps_per_task
+"""Of the WidowX, for packages that know one arm; a scene's are `scene.fps` and `scene.steps_per_task`."""
 
 LONG = 1.5
 """Length over width from which on a body has two ends."""
@@ -62,7 +63,10 @@ class Task:
 
 @dataclass(frozen=True)
 class Scene:
-    """Objects and receptacles that share one table.
+    """Objects and receptacles that share one table, and the name of the arm that stands at it.
+
+    `arm` is `widowx` or `so101`, a key of `scene.arms.registry.ARMS`. Nothing is put where it does not serve the
+    spawn area.
 
     The reference scatters ONE object and ONE receptacle over a square of 0.15 m. A shared scene holds all of
     them without overlap, so `spawn_low` and `spawn_high` widen it to 0.20 x 0.30 m, all within reach [m]; six
@@ -74,6 +78,8 @@ class Scene:
     receptacles: tuple[str, ...]
     spawn_low: tuple[float, float] = (0.20, -0.15)
     spawn_high: tuple[float, float] = (0.40, 0.15)
+    # Not a part of `repr`, of which saved states have a hash.
+    arm: str = field(default=WIDOWX.name, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("objects", "receptacles", "spawn_low", "spawn_high"):
@@ -82,21 +88,27 @@ class Scene:
                 raise ValueError(f"{name} of the scene {self.name!r} must be a tuple, ({value!r},), got {value!r}")
             # Scenes are keys of caches, which lists cannot be.
             object.__setattr__(self, name, tuple(value))
+        get_arm(self.arm)
+
+    @property
+    def robot(self) -> Arm:
+        """The arm that stands at the table."""
+        return get_arm(self.arm)
 
     @property
     def fps(self) -> int:
         """Control steps a second [Hz]."""
-        return CONTROL_HZ
+        return self.robot.fps
 
     @property
     def steps_per_task(self) -> int:
         """Control steps that a task has."""
-        return STEPS_PER_TASK
+        return self.robot.steps_per_task
 
     @property
     def robot_type(self) -> str:
         """LeRobot's name of the arm, of datasets."""
-        return "widowx"
+        return self.robot.robot_type
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -127,8 +139,19 @@ BODIES: dict[str, Body] = {
         Body("plastic bottle", (0.0361, 0.1216, 0.0390), 1916, "water bottle"),
         Body("carpet", (0.110, 0.0943, 0.0037), 2815, "carpet"),
         Body("newspaper", (0.0815, 0.1161, 0.0041), 2278, "newspaper"),
+        # The desk of the SO-101: what its jaws hold, 8 to 45 mm wide and at least 12 mm high.
+        Body("cube", (0.025, 0.025, 0.025), 900, "box", (0.86, 0.20, 0.16)),
+        Body("brick", (0.030, 0.060, 0.015), 1000, "brick", (0.16, 0.45, 0.80)),
+        Body("marker", (0.015, 0.120, 0.015), 900, "marker", (0.13, 0.60, 0.34)),
+        Body("roll of tape", (0.040, 0.040, 0.020), 900, "tape"),
+        Body("box lid", (0.105, 0.085, 0.010), 900, "lid"),
+        Body("plate", (0.100, 0.100, 0.007), 1500, "dish", (0.30, 0.52, 0.86)),
+        Body("mat", (0.095, 0.095, 0.004), 2500, "mat"),
     )
 }
+
+SO101_SPAWN = ((0.02, -0.28), (0.28, 0.28))
+"""A box around the sector that the arm serves [m]."""
 
 SCENES: dict[str, Scene] = {
     scene.name: scene
@@ -142,6 +165,14 @@ SCENES: dict[str, Scene] = {
             spawn_high=(0.42, 0.15),
         ),
         Scene("playroom_2x2", ("toy bear", "plastic bottle"), ("newspaper", "carpet")),
+        Scene("so101_desk_2x2", ("cube", "marker"), ("box lid", "plate"), *SO101_SPAWN, arm="so101"),
+        Scene(
+            "so101_desk_3x3",
+            ("brick", "marker", "roll of tape"),
+            ("box lid", "plate", "mat"),
+            *SO101_SPAWN,
+            arm="so101",
+        ),
     )
 }
 

@@ -75,6 +75,7 @@ class FilamentRenderer:
     def __init__(self, model: mujoco.MjModel, height: int, width: int, camera: str):
         self.model, self.height, self.width = model, height, width
         self.camera = model.camera(camera).id
+        self._moves = bool(model.cam_bodyid[self.camera])
         self._view: list[Any] = _thread().call(_open, model, self.camera)
         self._finalizer = weakref.finalize(self, _close, self._view, os.getpid())
 
@@ -91,6 +92,8 @@ class FilamentRenderer:
             mujoco.mj_kinematics(self.model, data)
             mujoco.mj_camlight(self.model, data)
             scene.update(data)
+            if self._moves:
+                view.camera = _camera(self.model, data, self.camera)
             renderer.target("frame", frame)
             renderer.render([view])
         return frames
@@ -124,7 +127,7 @@ def _open(model: mujoco.MjModel, camera: int) -> list[Any]:
     scene = ModelScene(renderer.context, model, renderer.scene("scene"))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    # The cameras stand still.
+    # A camera that moves is set anew for every frame.
     return [data, renderer, scene, View("scene", "frame", camera=_camera(model, data, camera))]
 
 

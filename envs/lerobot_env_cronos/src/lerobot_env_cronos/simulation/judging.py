@@ -1,4 +1,6 @@
-"""What lies where, and what the hand holds: read from the contact forces once after every control step.
+"""What lies where, and what the hand holds: read from the contact forces every 0.2 s.
+
+That is after every control step of an arm at 5 Hz and after every sixth at 30 Hz; grasps are read after each.
 
 An object is placed on a receptacle when the hand, having carried it, has let go of it there, and at two readings
 in a row it lies still, neither hand nor table touches it, and the receptacle carries at least half of its weight.
@@ -21,14 +23,14 @@ CARRIES, CARRIES_NOTHING = 0.5, 0.05
 """Shares of an object's weight: what carries it, and what does not take part in carrying it."""
 
 STILL_DISTANCE = 0.004
-"""No point of an object that lies still moves further in a control step: 0.02 m/s. The speed at one moment would
-not do: light objects may tremble in place [m]."""
+"""No point of an object that lies still moves further between two readings: 0.02 m/s. The speed at one moment
+would not do: light objects may tremble in place [m]."""
 
 RESTING_GAP = 0.001
 """Height above its resting pose up to which a body that was put there counts as lying on the table [m]."""
 
 CARRY_READINGS = 3
-"""Control steps in a row that make a hold a carry; a push may wedge an object between the fingers for two."""
+"""Readings in a row that make a hold a carry; a push may wedge an object between the fingers for two."""
 
 NOTHING, IN_HAND, ON_TABLE = -2, -1, 0
 """Where an object is: nowhere that counts, in the hand, on the table; on receptacle i of the scene is i + 1."""
@@ -56,10 +58,13 @@ class Judge:
     """
 
     STATE_FIELDS = ("grasped", "held", "carried_to", "place", "pose", "confirmed", "rests")
+    SEEN_FIELDS = ("looks", "touched", "sum_up", "max_up", "max_share")
 
     def __init__(self, scene: Scene, model: mujoco.MjModel, sensordata: np.ndarray, qpos: np.ndarray):
         self.scene = scene
         self._sensordata, self._qpos = sensordata, qpos
+        self._looks_per_reading = scene.robot.looks_per_reading
+        self._is_read_each_step = scene.robot.steps_per_reading == 1
         objects = scene.objects
         supports = (TABLE, *scene.receptacles)
 
@@ -85,7 +90,7 @@ class Judge:
         self.place, self.confirmed, self.rests = (np.full(shape, NOTHING, dtype=np.int8) for _ in range(3))
 
     def look(self, ids: np.ndarray) -> None:
-        """Take in the contacts of simulations `ids` (k,) now, for the next reading; several times a control step.
+        """Take in the contacts of simulations `ids` (k,) now, for the next reading; many times before it.
 
         What leans and trembles may be off the table at one moment.
         """
@@ -96,10 +101,19 @@ class Judge:
         self._max_up[ids] = np.maximum(self._max_up[ids], up)
         self._max_share[ids] = np.maximum(self._max_share[ids], share)
 
+    def is_due(self, ids: np.ndarray) -> np.ndarray:
+        """Whether simulations `ids` (k,) are to be read after this control step, (k,) bool."""
+        looks = self._looks[ids]
+        return (looks == 0) | (looks >= self._looks_per_reading)
+
+    def read_grasps(self, ids: np.ndarray, closing_axis: np.ndarray) -> None:
+        """Read what simulations `ids` (k,) hold, and nothing else; see `read`."""
+        self.grasped[ids], _ = self._read_grasps(self._sensordata[ids][:, self._fingers], closing_axis)
+
     def forget(self, ids: np.ndarray) -> None:
         """Forget what was looked at in simulations `ids`."""
-        for seen in (self._looks, self._touched, self._sum_up, self._max_up, self._max_share):
-            seen[ids] = 0
+        for name in self.SEEN_FIELDS:
+            getattr(self, f"_{name}")[ids] = 0
 
     def _contacts(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Touched by the hand (k, objects), upward and whole force of each support (k, objects, supports) in
@@ -111,7 +125,7 @@ class Judge:
     def read(
         self, ids: np.ndarray, closing_axis: np.ndarray, *, settled: bool = False, stepped: bool = True
     ) -> None:
-        """Read the contacts of simulations `ids` (k,), after a control step or an intervention.
+        """Read the contacts of simulations `ids` (k,), where that is due or after an intervention.
 
         Args:
             ids: the simulations.
@@ -203,4 +217,7 @@ class Judge:
 
     def state_arrays(self) -> dict[str, np.ndarray]:
         """What the next reading depends on: live arrays with a leading dimension n."""
-        return {name: getattr(self, name) for name in self.STATE_FIELDS}
+        arrays = {name: getattr(self, name) for name in self.STATE_FIELDS}
+        if self._is_read_each_step:
+            return arrays
+        return arrays | {name: getattr(self, f"_{name}") for name in self.SEEN_FIELDS}

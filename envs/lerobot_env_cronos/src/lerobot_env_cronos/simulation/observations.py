@@ -6,35 +6,22 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from lerobot_env_cronos.scene.cameras import CAMERAS
 from lerobot_env_cronos.scene.scenes import Scene, Task
 from lerobot_env_cronos.simulation.rendering import RENDERERS, ClassicRenderer, FilamentRenderer, make_renderer
 from lerobot_env_cronos.simulation.simulation import Simulation
 
 OBS_TYPES = ("pixels_agent_pos", "environment_state_agent_pos")
 
-AGENT_POS_NAMES = (
-    *(f"ee.{axis}" for axis in "xyz"),
-    *(f"ee.r{row}{column}" for column in (1, 2) for row in (1, 2, 3)),
-    "gripper.opening",
-    *(f"ee_target_offset.{axis}" for axis in "xyz"),
-)
-"""Proprioception (13): end-effector position [m], the first two columns of its rotation matrix, gripper opening
-(0 closed, 1 open), and the commanded minus the measured position [m]."""
-
-
 TASK_OBSERVATIONS = ("none", "one_hot")
 """How a policy that reads no instructions is told its task: not at all, or in `agent_pos`."""
 
-STATE_LIMIT = 10.0
-"""Bound of every state observation; a body further away than this has left the room [m]."""
 
-
-def parse_cameras(camera_name: str) -> list[str]:
-    """Cameras of a comma-separated list; a ValueError names the valid ones."""
+def parse_cameras(scene: Scene, camera_name: str) -> list[str]:
+    """Cameras of a comma-separated list, of a scene; a ValueError names the valid ones."""
     cameras = [name.strip() for name in camera_name.split(",") if name.strip()]
-    if not cameras or set(cameras) - CAMERAS.keys():
-        raise ValueError(f"unknown camera_name {camera_name!r}; valid, comma-separated: {sorted(CAMERAS)}")
+    valid = scene.robot.cameras
+    if not cameras or set(cameras) - valid.keys():
+        raise ValueError(f"unknown camera_name {camera_name!r}; valid, comma-separated: {sorted(valid)}")
     return cameras
 
 
@@ -49,17 +36,17 @@ def environment_state_names(scene: Scene) -> tuple[str, ...]:
 
 
 def agent_pos_names(scene: Scene, task_observation: str = "none") -> tuple[str, ...]:
-    """Names of `agent_pos`: `AGENT_POS_NAMES` and, with `one_hot`, which object and which receptacle is meant.
+    """Names of `agent_pos`: the arm's, and with `one_hot` which object and receptacle is meant.
 
     Of each block one number is 1, the others are 0. The table is the receptacle of the reset tasks.
     """
     if task_observation not in TASK_OBSERVATIONS:
         raise ValueError(f"unknown task_observation {task_observation!r}; valid values: {list(TASK_OBSERVATIONS)}")
     if task_observation == "none":
-        return AGENT_POS_NAMES
+        return scene.robot.state_names
     bodies = [f"task.object.{name}" for name in scene.objects]
     bodies += [f"task.receptacle.{name}" for name in (*scene.receptacles, "table")]
-    return AGENT_POS_NAMES + tuple(name.replace(" ", "_") for name in bodies)
+    return scene.robot.state_names + tuple(name.replace(" ", "_") for name in bodies)
 
 
 class ObservationBuilder:
@@ -88,9 +75,10 @@ class ObservationBuilder:
                 f"{height}, {width} and {render_size}"
             )
         self.renderer = renderer
-        self.cameras = parse_cameras(camera_name)
+        self.cameras = parse_cameras(simulation.scene, camera_name)
         self.flat = flat_observation
         self.simulation = simulation
+        self._limit = simulation.scene.robot.state_limit
         self.agent_pos_names = agent_pos_names(simulation.scene, task_observation)
         self.tells_task = task_observation == "one_hot"
         self.pixels = obs_type == "pixels_agent_pos"
@@ -101,7 +89,7 @@ class ObservationBuilder:
 
     def _space(self) -> gym.spaces.Dict:
         def box(n: int) -> gym.spaces.Box:
-            return gym.spaces.Box(-STATE_LIMIT, STATE_LIMIT, (n,), np.float32)
+            return gym.spaces.Box(-self._limit, self._limit, (n,), np.float32)
 
         spaces: dict[str, gym.Space] = {"agent_pos": box(len(self.agent_pos_names))}
         if self.privileged:
@@ -120,15 +108,15 @@ class ObservationBuilder:
 
     def observe(self, ids: np.ndarray, tasks: Sequence[Task]) -> dict[str, Any]:
         """Observation of simulations `ids` (k,) under their `tasks`, (k, ...); every array is fresh."""
-        p, R = self.simulation.end_effector()
-        agent_pos = self._agent_pos(p, R)[ids]
+        sim = self.simulation
+        agent_pos = sim.scene.robot.proprioception(sim)[ids].clip(-self._limit, self._limit)
         if self.tells_task:
             agent_pos = np.concatenate([agent_pos, self._one_hot(tasks)], axis=1)
         observation: dict[str, Any] = {"agent_pos": agent_pos}
         if self.privileged:
-            observation["environment_state"] = self._environment_state(p)[ids]
+            observation["environment_state"] = self._environment_state(sim.end_effector()[0])[ids]
         if self.pixels:
-            qpos = self.simulation.qpos[ids]
+            qpos = sim.qpos[ids]
             images = {camera: self._renderer(self.size, camera).render(qpos) for camera in self.cameras}
             observation |= self._place_images(images)
         return observation
@@ -137,17 +125,12 @@ class ObservationBuilder:
         """An observation (k, ...) as it would be under other `tasks`; what they do not change is shared."""
         if not self.tells_task:
             return observation
-        agent_pos = observation["agent_pos"][:, : len(AGENT_POS_NAMES)]
+        agent_pos = observation["agent_pos"][:, : len(self.simulation.scene.robot.state_names)]
         return observation | {"agent_pos": np.concatenate([agent_pos, self._one_hot(tasks)], axis=1)}
 
     def render(self, qpos: np.ndarray) -> np.ndarray:
         """Frames (k, height, width, 3) of states `qpos` (k, nq) for videos, from the first camera."""
         return self._renderer(self.render_size, self.cameras[0]).render(qpos)
-
-    def _agent_pos(self, p: np.ndarray, R: np.ndarray) -> np.ndarray:
-        sim = self.simulation
-        columns = (p, R[:, :, 0], R[:, :, 1], sim.gripper_opening()[:, None], sim.target_position() - p)
-        return np.concatenate(columns, axis=1, dtype=np.float32).clip(-STATE_LIMIT, STATE_LIMIT)
 
     def _one_hot(self, tasks: Sequence[Task]) -> np.ndarray:
         scene = self.simulation.scene
@@ -163,7 +146,7 @@ class ObservationBuilder:
         R = self.simulation.body_rotations()
         parts = (position, R[..., 0], R[..., 1], position - p[:, None])
         flat = np.concatenate(parts, axis=2, dtype=np.float32).reshape(len(p), -1)
-        return flat.clip(-STATE_LIMIT, STATE_LIMIT)
+        return flat.clip(-self._limit, self._limit)
 
     def _renderer(self, size: tuple[int, int], camera: str) -> ClassicRenderer | FilamentRenderer:
         key = (size, camera)

@@ -1,8 +1,6 @@
 """Many copies of one scene on MuJoCo's batched engine: control, contacts, and putting things somewhere.
 
-The action is a delta of the end effector's TARGET pose (facts of the Bridge set-up: the delta is applied to the
-previous target, not to the measured pose) and a gripper command. Targets become joint targets by inverse
-kinematics and are ramped over most of the control step.
+What an action means is the arm's: it becomes targets of the joints and of the gripper.
 """
 
 import os
@@ -14,35 +12,16 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from lerobot_env_cronos.benchmark.version import VERSION
-from lerobot_env_cronos.scene.model import CHUNK_SUBSTEPS, RAMP_CHUNKS, SETTLE_SUBSTEPS, SUBSTEPS, build_model
-from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW, FINGER_CLOSED, FINGER_OPEN, FINGERTIP_REACH, HOME_QPOS
+from lerobot_env_cronos.scene.arms.arm import Arm, Pose
+from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
+from lerobot_env_cronos.scene.model import SETTLE_CHUNK_S, build_model
+from lerobot_env_cronos.scene.rotations import quaternion_to_matrix
 from lerobot_env_cronos.scene.scenes import BODIES, Scene
 from lerobot_env_cronos.simulation.judging import Judge
-from lerobot_env_cronos.simulation.kinematics import (
-    LastPose,
-    inverse_kinematics,
-    quaternion_to_matrix,
-    rotation_vector_to_matrix,
-)
 
-ACTION_LOW = np.array([-0.028727253, -0.0417035, -0.026093859, -0.08092105, -0.092886995, -0.20718276, 0.0])
-ACTION_HIGH = np.array([0.028309678, 0.040855255, 0.040161587, 0.0819204776, 0.0779285, 0.203825745, 1.0])
-"""q01 and q99 of `bridge_orig`, the range that OpenVLA's action tokens span: m, rad, gripper (1 open).
+ACTION_NAMES, ACTION_LOW, ACTION_HIGH = WIDOWX.action_names, WIDOWX.action_low, WIDOWX.action_high
+"""Of the WidowX, for packages that know one arm; a scene's are those of `scene.robot`."""
 
-Rotations here are a rotation vector. Those of `bridge_orig` are Euler angles: up to .77 degrees apart a step."""
-ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
-
-
-def _round_outwards(bound: np.ndarray, towards: float) -> np.ndarray:
-    nearest = bound.astype(np.float32)
-    inside = nearest > bound if towards < 0 else nearest < bound
-    return np.where(inside, np.nextafter(nearest, np.float32(towards)), nearest)
-
-
-ACTION_LOW_F32, ACTION_HIGH_F32 = _round_outwards(ACTION_LOW, -np.inf), _round_outwards(ACTION_HIGH, np.inf)
-"""The bounds as float32, rounded outwards: an action that was clipped to them does exactly the same again."""
-
-NUM_ARM_JOINTS, NUM_ROBOT_JOINTS = 6, 8
 MAX_SPEED = 200.0
 """Joint or body speed beyond which a simulation counts as diverged [m/s, rad/s]."""
 BODY_SPEED_LIMITS = np.array([3.0, 50.0])
@@ -59,6 +38,21 @@ def num_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+class LastPose:
+    """An arm's kinematics that remember their last answer: a control step asks for the same arm more than once."""
+
+    def __init__(self, arm: Arm) -> None:
+        self._forward = arm.forward_kinematics
+        self._q = np.empty((0, arm.num_joints))
+        self._pose = self._forward(self._q)
+
+    def __call__(self, q: np.ndarray) -> Pose:
+        """See `Arm.forward_kinematics`; what it returns must not be changed."""
+        if not np.array_equal(q, self._q):
+            self._q, self._pose = q.copy(), self._forward(q)
+        return self._pose
+
+
 class Simulation:
     """`num_sims` copies of `scene`, stepped together on `num_threads` threads (bit-identical at any number).
 
@@ -69,20 +63,20 @@ class Simulation:
     def __init__(self, scene: Scene, num_sims: int, num_threads: int = 0):
         if num_threads < 0:
             raise ValueError(f"num_threads must be 0 (all cores) or more, got {num_threads}")
-        self.scene, self.num_sims = scene, num_sims
+        self.scene, self.num_sims, self.arm = scene, num_sims, scene.robot
+        self._joints, self._robot = self.arm.num_joints, self.arm.num_robot_joints
         self.num_threads = num_threads or num_cores()
         self.model = build_model(scene, looks=False)
         self._batch = Batch(self.model, num_sims, self.num_threads, persistent=True)
         self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl, self.sensordata = self._batch.bind("ctrl"), self._batch.bind("sensordata")
         self._qpos_slice = {
-            name: slice(NUM_ROBOT_JOINTS + 7 * i, NUM_ROBOT_JOINTS + 7 * (i + 1))
-            for i, name in enumerate(scene.bodies)
+            name: slice(self._robot + 7 * i, self._robot + 7 * (i + 1)) for i, name in enumerate(scene.bodies)
         }
         self._sensor_slice = self._find_sensors()
-        self.arm_target = np.tile(HOME_QPOS, (num_sims, 1))
-        self.gripper_target = np.full(num_sims, FINGER_OPEN)
-        self._measured_pose, self._target_pose = LastPose(), LastPose()
+        self.arm_target = np.tile(self.arm.home_qpos[: self._joints], (num_sims, 1))
+        self.gripper_target = np.full(num_sims, self.arm.home_gripper)
+        self._measured_pose, self._target_pose = LastPose(self.arm), LastPose(self.arm)
         self.judge = Judge(scene, self.model, self.sensordata, self.qpos)
 
     @cached_property
@@ -100,7 +94,7 @@ class Simulation:
         """Advance the simulations `ids` by one control step.
 
         Args:
-            actions: (len(ids), 7) in physical units, within bounds.
+            actions: (len(ids), a) in physical units, within bounds.
             ids: (k,) indices of the simulations.
 
         Returns:
@@ -108,21 +102,20 @@ class Simulation:
         """
         before = self.qpos[ids].copy()
         start = self.arm_target[ids]
-        goal = self._next_arm_target(start, actions)
-        self.arm_target[ids] = goal
-        self.gripper_target[ids] = np.where(actions[:, 6] > 0.5, FINGER_OPEN, FINGER_CLOSED)
-        self._ctrl[ids, NUM_ARM_JOINTS] = self.gripper_target[ids]
+        goal, gripper = self.arm.next_target(start, actions, self._target_pose)
+        self.arm_target[ids], self.gripper_target[ids] = goal, gripper
+        self._ctrl[ids, self._joints] = gripper
         broken = np.zeros(self.num_sims, dtype=bool)
-        for k in range(1, RAMP_CHUNKS + 1):
-            self._ctrl[ids, :NUM_ARM_JOINTS] = start + (k / RAMP_CHUNKS) * (goal - start)
-            last = k == RAMP_CHUNKS
-            broken |= self._advance(ids, SUBSTEPS - (RAMP_CHUNKS - 1) * CHUNK_SUBSTEPS if last else CHUNK_SUBSTEPS)
+        for share, substeps in self.arm.chunks:
+            self._ctrl[ids, : self._joints] = start + share * (goal - start)
+            broken |= self._advance(ids, substeps)
             self.judge.look(ids)
         diverged = broken[ids] | self._is_diverged(ids)
         if diverged.any():
             self._restore(ids[diverged], before[diverged])
-            self.judge.forget(ids[diverged])
-        self._read(ids)
+        due = self.judge.is_due(ids)
+        self._read(ids[due])
+        self._read_grasps(ids[~due])
         return diverged
 
     def _advance(self, ids: np.ndarray, nstep: int) -> np.ndarray:
@@ -135,7 +128,7 @@ class Simulation:
         return broken
 
     def _limit_body_speeds(self, ids: np.ndarray) -> None:
-        velocity = self.qvel[ids, NUM_ROBOT_JOINTS:].reshape(len(ids), len(self.scene.bodies), 2, 3)
+        velocity = self.qvel[ids, self._robot :].reshape(len(ids), len(self.scene.bodies), 2, 3)
         # No component is above limit / sqrt(3): hardly ever is there more to look at.
         if (np.abs(velocity) < _SLOW_COMPONENTS).all():
             return
@@ -147,15 +140,7 @@ class Simulation:
             mine = too_fast.any((1, 2))
             scale = np.where(too_fast, BODY_SPEED_LIMITS / np.maximum(speed, BODY_SPEED_LIMITS), 1.0)
         limited = (velocity * scale[..., None])[mine]
-        self.qvel[ids[mine], NUM_ROBOT_JOINTS:] = limited.reshape(len(limited), -1)
-
-    def _next_arm_target(self, q: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        pose = p, R, _ = self._target_pose(q)
-        R = rotation_vector_to_matrix(actions[:, 3:6]) @ R
-        p = np.clip(p + actions[:, :3], EE_LOW, EE_HIGH)
-        # The fingertips' target stays above the table, however the hand is tilted.
-        p[:, 2] = np.maximum(p[:, 2], 0.001 - FINGERTIP_REACH * np.minimum(R[:, 2, 0], 0.0))
-        return inverse_kinematics(q, p, R, pose=pose)
+        self.qvel[ids[mine], self._robot :] = limited.reshape(len(limited), -1)
 
     def _is_diverged(self, ids: np.ndarray) -> np.ndarray:
         finite = np.isfinite(self.qpos[ids]).all(1) & np.isfinite(self.qvel[ids]).all(1)
@@ -167,11 +152,12 @@ class Simulation:
     def _restore(self, ids: np.ndarray, qpos: np.ndarray) -> None:
         """Put the simulations into `qpos` at rest, everything awake, targets where the arm is."""
         self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.judge.forget(ids)
         self.qpos[ids] = qpos
         self.qvel[ids] = 0.0
-        self.arm_target[ids] = qpos[:, :NUM_ARM_JOINTS]
-        self._ctrl[ids, :NUM_ARM_JOINTS] = self.arm_target[ids]
-        self._ctrl[ids, NUM_ARM_JOINTS] = self.gripper_target[ids]
+        self.arm_target[ids] = qpos[:, : self._joints]
+        self._ctrl[ids, : self._joints] = self.arm_target[ids]
+        self._ctrl[ids, self._joints] = self.gripper_target[ids]
         self._batch.forward(ids)
 
     def place(self, ids: np.ndarray, poses: np.ndarray) -> None:
@@ -180,7 +166,7 @@ class Simulation:
             return
         qpos = np.empty((len(ids), self.model.nq))
         poses = np.asarray(poses)
-        qpos[:, NUM_ROBOT_JOINTS:] = poses.reshape(len(ids), -1)
+        qpos[:, self._robot :] = poses.reshape(len(ids), -1)
         self._home(ids, qpos)
         self.judge.put(ids, poses[:, : len(self.scene.objects)])
 
@@ -191,15 +177,14 @@ class Simulation:
         self._read(ids, settled=True)
 
     def _home(self, ids: np.ndarray, qpos: np.ndarray) -> None:
-        qpos[:, :NUM_ARM_JOINTS] = HOME_QPOS
-        qpos[:, NUM_ARM_JOINTS:NUM_ROBOT_JOINTS] = (FINGER_OPEN, -FINGER_OPEN)
-        self.gripper_target[ids] = FINGER_OPEN
+        qpos[:, : self._robot] = self.arm.home_qpos
+        self.gripper_target[ids] = self.arm.home_gripper
         self._restore(ids, qpos)
 
     def move_arm(self, ids: np.ndarray, arm_qpos: np.ndarray) -> None:
-        """Put the arm at joint positions (k, 6) [rad], gripper as it is; bodies stay where they are."""
+        """Put the arm at joint positions (k, j) [rad], gripper as it is; bodies stay where they are."""
         qpos = self.qpos[ids].copy()
-        qpos[:, :NUM_ARM_JOINTS] = arm_qpos
+        qpos[:, : self._joints] = arm_qpos
         self._restore(ids, qpos)
         self._read(ids)
 
@@ -210,7 +195,7 @@ class Simulation:
         qpos[:, self._qpos_slice[body]] = poses
         self._restore(ids, qpos)
         self.arm_target[ids] = arm_target
-        self._ctrl[ids, :NUM_ARM_JOINTS] = arm_target
+        self._ctrl[ids, : self._joints] = arm_target
         self.judge.put_one(ids, body)
         self._read(ids, stepped=False)
 
@@ -221,11 +206,11 @@ class Simulation:
         """
         before = self.qpos[ids].copy()
         for _ in range(SETTLE_MAX_CHUNKS):
-            broken = self._advance(ids, SETTLE_SUBSTEPS)
+            broken = self._advance(ids, round(SETTLE_CHUNK_S / self.arm.timestep_s))
             diverged = broken[ids] | self._is_diverged(ids)
             if diverged.any():
                 self._restore(ids[diverged], before[diverged])
-            moving = np.abs(self.qvel[ids, NUM_ROBOT_JOINTS:]).max(1) > SETTLE_SPEED
+            moving = np.abs(self.qvel[ids, self._robot :]).max(1) > SETTLE_SPEED
             ids, before = ids[moving], before[moving]
             if not len(ids):
                 return
@@ -234,7 +219,7 @@ class Simulation:
 
     def end_effector(self) -> tuple[np.ndarray, np.ndarray]:
         """Measured pose of the end-effector site: p_we (n, 3) [m] and R_we (n, 3, 3)."""
-        p, R, _ = self._measured_pose(self.qpos[:, :NUM_ARM_JOINTS])
+        p, R, *_ = self._measured_pose(self.qpos[:, : self._joints])
         return p, R
 
     def target_position(self) -> np.ndarray:
@@ -243,8 +228,7 @@ class Simulation:
 
     def gripper_opening(self) -> np.ndarray:
         """Opening of the gripper (n,), 0 closed to 1 open."""
-        left = self.qpos[:, NUM_ARM_JOINTS]
-        return np.clip((left - FINGER_CLOSED) / (FINGER_OPEN - FINGER_CLOSED), 0.0, 1.0)
+        return self.arm.gripper_opening(self.qpos)
 
     def body_pose(self, body: str) -> np.ndarray:
         """Pose of a body (n, 7): position [m] and quaternion (w, x, y, z)."""
@@ -252,7 +236,7 @@ class Simulation:
 
     def body_poses(self) -> np.ndarray:
         """Poses of all bodies (n, bodies, 7), in the scene's order."""
-        return self.qpos[:, NUM_ROBOT_JOINTS:].reshape(self.num_sims, -1, 7)
+        return self.qpos[:, self._robot :].reshape(self.num_sims, -1, 7)
 
     def force(self, sensor: str) -> np.ndarray:
         """Net contact force (n, 3) of a sensor [N], world frame."""
@@ -260,8 +244,17 @@ class Simulation:
 
     def _read(self, ids: np.ndarray, *, settled: bool = False, stepped: bool = True) -> None:
         """Let the judge see the simulations `ids` as they are now."""
-        _, R, _ = self._measured_pose(self.qpos[ids, :NUM_ARM_JOINTS])
-        self.judge.read(ids, R[:, :, 1], settled=settled, stepped=stepped)
+        if len(ids):
+            self.judge.read(ids, self._closing_axis(ids), settled=settled, stepped=stepped)
+
+    def _read_grasps(self, ids: np.ndarray) -> None:
+        """The same between two readings: what the hands hold, and nothing else."""
+        if len(ids):
+            self.judge.read_grasps(ids, self._closing_axis(ids))
+
+    def _closing_axis(self, ids: np.ndarray) -> np.ndarray:
+        """(k, 3), world frame."""
+        return self.arm.closing_axis(self._measured_pose(self.qpos[ids, : self._joints])[1])
 
     def is_grasped(self, obj: str) -> np.ndarray:
         """Both fingers press on the object (n,); see `Judge.is_grasped`."""
@@ -273,8 +266,7 @@ class Simulation:
 
     def is_on_table(self, obj: str) -> np.ndarray:
         """The object is released and rests on the table within reach, on no receptacle (n,)."""
-        xy = self.body_pose(obj)[:, :2]
-        return self.judge.is_on_table(obj) & ((xy >= EE_LOW[:2]) & (xy <= EE_HIGH[:2])).all(1)
+        return self.judge.is_on_table(obj) & self.arm.is_within(self.body_pose(obj)[:, :2])
 
     def body_rotations(self) -> np.ndarray:
         """Rotation matrices of all bodies (n, bodies, 3, 3)."""

@@ -10,8 +10,7 @@ from functools import partial
 import numpy as np
 
 from lerobot_env_cronos.benchmark.configurations import Place, draw_spawn_place, footprint_corners, sample_place
-from lerobot_env_cronos.scene.cameras import is_in_view, is_spawn_area_in_view
-from lerobot_env_cronos.scene.robot import EE_HIGH, EE_LOW
+from lerobot_env_cronos.scene.cameras import is_spawn_area_in_view
 from lerobot_env_cronos.scene.scenes import BODIES, Scene
 from lerobot_env_cronos.simulation.simulation import Simulation
 
@@ -29,7 +28,7 @@ class Unsuitable(StrEnum):
     """Why a body has to be put back."""
 
     OUTSIDE = "outside"
-    """Its centre is outside the box that the end effector moves in, seen from above."""
+    """Its centre is where the end effector does not get to, seen from above."""
     FALLEN = "fallen"
     """Its centre is below the table's surface, or a receptacle lies on its edge."""
     UNSEEN = "unseen"
@@ -39,22 +38,22 @@ class Unsuitable(StrEnum):
 def find_unsuitable(simulation: Simulation) -> dict[Unsuitable, np.ndarray]:
     """Return for each reason which bodies of which simulations it applies to, (n, bodies) bool."""
     position = simulation.body_poses()[..., :3]
-    outside = np.asarray((position[..., :2] < EE_LOW[:2]) | (position[..., :2] > EE_HIGH[:2])).any(-1)
+    arm = simulation.scene.robot
     flat = np.array([name in simulation.scene.receptacles for name in simulation.scene.bodies])
     # Lying upside down is as good as lying upright.
     upright = np.abs(simulation.body_rotations()[..., 2, 2])
     on_edge = flat & (upright < np.cos(MAX_RECEPTACLE_TILT_RAD))
     return {
-        Unsuitable.OUTSIDE: np.asarray(outside),
+        Unsuitable.OUTSIDE: np.asarray(~arm.is_within(position[..., :2])),
         Unsuitable.FALLEN: np.asarray((position[..., 2] < 0.0) | on_edge),
-        Unsuitable.UNSEEN: np.asarray(~is_in_view(position)),
+        Unsuitable.UNSEEN: np.asarray(~arm.sees(position)),
     }
 
 
 def _draw_place_in_view(scene: Scene, body: str, rng: np.random.Generator) -> Place:
     for _ in range(MAX_VIEW_DRAWS):
         xy, yaw = draw_spawn_place(scene, body, rng)
-        if is_in_view(np.array([*xy, BODIES[body].size[2] / 2])):
+        if scene.robot.sees(np.array([*xy, BODIES[body].size[2] / 2])):
             break
     return xy, yaw
 

@@ -27,14 +27,40 @@ COLOURS: dict[str, tuple[tuple[float, float, float], float, float]] = {
     "table edge": ((0.50, 0.43, 0.36), 0.1, 0.2),
     "wall": ((0.88, 0.90, 0.91), 0.0, 0.0),
 }
+"""Of every scene, used or not: the models of the first scenes stay what they were."""
+MORE_COLOURS: dict[str, tuple[tuple[float, float, float], float, float]] = {
+    "white print": ((0.93, 0.93, 0.91), 0.2, 0.3),
+    "servo": ((0.09, 0.09, 0.10), 0.4, 0.4),
+    "servo horn": ((0.20, 0.20, 0.22), 0.4, 0.4),
+    "cardboard": ((0.70, 0.53, 0.35), 0.05, 0.1),
+    "cardboard edge": ((0.56, 0.41, 0.26), 0.05, 0.1),
+    "masking tape": ((0.90, 0.78, 0.50), 0.1, 0.2),
+}
+"""Added where they are used."""
 
 
 def add_materials(spec: mujoco.MjSpec) -> None:
-    """Add every material and texture that the visuals name."""
-    for name, (rgb, specular, shininess) in COLOURS.items():
-        spec.add_material(name=name, rgba=[*rgb, 1.0], specular=specular, shininess=shininess)
+    """Add the materials and textures of `COLOURS`; `use_material` adds the others."""
+    for name, look in COLOURS.items():
+        _add_colour(spec, name, *look)
     for name, image in {"cloth": _gingham(64), "carpet": _rug(64), "newspaper": _front_page(64)}.items():
         _add_textured(spec, name, image)
+
+
+def use_material(spec: mujoco.MjSpec, name: str) -> None:
+    """Add a material of `MORE_COLOURS`, or the texture of a mat, unless it is there."""
+    if spec.material(name) is not None:
+        return
+    if name == "mat":
+        _add_textured(spec, name, _cutting_mat(64))
+    else:
+        _add_colour(spec, name, *MORE_COLOURS[name])
+
+
+def _add_colour(
+    spec: mujoco.MjSpec, name: str, rgb: tuple[float, float, float], specular: float, shininess: float
+) -> None:
+    spec.add_material(name=name, rgba=[*rgb, 1.0], specular=specular, shininess=shininess)
 
 
 def add_plain_material(spec: mujoco.MjSpec, name: str, colour: tuple[float, float, float]) -> None:
@@ -56,6 +82,13 @@ def _gingham(n: int) -> np.ndarray:
     stripe = (np.arange(n) * 5 // n) % 2 == 0
     cover = (stripe[:, None] * 0.5 + stripe[None] * 0.5)[..., None]
     return (1 - cover) * np.array([0.97, 0.96, 0.99]) + cover * np.array([0.44, 0.27, 0.72])
+
+
+def _cutting_mat(n: int) -> np.ndarray:
+    """A dark green mat (n, n, 3) with a pale grid of eight cells."""
+    green, line = np.array([0.09, 0.30, 0.25]), np.array([0.45, 0.65, 0.55])
+    on_line = np.arange(n) % (n // 8) == n // 16
+    return np.where((on_line[:, None] | on_line[None])[..., None], line, green)
 
 
 def _rug(n: int) -> np.ndarray:

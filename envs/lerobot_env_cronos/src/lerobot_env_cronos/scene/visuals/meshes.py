@@ -9,6 +9,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from lerobot_env_cronos.scene.visuals.materials import use_material
+
 Surface = tuple[np.ndarray, np.ndarray]
 
 VISUAL_GROUP = 2
@@ -148,6 +150,7 @@ def add_visual(
     With a `texture_size` (x and y, or one for both) [m] the mesh is textured as seen from above, one repeat per
     `texture_size`.
     """
+    use_material(spec, material)
     vertices, faces = merge(*parts)
     corners = vertices[faces].reshape(-1, 3)
     mesh = spec.add_mesh(name=f"{name} visual", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)

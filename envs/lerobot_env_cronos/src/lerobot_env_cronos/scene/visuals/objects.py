@@ -6,6 +6,7 @@ What a look consists of is named `<body>` and `<body>/<part>`, so that no two bo
 from collections.abc import Callable
 
 import mujoco
+import numpy as np
 
 from lerobot_env_cronos.scene.bodies import SHOVEL_BLADE_SHARE, SHOVEL_HANDLE_HALF_WIDTH
 from lerobot_env_cronos.scene.scenes import Body
@@ -16,6 +17,8 @@ from lerobot_env_cronos.scene.visuals.meshes import (
     box,
     circle,
     cylinder,
+    loft,
+    merge,
     prism,
     rounded_rectangle,
     stack,
@@ -157,6 +160,65 @@ def _dress_disc(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> N
     _add_plain(spec, spec_body, body, cylinder(body.size[0] / 2, -body.size[2] / 2, body.size[2] / 2, sides=24))
 
 
+def _dress_brick(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A building block of the body's colour with a pale stripe across its middle."""
+    hx, hy, hz = (s / 2 for s in body.size)
+    _add_plain(spec, spec_body, body, box((-hx, -hy, -hz), (hx, hy, hz), 0.002))
+    stripe = box((-hx - 5e-5, -0.2 * hy, -hz), (hx + 5e-5, 0.2 * hy, hz + 5e-5), caps="last")
+    add_visual(spec, spec_body, f"{body.name}/stripe", "white plastic", stripe)
+
+
+def _dress_marker(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A marker lying along y: a white barrel, a cap of the body's colour at +y, and a band of it at -y."""
+    hx, hy, hz = (s / 2 for s in body.size)
+    outline = superellipse(hx, hz, 3.0, 10)
+    barrel = prism(0.96 * outline, -0.94 * hy, 0.40 * hy, "y", "none")
+    add_visual(spec, spec_body, f"{body.name}/barrel", "white plastic", barrel)
+    cap = stack(outline, [(0.38 * hy, 1.0), (0.94 * hy, 1.0), (hy, 0.72)], "y")
+    end = stack(outline, [(-hy, 0.86), (-0.92 * hy, 1.0), (-0.80 * hy, 1.0)], "y")
+    _add_plain(spec, spec_body, body, merge(cap, end))
+
+
+def _dress_tape(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A roll of masking tape, lying: a ring around a cardboard core."""
+    radius, hz = body.size[0] / 2, body.size[2] / 2
+    for part, material, outer, inner in (("", "masking tape", 1.0, 0.62), ("/core", "cardboard edge", 0.62, 0.54)):
+        add_visual(spec, spec_body, body.name + part, material, _ring(radius * outer, radius * inner, hz))
+
+
+def _ring(outer: float, inner: float, hz: float) -> Surface:
+    """A ring about the z axis from -hz to hz: its walls and its flat sides."""
+    sections = [(inner, -hz), (outer, -hz), (outer, hz), (inner, hz), (inner, -hz)]
+    rings = [np.column_stack([circle(radius, 16), np.full(16, z)]) for radius, z in sections]
+    return loft(np.stack(rings), "none")
+
+
+def _dress_lid(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A cardboard lid, upside up, with darker edges."""
+    hx, hy, hz = (s / 2 for s in body.size)
+    edge = 0.004
+    add_visual(
+        spec, spec_body, body.name, "cardboard edge", box((-hx, -hy, -hz), (hx, hy, hz - 2e-4), 0.003, "last")
+    )
+    top = box((-hx + edge, -hy + edge, hz - 2e-4), (hx - edge, hy - edge, hz), 0.002, "last")
+    add_visual(spec, spec_body, f"{body.name}/top", "cardboard", top)
+
+
+def _dress_dish(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A shallow plate: a flared rim of the body's colour around a white well."""
+    outline, hz = circle(body.size[0] / 2, 24), body.size[2] / 2
+    _add_plain(spec, spec_body, body, stack(outline, [(-hz, 0.72), (0.5 * hz, 1.0), (hz, 0.98), (0.4 * hz, 0.74)]))
+    well = stack(0.74 * outline, [(0.3 * hz, 1.0), (0.45 * hz, 1.0)], caps="last")
+    add_visual(spec, spec_body, f"{body.name}/well", "white plastic", well)
+
+
+def _dress_mat(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body) -> None:
+    """A green cutting mat with a grid."""
+    hx, hy, hz = (s / 2 for s in body.size)
+    surface = box((-hx, -hy, -hz), (hx, hy, hz), 0.004, "last")
+    add_visual(spec, spec_body, body.name, "mat", surface, texture_size=body.size[:2])
+
+
 def _add_plain(spec: mujoco.MjSpec, spec_body: mujoco.MjsBody, body: Body, surface: Surface) -> None:
     material = f"{body.name} colour"
     add_plain_material(spec, material, body.colour or DEFAULT_COLOUR)
@@ -174,5 +236,11 @@ LOOKS: dict[str, Callable[[mujoco.MjSpec, mujoco.MjsBody, Body], None]] = {
     "newspaper": _dress_newspaper,
     "box": _dress_box,
     "disc": _dress_disc,
+    "brick": _dress_brick,
+    "marker": _dress_marker,
+    "tape": _dress_tape,
+    "lid": _dress_lid,
+    "dish": _dress_dish,
+    "mat": _dress_mat,
 }
 """How to draw a body, by `Body.shape`."""

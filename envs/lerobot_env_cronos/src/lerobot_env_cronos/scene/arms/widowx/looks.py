@@ -1,12 +1,12 @@
 """Looks of the WidowX-250S: black links around Dynamixel servos, in each link's own frame.
 
-Link axes at the zero pose: x forward, y left, z up; every joint frame is that of `lerobot_env_cronos.scene.robot`.
+Link axes at the zero pose: x forward, y left, z up; every joint frame is that of `geometry`.
 Each link is one dark mesh, one of a lighter black that sets plates apart from servos, and a few metal accents.
 """
 
 import mujoco
 
-from lerobot_env_cronos.scene.robot import FINGER_POS, PAD_HALF_SIZE, PAD_POS
+from lerobot_env_cronos.scene.arms.widowx.geometry import FINGER_POS, PAD_HALF_SIZE, PAD_POS
 from lerobot_env_cronos.scene.visuals.meshes import (
     Surface,
     add_visual,
