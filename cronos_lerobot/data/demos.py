@@ -7,7 +7,6 @@ from typing import Protocol
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, REWARD
 from lerobot_env_cronos import CronosVectorEnv, Scene, Task
-from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW
 
 from cronos_lerobot.agents.processing import observation_columns
 from cronos_lerobot.data.demo_starts import FREE_LAYOUTS, StartConfig, check_starts, other_tasks, tasks_before
@@ -43,8 +42,9 @@ class Expert(Protocol):
 class DemoConfig:
     """What a demonstration is."""
 
-    max_steps: int = ranged(80, minimum=1)
-    """Control steps until an episode counts as failed, also if its object has lain too short by then."""
+    max_steps: int | None = ranged(None, minimum=1)
+    """Control steps until an episode counts as failed, also if its object has lain too short by then; null takes
+    those of a task of the scene."""
     steps_after_release: int = ranged(3, minimum=0)
     """Frames kept after the object lies on its receptacle and is released."""
     keep_failures: bool = False
@@ -54,6 +54,14 @@ class DemoConfig:
     start: StartConfig = field(default_factory=StartConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     misses: MissConfig = field(default_factory=MissConfig)
+
+
+def check_arm(config: DemoConfig, scene: Scene) -> None:
+    """Raise a ValueError for what is shown by the WidowX alone."""
+    if scene.arm != "widowx" and (config.misses.share or config.start.arm_pose == "random"):
+        raise ValueError(
+            f"--misses.share and --start.arm_pose=random are for the WidowX, {scene.name} has {scene.arm}"
+        )
 
 
 @dataclass
@@ -115,7 +123,9 @@ class DemoCollector:
         # A resumed dataset begins with the next configuration, as far as the attempts succeeded.
         self._tried = dict(self._kept)
         self._episodes: list[_Episode | None] = [None] * env.num_envs
-        self._noise = ActionNoise(config.noise, env.num_envs)
+        self._arm = env.scene.robot
+        self._max_steps = config.max_steps or env.steps_per_task
+        self._noise = ActionNoise(config.noise, env.num_envs, self._arm)
         self._misses = GraspMisses(config.misses, env)
         self._failures_in_a_row = 0
         check_starts(config.start, env.scene, tasks)
@@ -135,7 +145,8 @@ class DemoCollector:
         self._start_idle_streams(total)
         observation = self.env.observe()
         while any(episode is not None for episode in self._episodes):
-            labels = np.clip(self.expert.act(), ACTION_LOW, ACTION_HIGH).astype(np.float32)
+            arm = self._arm
+            labels = np.clip(self.expert.act(), arm.action_low, arm.action_high).astype(np.float32)
             columns = observation_columns(observation) | {ACTION: labels}
             observation, reward, _, _, info = self.env.step(self._perturb(labels))
             columns |= {REWARD: reward, SUCCESS: info["is_success"]}
@@ -147,9 +158,10 @@ class DemoCollector:
         recording = np.array([episode is not None and not episode.preludes for episode in self._episodes])
         executed = self._misses.apply(labels, recording)
         executed = self._noise.apply(executed, recording)
+        resting = self._arm.hold(self.env.simulation.arm_target)
         for stream, episode in enumerate(self._episodes):
             if episode is None or episode.settling:
-                executed[stream] = _REST
+                executed[stream] = resting[stream]
         return executed
 
     def _after_step(self, stream: int, columns: Mapping[str, np.ndarray], info: Mapping[str, np.ndarray]) -> None:
@@ -168,7 +180,7 @@ class DemoCollector:
             for key, column in columns.items():
                 episode.frames.setdefault(key, []).append(column[stream].copy())
         succeeded = episode.released > self.config.steps_after_release
-        is_late = episode.steps >= self.config.max_steps
+        is_late = episode.steps >= self._max_steps
         if info["diverged"][stream]:
             self._end(stream, episode, succeeded=False, keep=False)
         elif succeeded and episode.preludes:
@@ -185,7 +197,7 @@ class DemoCollector:
         if succeeded:
             self._failures_in_a_row = 0
         else:
-            last = f"to {episode.task.instruction!r} within --max_steps={self.config.max_steps}"
+            last = f"to {episode.task.instruction!r} within --max_steps={self._max_steps}"
             self._count_failure("the expert failed", last)
         if keep:
             frames = {key: np.stack(values) for key, values in episode.frames.items()}
@@ -282,7 +294,3 @@ class DemoCollector:
         self._noise.reset(ids[0], episode.rng)
         self._misses.reset(ids[0], episode.rng)
         episode.settling, episode.steps, episode.released = True, 0, 0
-
-
-_REST = np.array([0, 0, 0, 0, 0, 0, 1], dtype=np.float32)
-"""No motion, gripper open."""

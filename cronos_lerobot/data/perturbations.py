@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from lerobot_env_cronos import CronosVectorEnv
-from lerobot_env_cronos.simulation.kinematics import inverse_kinematics
-from lerobot_env_cronos.simulation.simulation import ACTION_HIGH, ACTION_LOW
+from lerobot_env_cronos.scene.arms.arm import Arm
+from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
+from lerobot_env_cronos.scene.arms.widowx.kinematics import inverse_kinematics
 
 from cronos_lerobot.ranges import ranged
 
-MOTION = slice(0, 6)
-"""The end-effector part of an action; the gripper command is never perturbed by noise."""
+ACTION_LOW, ACTION_HIGH = WIDOWX.action_low, WIDOWX.action_high
 
 
 @dataclass
@@ -25,13 +25,13 @@ class NoiseConfig:
     share: float = ranged(0.0, minimum=0, maximum=1)
     """Share of the episodes that have bursts, from 0 to 1."""
     rate: float = ranged(0.15, minimum=0, maximum=1)
-    """Probability per control step that a burst begins."""
+    """Probability per 0.2 s, a control step of the WidowX, that a burst begins."""
     min_steps: int = ranged(1, minimum=1)
-    """Shortest burst [control steps]."""
+    """Shortest burst [0.2 s]."""
     max_steps: int = 4
-    """Longest burst [control steps]."""
+    """Longest burst [0.2 s]."""
     scale: float = ranged(0.6, minimum=0)
-    """Standard deviation of the push, as a fraction of half the action range of each dimension."""
+    """Standard deviation of the push: of half the range of the WidowX's actions, of 6 degrees of the SO-101's."""
 
     def __post_init__(self) -> None:
         """Check what goes with what."""
@@ -59,12 +59,12 @@ class MissConfig:
 class ActionNoise:
     """The bursts of every stream."""
 
-    def __init__(self, config: NoiseConfig, num_envs: int) -> None:
+    def __init__(self, config: NoiseConfig, num_envs: int, arm: Arm) -> None:
         """No bursts until `reset`."""
-        self._config = config
+        self._config, self._arm = config, arm
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._remaining = np.zeros(num_envs, dtype=np.int64)
-        self._push = np.zeros((num_envs, 6))
+        self._push = np.zeros((num_envs, len(arm.push)))
 
     def reset(self, stream: int, rng: np.random.Generator) -> None:
         """A new episode begins in `stream`; `rng` decides whether it has bursts, and draws them."""
@@ -72,24 +72,27 @@ class ActionNoise:
         self._remaining[stream] = 0
 
     def apply(self, actions: np.ndarray, active: np.ndarray) -> np.ndarray:
-        """Add the noise of this step to actions (n, 7) of the `active` (n,) streams; returns a copy."""
-        actions, config = actions.copy(), self._config
+        """Add the noise of this step to actions (n, a) of the `active` (n,) streams; returns a copy.
+
+        The gripper's command, the last number, is never perturbed.
+        """
+        actions, config, arm = actions.copy(), self._config, self._arm
         for stream in np.flatnonzero(active):
             rng = self._rngs[stream]
             if rng is None:
                 continue
-            if self._remaining[stream] == 0 and rng.random() < config.rate:
-                self._remaining[stream] = rng.integers(config.min_steps, config.max_steps, endpoint=True)
-                half_range = (ACTION_HIGH - ACTION_LOW)[MOTION] / 2
-                self._push[stream] = rng.normal(size=6) * config.scale * half_range
+            if self._remaining[stream] == 0 and rng.random() < config.rate / arm.steps_per_reading:
+                length = rng.integers(config.min_steps, config.max_steps, endpoint=True)
+                self._remaining[stream] = length * arm.steps_per_reading
+                self._push[stream] = rng.normal(size=len(arm.push)) * config.scale * arm.push
             if self._remaining[stream] > 0:
                 self._remaining[stream] -= 1
-                actions[stream, MOTION] += self._push[stream]
-        return np.clip(actions, ACTION_LOW, ACTION_HIGH).astype(np.float32)
+                actions[stream, :-1] += self._push[stream]
+        return np.clip(actions, arm.action_low, arm.action_high).astype(np.float32)
 
 
 class GraspMisses:
-    """Steers the gripper beside the object, closes it there, and hands the arm back to the expert."""
+    """Steers the WidowX's gripper beside the object, closes it there, and hands the arm back to the expert."""
 
     HOVER_M = 0.06
     """Height above the object at which the approach ends and the descent begins [m]."""
@@ -156,7 +159,7 @@ MIN_TARGET_HEIGHT_M = 0.032
 
 
 def move_arm_at_random(env: CronosVectorEnv, stream: int, rng: np.random.Generator) -> None:
-    """Put the arm of a stream at a random place well above the table, the hand turned a little."""
+    """Put the WidowX of a stream at a random place well above the table, the hand turned a little."""
     sim, ids = env.simulation, np.array([stream])
     position, rotation = sim.end_effector()
     position = np.array([[*rng.uniform((0.20, -0.18), (0.42, 0.18)), rng.uniform(0.12, 0.26)]])

@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from cronos_lerobot.command_line import parse_command_line
 from cronos_lerobot.data.demo_starts import check_starts
-from cronos_lerobot.data.demos import DemoCollector, DemoConfig, ExpertError, tasks_of
+from cronos_lerobot.data.demos import DemoCollector, DemoConfig, ExpertError, check_arm, tasks_of
 from cronos_lerobot.data.origin import DEMONSTRATIONS, flags_of, origin_of
 from cronos_lerobot.data.schema import demonstration_features
 from cronos_lerobot.data.writer import RecordingError, SegmentWriter
@@ -105,6 +105,7 @@ def _open(cfg: RecordDemosConfig) -> tuple[SegmentWriter, DemoCollector]:
     tasks = tasks_of(cfg, scene) if task is None else [task]
     env = cfg.env.create_streams(cfg.num_envs)
     check_starts(cfg.start, scene, tasks)
+    check_arm(cfg, scene)
     # Before there is a dataset: whether pictures can be drawn here.
     env.observe(np.arange(1))
     writer = open_writer(cfg, env)

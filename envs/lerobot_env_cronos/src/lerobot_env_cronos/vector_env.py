@@ -61,6 +61,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
 
     Attributes:
         fps: control steps a second.
+        steps_per_task: control steps that a task has.
         robot_type: LeRobot's, of datasets.
         tasks, reset_tasks: of the scene; `current_tasks` has the one of each stream.
         state_names, action_names: one for each number of `agent_pos` and of an action.
@@ -118,7 +119,7 @@ class CronosVectorEnv(gym.vector.VectorEnv):
         self.single_action_space = gym.spaces.Box(*self._bounds, dtype=np.float32)
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
-        self.fps = self.scene.fps
+        self.fps, self.steps_per_task = self.scene.fps, self.scene.steps_per_task
         self.robot_type = self.scene.robot_type
         self.metadata = self.metadata | {"render_fps": self.fps}
         self.tasks, self.reset_tasks = self.scene.tasks, self.scene.reset_tasks

@@ -106,6 +106,8 @@ class Arm(ABC):
     action_low: np.ndarray
     action_high: np.ndarray
     """Bounds, in physical units."""
+    push: np.ndarray
+    """What noise of scale 1 adds to an action, without the gripper's number (a - 1,)."""
     state_names: tuple[str, ...]
     """Of proprioception, `agent_pos`."""
     state_limit: float
@@ -182,6 +184,10 @@ class Arm(ABC):
         Returns:
             The next joint targets (n, j), and what the gripper's actuator is told (n,).
         """
+
+    @abstractmethod
+    def hold(self, target: np.ndarray) -> np.ndarray:
+        """Actions (n, a) that leave the arm at joint targets (n, j) [rad], the gripper open."""
 
     @abstractmethod
     def gripper_opening(self, qpos: np.ndarray) -> np.ndarray:

@@ -49,6 +49,7 @@ class SO101(Arm):
 
     action_names = tuple(f"{joint}.pos" for joint in JOINTS)
     action_low, action_high = (from_joints(bound[None])[0].round(6) for bound in (JOINT_LOW, JOINT_HIGH))
+    push = np.full(NUM_JOINTS, 6.0)
     state_names = action_names
     state_limit = 360.0
 
@@ -94,6 +95,10 @@ class SO101(Arm):
         """See `Arm`: the action itself, whatever the last target was."""
         joints = to_joints(actions)
         return joints[:, :NUM_JOINTS], joints[:, NUM_JOINTS]
+
+    def hold(self, target: np.ndarray) -> np.ndarray:
+        """See `Arm`."""
+        return np.concatenate([np.rad2deg(target), np.full((len(target), 1), HOME_GRIPPER)], axis=1)
 
     def gripper_opening(self, qpos: np.ndarray) -> np.ndarray:
         """See `Arm`."""

@@ -45,6 +45,7 @@ class WidowX(Arm):
     # Rotations here are a rotation vector. Those of `bridge_orig` are Euler angles, up to .77 degrees apart.
     action_low = np.array([-0.028727253, -0.0417035, -0.026093859, -0.08092105, -0.092886995, -0.20718276, 0.0])
     action_high = np.array([0.028309678, 0.040855255, 0.040161587, 0.0819204776, 0.0779285, 0.203825745, 1.0])
+    push = (action_high - action_low)[:-1] / 2
     # End-effector position [m], the first two columns of its rotation matrix, gripper opening (0 closed, 1 open),
     # and the commanded minus the measured position [m].
     state_names = (
@@ -96,6 +97,10 @@ class WidowX(Arm):
         p_next[:, 2] = np.maximum(p_next[:, 2], 0.001 - FINGERTIP_REACH * np.minimum(R_next[:, 2, 0], 0.0))
         goal = inverse_kinematics(target, p_next, R_next, pose=(p, R, jacobian))
         return goal, np.where(actions[:, 6] > 0.5, FINGER_OPEN, FINGER_CLOSED)
+
+    def hold(self, target: np.ndarray) -> np.ndarray:
+        """See `Arm`."""
+        return np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(target), 1))
 
     def gripper_opening(self, qpos: np.ndarray) -> np.ndarray:
         """See `Arm`."""
