@@ -8,6 +8,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_env_cronos import CronosEnvConfig, CronosVectorEnv
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.expert.reach import find_reach
+from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
 
 from cronos_lerobot.data.demos import DemoCollector, DemoConfig, StartConfig
 from cronos_lerobot.data.file_check import check_dataset
@@ -79,7 +80,7 @@ def test_noise_is_executed_but_not_recorded(env, tmp_path, monkeypatch):
 
 
 def test_noise_leaves_the_gripper_and_the_bounds_alone():
-    noise = ActionNoise(NoiseConfig(share=1.0, rate=1.0, scale=5.0), 2)
+    noise = ActionNoise(NoiseConfig(share=1.0, rate=1.0, scale=5.0), 2, WIDOWX)
     for stream in range(2):
         noise.reset(stream, np.random.default_rng(stream))
     actions = np.tile(np.array([0, 0, 0, 0, 0, 0, 1], np.float32), (2, 1))
