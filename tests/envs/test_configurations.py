@@ -44,7 +44,7 @@ def test_doing_nothing_moves_nothing_and_completes_nothing(scene, split):
     poses = load_configurations(scene, split)
     env = make(64, scene)
     env.scene_reset(np.arange(64), np.arange(64), split)
-    keep_still(env, 10)
+    keep_still(env, 2 * env.fps)
     assert np.abs(env.simulation.body_poses() - poses)[..., :3].max() < 2e-3
     assert np.abs(env.simulation.qvel[:, env.scene.robot.num_robot_joints :]).max() < 1e-6
     assert not env.find_complete(env.scene.tasks).any()

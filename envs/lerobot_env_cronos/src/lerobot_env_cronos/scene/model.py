@@ -5,6 +5,7 @@ from collections.abc import Callable
 import mujoco
 
 from lerobot_env_cronos.scene import visuals
+from lerobot_env_cronos.scene.arms.arm import Arm
 from lerobot_env_cronos.scene.arms.so101.model import add_robot as add_so101
 from lerobot_env_cronos.scene.arms.widowx.model import add_robot as add_widowx
 from lerobot_env_cronos.scene.bodies import add_body
@@ -57,7 +58,7 @@ def build_spec(scene: Scene, looks: bool = True) -> mujoco.MjSpec:
     spec.modelname = scene.name
     spec.compiler.degree = False
     spec.compiler.autolimits = True
-    _set_options(spec, scene.robot.timestep_s)
+    _set_options(spec, scene.robot)
     _add_furniture(spec)
     ADD_ROBOT[scene.arm](spec)
     bodies = {name: add_body(spec, BODIES[name]) for name in scene.bodies}
@@ -75,18 +76,18 @@ def build_model(scene: Scene, looks: bool = True) -> mujoco.MjModel:
     return build_spec(scene, looks).compile()
 
 
-def _set_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
+def _set_options(spec: mujoco.MjSpec, arm: Arm) -> None:
     # Time constant [s] and damping ratio of contacts: as stiff as the time step allows.
-    spec.default.geom.solref = spec.default.equality.solref = (2 * timestep_s, 1.0)
+    spec.default.geom.solref = spec.default.equality.solref = (2 * arm.timestep_s, 1.0)
     option = spec.option
-    option.timestep = timestep_s
+    option.timestep = arm.timestep_s
     option.integrator = INTEGRATOR
     # Elliptic cones and a high friction-to-normal impedance ratio: grasped objects do not creep.
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = 10.0
     # Bodies at rest cost nothing: three times as many steps per second.
     option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-    option.sleep_tolerance = 1e-3
+    option.sleep_tolerance = arm.sleep_tolerance
     # A simulation that diverges is reported by `Simulation.step`, not silently put back to qpos0.
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
 

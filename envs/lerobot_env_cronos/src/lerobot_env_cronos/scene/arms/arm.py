@@ -121,6 +121,8 @@ class Arm(ABC):
     """What the gripper's actuator is told at home."""
 
     timestep_s: float
+    sleep_tolerance: float
+    """Speed below which MuJoCo puts bodies to sleep, with the forces that they have then [m/s]."""
     chunks: tuple[tuple[float, int], ...]
     """Of a control step: the share of the way from the last joint target to the next one at which the actuators
     are, and physics steps. The contacts are looked at after each."""

@@ -56,8 +56,9 @@ class SO101(Arm):
     num_joints = NUM_JOINTS
     home_qpos = to_joints(np.array([[*HOME_DEG, HOME_GRIPPER]]))[0]
     home_gripper = float(home_qpos[-1])
-    timestep_s = 1 / 240
-    chunks = ((1.0, 4), (1.0, 4))
+    # In small steps what rocks would fall asleep while it does not bear its weight.
+    timestep_s, sleep_tolerance = 1 / 240, 1e-4
+    chunks = ((1.0, 2),) * 4
     steps_per_reading = 6
 
     cameras = {  # noqa: RUF012 - a value, the same for every scene

@@ -59,7 +59,7 @@ class WidowX(Arm):
     num_joints = 6
     home_qpos = np.array([*HOME_QPOS, FINGER_OPEN, -FINGER_OPEN])
     home_gripper = FINGER_OPEN
-    timestep_s = TIMESTEP_S
+    timestep_s, sleep_tolerance = TIMESTEP_S, 1e-3
     chunks = _ramp(fps)
     steps_per_reading = 1
 
