@@ -15,7 +15,7 @@ from lerobot_env_cronos.benchmark.configurations import SPLITS
 from lerobot_env_cronos.benchmark.files import CONFIGS, CONFIGURATIONS, make_tables
 from lerobot_env_cronos.benchmark.load import benchmark_scene
 from lerobot_env_cronos.config import DEFAULT_SCENE
-from lerobot_env_cronos.scene.scenes import BODIES, STEPS_PER_TASK
+from lerobot_env_cronos.scene.scenes import BODIES
 from lerobot_env_cronos.simulation.gl import RenderingError
 
 from cronos_lerobot.hub import env_file
@@ -92,7 +92,7 @@ def _eval_yaml(benchmark: Benchmark, title: str) -> str:
         "name": title,
         "description": (
             f"Pick and place ({', '.join(scene.objects)}; {', '.join(scene.receptacles)}) by instruction: single"
-            f" tasks, and chains of tasks without a reset, {STEPS_PER_TASK} control steps for each task"
+            f" tasks, and chains of tasks without a reset, {scene.steps_per_task} control steps for each task"
             f" ({gymnasium_id(scene.name)}, fingerprint {benchmark.fingerprint})."
         ),
         "evaluation_framework": FRAMEWORK,
@@ -119,7 +119,7 @@ def _card(benchmark: Benchmark, config: BenchmarkConfig, title: str) -> str:
         source=describe_source(benchmark.source),
         environment=gymnasium_id(scene.name),
         bodies=[BODIES[name] for name in scene.bodies],
-        window_steps=STEPS_PER_TASK,
+        window_steps=scene.steps_per_task,
         is_own_scene=not is_packaged(scene.name),
         is_packaged=benchmark.fingerprint == load_benchmark(None, scene.name).fingerprint,
         size_category="n<1K" if rows < 1000 else "1K<n<10K" if rows < 10_000 else "10K<n<100K",

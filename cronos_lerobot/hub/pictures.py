@@ -10,8 +10,6 @@ from PIL import Image, ImageDraw
 
 from cronos_lerobot.film.sheets import PICTURE, caption_font, draw_task_sheet, encode_palette_png
 
-CAMERAS = ("front", "bridge")
-"""Of the sheet of tasks."""
 ROW_PICTURE = (320, 240)
 """Width and height of a configuration's picture [px]."""
 SHEET_PICTURE, SHEET_COLUMNS, SHEET_ROWS = (200, 150), 6, 2
@@ -49,11 +47,12 @@ def render_poses(
 
 
 def task_sheet(benchmark: Benchmark) -> bytes:
-    """Every task from a training configuration and both cameras, as PNG."""
+    """Every task from a training configuration and all cameras of the arm, as PNG."""
     tasks = [group.tasks[0] for group in benchmark.groups("independent", "train")]
     starts = benchmark.configurations["train"]
     poses = starts[np.arange(len(tasks)) % len(starts)]
-    frames = render_poses(benchmark, poses, (2 * PICTURE[0], 2 * PICTURE[1]), CAMERAS)
+    cameras = tuple(benchmark.scene.robot.cameras)
+    frames = render_poses(benchmark, poses, (2 * PICTURE[0], 2 * PICTURE[1]), cameras)
     return encode_palette_png(
         draw_task_sheet([(task.instruction, shown) for task, shown in zip(tasks, frames, strict=True)])
     )
