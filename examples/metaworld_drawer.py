@@ -80,24 +80,24 @@ class DrawerStreams:
             spaces["pixels"] = Dict(corner2=Box(0, 255, (pixels, pixels, 3), np.uint8))
         self.single_observation_space, self._renderer = Dict(spaces), None
         self._scenes = [Drawer() for _ in range(num_envs)]
-        self._all, self._opens, self._seen = np.arange(num_envs), np.full(num_envs, True), np.zeros((num_envs, 11))
+        self._all, self.opens, self.seen = np.arange(num_envs), np.full(num_envs, True), np.zeros((num_envs, 11))
         self.scene_reset(self._all, self._all % 64)
 
     def set_task(self, ids, tasks):
         """Give the streams `ids` their tasks; nothing moves."""
-        self._opens[ids] = [task.opens for task in tasks]
+        self.opens[ids] = [task.opens for task in tasks]
 
     def observe(self, ids=None):
         """The robot is `agent_pos`, the rest `environment_state`; the loop tells the policy the instruction."""
         ids = self._all if ids is None else ids
-        seen = self._seen[ids].astype(np.float32)
+        seen = self.seen[ids].astype(np.float32)
         observation = {"agent_pos": seen[:, :7], "environment_state": seen[:, 7:]}
         return observation | ({"pixels": {"corner2": self.render_streams(ids)}} if self.pixels else {})
 
     def step(self, actions):
         """Apply `actions` (N, 4); the reward is how far the task has come by it."""
         before, executed = self._progress(), np.clip(actions, -1, 1).astype(np.float32)
-        self._seen[:] = [scene.move(action) for scene, action in zip(self._scenes, executed, strict=True)]
+        self.seen[:] = [scene.move(action) for scene, action in zip(self._scenes, executed, strict=True)]
         diverged = np.array([scene.data.warning.number[FIRST_BAD:].any() for scene in self._scenes])
         info = {"is_success": self._succeeds(), "diverged": diverged, "executed_action": executed}
         never = np.zeros(self.num_envs, np.bool_)
@@ -106,7 +106,7 @@ class DrawerStreams:
     def scene_reset(self, ids, starts, split="train"):
         """Put the streams `ids` (k,) into the starts number `starts` (k,) of a split."""
         for i, start in zip(ids, SPLITS[split][starts], strict=True):
-            self._seen[i] = self._scenes[i].place(start)
+            self.seen[i] = self._scenes[i].place(start)
 
     def close(self):
         """Free the renderer."""
@@ -114,14 +114,14 @@ class DrawerStreams:
             self._renderer.close()
 
     def _succeeds(self):
-        return np.where(self._opens, self._seen[:, 10] > 0.15, self._seen[:, 10] < 0.01)
+        return np.where(self.opens, self.seen[:, 10] > 0.15, self.seen[:, 10] < 0.01)
 
     def _progress(self):
         # The hand reaches into the handle to pull, and stands before it to push.
-        hand, handle, opening = self._seen[:, :3], self._seen[:, 7:10], self._seen[:, 10] / TRAVEL
-        aim = handle - np.where(self._opens[:, None], (0, 0, 0.02), (0, 0.07, 0))
+        hand, handle, opening = self.seen[:, :3], self.seen[:, 7:10], self.seen[:, 10] / TRAVEL
+        aim = handle - np.where(self.opens[:, None], (0, 0, 0.02), (0, 0.07, 0))
         reach = np.linalg.norm(hand - aim, axis=1)
-        return np.where(self._opens, opening, -opening) - 2 * reach + self._succeeds()
+        return np.where(self.opens, opening, -opening) - 2 * reach + self._succeeds()
 
     # Optional: videos, and resumed runs that continue bit for bit.
 
@@ -140,15 +140,15 @@ class DrawerStreams:
         for scene, row in zip(self._scenes, physics, strict=True):
             mujoco.mj_getState(scene.model, scene.data, row, STATE)
         cabinets = np.stack([scene.model.body("drawer").pos for scene in self._scenes])
-        return {"physics": physics, "cabinets": cabinets, "opens": self._opens.copy()}
+        return {"physics": physics, "cabinets": cabinets, "opens": self.opens.copy()}
 
     def set_state(self, state):
         """Continue from `get_state`."""
-        self._opens[:] = state["opens"]
+        self.opens[:] = state["opens"]
         for scene, row, cabinet in zip(self._scenes, state["physics"], state["cabinets"], strict=True):
             mujoco.mj_setState(scene.model, scene.data, row, STATE)
             scene.model.body("drawer").pos = cabinet
-        self._seen[:] = [scene.look() for scene in self._scenes]
+        self.seen[:] = [scene.look() for scene in self._scenes]
 
 
 @EnvConfig.register_subclass("metaworld_drawer")

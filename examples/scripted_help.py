@@ -1,4 +1,4 @@
-"""Human help, played by the scripted expert: it does the next task of a stream that has failed twice in a row.
+"""Human help, played by a script: it does the next task of a stream that has failed twice in a row.
 
     PYTHONPATH=examples cronos-train --env.discover_packages_path=scripted_help --env.type=cronos_helped \
         --algorithm.type=imitation --policy.path=<checkpoint> --output_dir=outputs/scripted_help
@@ -23,12 +23,12 @@ class ScriptedHelp:
     """Streams in which the expert does a segment after FAILURES failed segments in a row.
 
     Args:
-        env: the streams, a CronosVectorEnv.
+        env: the streams.
+        expert: knows them; has `act()`, actions (N, A), and `reset(ids)`.
     """
 
-    def __init__(self, env: Any) -> None:
-        self.env = env
-        self.expert = ScriptedExpert(env)
+    def __init__(self, env: Any, expert: Any) -> None:
+        self.env, self.expert = env, expert
         self.failures = np.zeros(env.num_envs, np.int64)
         self.helps = np.zeros(env.num_envs, np.bool_)
         # Before the first segment nothing has failed.
@@ -83,4 +83,9 @@ class HelpedEnvConfig(CronosEnvConfig):
 
     def create_streams(self, num_envs: int, **options: Any) -> Any:
         """The streams that `cronos-train` trains on."""
-        return ScriptedHelp(super().create_streams(num_envs, **options))
+        env = super().create_streams(num_envs, **options)
+        return ScriptedHelp(env, ScriptedExpert(env))
+
+    def create_eval_streams(self, num_envs: int) -> Any:
+        """Nobody helps in evaluations."""
+        return super().create_streams(num_envs)

@@ -155,11 +155,6 @@ class CronosEvalConfig:
         scene = {} if {"benchmark", "scene"} & set(given) else trained_scene(path)
         return trained_observations(self.policy.input_features or {}, path) | scene
 
-    @property
-    def streams(self) -> Any:
-        """`env`, which has `create_streams`."""
-        return self.env
-
     def chains(self, benchmark: Benchmark, suite: str, split: str) -> list[Chain]:
         """What is run of a suite and split."""
         quick = (QUICK_CONFIGURATIONS, QUICK_ORDERINGS) if self.quick else (None, None)

@@ -38,7 +38,7 @@ from cronos_lerobot.evaluation.suites import (
     sampling_seed,
 )
 from cronos_lerobot.locks import FolderLock
-from cronos_lerobot.protocol.streams import Draws, Streams, steps_per_task
+from cronos_lerobot.protocol.streams import Draws, Streams, create_eval_streams, steps_per_task
 from cronos_lerobot.provenance import git_commit, package_versions
 
 FRAMES_KEPT = 4
@@ -75,7 +75,7 @@ class Evaluation:
         self.config, self.folder, self._draw = config, config.output_dir, draw
         pairs = [(suite, split) for suite in config.eval.suites for split in config.eval.splits]
         # What the world is; more streams of it are made where they are needed.
-        self.world: Streams = config.streams.create_streams(1)
+        self.world: Streams = create_eval_streams(config.env, 1)
         config.check_world(self.world)
         self.benchmark = benchmark_of(self.world)
         self.chains = {pair: config.chains(self.benchmark, *pair) for pair in dict.fromkeys(pairs)}
@@ -112,7 +112,7 @@ class Evaluation:
     def _run_missing(self) -> None:
         config = self.config
         num_envs = min(config.eval.batch_size, max(len(self.chains[pair]) for pair in self.missing))
-        env = self.world if num_envs == 1 else config.streams.create_streams(num_envs)
+        env = self.world if num_envs == 1 else create_eval_streams(config.env, num_envs)
         try:
             actor = self._load_actor(env)
             for suite, split in self.missing:

@@ -194,7 +194,8 @@ class StreamsConfig(Protocol):
     """A LeRobot `EnvConfig` that makes `Streams`.
 
     It may also have `steps_per_task`, the control steps that a task has: K of a training that says no other, and
-    the window of an evaluation.
+    the window of an evaluation; and `create_eval_streams(num_envs)`, where evaluations need other streams, such as
+    those without help.
     """
 
     type: str
@@ -217,6 +218,11 @@ def check_makes_streams(env: Any) -> None:
     if not makes_streams(env):
         given = "" if env is None else f"; --env.type={env.type} has no create_streams(num_envs)"
         raise ValueError(f"choose an environment: --env.type=cronos --env.scene=kitchen_2x2{given}")
+
+
+def create_eval_streams(env: Any, num_envs: int) -> Streams:
+    """Streams for an evaluation in the worlds of an environment config."""
+    return getattr(env, "create_eval_streams", env.create_streams)(num_envs)
 
 
 def steps_per_task(env: Any) -> int:

@@ -32,7 +32,7 @@ from cronos_lerobot.evaluation.policy_env import (
 from cronos_lerobot.evaluation.policy_loading import check_processor_classes, damage_named, load_policy
 from cronos_lerobot.evaluation.policy_source import UNDECISIVE, load_policy_config
 from cronos_lerobot.protocol.config import ProtocolConfig
-from cronos_lerobot.protocol.streams import Streams
+from cronos_lerobot.protocol.streams import Streams, create_eval_streams
 from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.training.config import CronosTrainConfig, check_world
 from cronos_lerobot.training.run import Parts
@@ -72,10 +72,9 @@ def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1)
     Raises:
         ValueError: `--protocol.reward` is given, and the world has its own.
     """
-    reward = config.protocol.reward
+    reward, env = config.protocol.reward, _of_one_process(config, local_processes)
     if reward == ProtocolConfig().reward:
-        return make_eval_env(config, num_envs, local_processes)
-    env = _of_one_process(config, local_processes)
+        return env.create_streams(num_envs)
     try:
         return env.create_streams(num_envs, reward=reward)
     except TypeError as error:
@@ -84,7 +83,7 @@ def make_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1)
 
 def make_eval_env(config: CronosTrainConfig, num_envs: int, local_processes: int = 1) -> Streams:
     """Return `num_envs` streams of the config's world for the periodic evaluation; see `make_env`."""
-    return _of_one_process(config, local_processes).create_streams(num_envs)
+    return create_eval_streams(_of_one_process(config, local_processes), num_envs)
 
 
 def _of_one_process(config: CronosTrainConfig, local_processes: int) -> Any:
