@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 import torch
 from forked_commands import run_forked
+from lerobot_env_cronos import CronosVectorEnv
 from safetensors.torch import load_file
 
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.protocol import LoopState
+from cronos_lerobot.training.config import CronosTrainConfig
+from cronos_lerobot.training.factory import make_env, make_eval_env
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 TINY = (
@@ -77,6 +80,13 @@ def test_help_is_executed_recorded_and_counted(tmp_path):
     streams.check()
     assert [segment.helped for segment in streams.segments_of(0)] == [i in (2, 5) for i in range(8)]
     assert not {"cronos.log_prob", "cronos.value"} & set(streams.meta.features)
+
+
+def test_nobody_helps_in_evaluations(example):
+    env = example("scripted_help").HelpedEnvConfig(obs_type="environment_state_agent_pos")
+    config = CronosTrainConfig(env=env)
+    assert type(make_env(config, 1)).__name__ == "ScriptedHelp"
+    assert type(make_eval_env(config, 1)) is CronosVectorEnv
 
 
 def test_an_agent_learns_from_what_was_rewarded_and_resumes_bit_for_bit(tmp_path):
