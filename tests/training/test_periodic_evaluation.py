@@ -35,7 +35,7 @@ def of_cronos_eval(checkpoint):
     """Episodes and motions of `cronos-eval`."""
     ended = []
 
-    def keep(folder, results, chains, render, count):
+    def keep(folder, results, chains, render, count, fps):
         ended.extend(chains)
 
     with TemporaryDirectory() as folder:
