@@ -80,7 +80,7 @@ def test_a_value_on_a_card_stays_in_its_line_and_its_code(tmp_path):
     assert command(["cronos-eval", f"--a={evil}"]) == "cronos-eval \\\n    '--a=x # Injected <img src=x>|y'"
     assert cell(evil) == "`x # Injected <img src=x>\\|y`"
     values = dict.fromkeys(("license", "base_model", "dataset", "scene", "repo_id"), evil)
-    values |= dict.fromkeys(("is_adapter", "is_steered", "plays_in_lerobot", "is_reset_free", "run"))
+    values |= dict.fromkeys(("is_adapter", "is_steered", "is_reset_free", "run")) | {"plays_in_lerobot": True}
     results = [{"suite": evil, "split": evil, "success": 0.5, "ci95": [0, 1], "n": 2}]
     evaluate = {name: [name, f"--policy.path={evil}"] for name in ("cronos-eval", "lerobot-eval")}
     lists = {name: [evil] for name in ("tags", "settings", "differences")}

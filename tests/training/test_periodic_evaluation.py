@@ -69,7 +69,7 @@ def of_cronos_train(ranks, checkpoint, batch_size):
     env = make_eval_env(config, batch_size, ranks.local_count)
     results = run_independent(
         env, network, make_processors(network, *pipelines), n_episodes=N_EPISODES, split="held_out",
-        temperature=TEMPERATURE, seed=SEED, ranks=ranks, states=env.positions,
+        temperature=TEMPERATURE, seed=SEED, ranks=ranks, states=lambda ids: env.positions(ids).astype(np.float32),
     )  # fmt: skip
     return by_episode(results)
 
