@@ -22,7 +22,7 @@ BLOCK = re.compile(r"(?:`([\w/]+\.py)`[^\n]*:\n\n)?```(bash|python)\n(.*?)```", 
 """A block of code, and the file that the line before it names."""
 OURS = re.compile(r"(PYTHONPATH=\S+ )?(cronos|lerobot)-")
 SKIPPED = re.compile(
-    r"<|\.\.\.|=cuda|smolvla|openvla|-reproduce|=mine |outputs/mine"
+    r"<|\.\.\.|=cuda|smolvla|openvla|metaworld|-reproduce|=mine |outputs/mine"
     r"|me/(policy|eer|t320|my_|clone|lora|cronos_kitchen)"
 )
 SHORT = (
