@@ -7,6 +7,11 @@ import re
 PATTERN = re.compile(r"(?P<namespace>[\w.-]{1,80})/(?P<name>[\w.-]{1,80})-v(?P<version>\d{1,9})")
 
 
+def is_of_a_scene(environment: str) -> bool:
+    """Whether an id is of a CRONOS scene."""
+    return environment.startswith("lerobot_env_cronos/")
+
+
 def check_environment_id(text: str | None, what: str, remedy: str = "make it anew") -> str:
     """The name in an environment id that was recorded: `kitchen_2x2`.
 
@@ -19,7 +24,7 @@ def check_environment_id(text: str | None, what: str, remedy: str = "make it ane
         ValueError: it is no environment id, or one of CRONOS scenes of another version.
     """
     match = PATTERN.fullmatch(text or "")
-    if match is None or match["namespace"] == "lerobot_env_cronos":
+    if match is None or is_of_a_scene(match[0]):
         # The versions that are known are those of the scenes that come with this project.
         from lerobot_env_cronos import check_environment_id as check_scene
 

@@ -30,13 +30,12 @@ from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS
 
 from cronos_lerobot.agents.processing import EMPTY_CAMERA
 from cronos_lerobot.data.origin import Origin, read_origin
+from cronos_lerobot.environment_id import is_of_a_scene
 
 WITHOUT_LANGUAGE = ("act", "diffusion", "gaussian_actor", "tdmpc", "vqbet")
 """LeRobot's policies that read no instruction."""
 
 Features = Mapping[str, PolicyFeature]
-OURS = "lerobot_env_cronos/"
-"""How the ids of CRONOS scenes begin."""
 
 
 def reads_privileged_state(config: PreTrainedConfig) -> bool:
@@ -52,10 +51,11 @@ def reads_privileged_state(config: PreTrainedConfig) -> bool:
 
 def warn_of_inputs(config: PreTrainedConfig, env: Any) -> None:
     """Log if a policy cannot know its task, or reads what no robot has."""
-    if config.type in WITHOUT_LANGUAGE and isinstance(env, CronosEnvConfig) and env.task_observation == "none":
+    is_untold = isinstance(env, CronosEnvConfig) and env.task_observation == "none"
+    if config.type in WITHOUT_LANGUAGE and is_untold and (num_tasks := len(get_scene(env.scene).tasks)) > 1:
         logging.warning(
             f"--policy.type={config.type} reads no instructions and is not told its task "
-            f"(--env.task_observation=one_hot): it cannot tell the tasks apart."
+            f"(--env.task_observation=one_hot): it cannot tell the {num_tasks} tasks apart."
         )
     if reads_privileged_state(config):
         logging.warning(
@@ -74,7 +74,7 @@ def trained_scene(path: Path | None) -> dict[str, str]:
         ValueError: its config is damaged, or its scene is not registered here.
     """
     env, origin = _training(path)
-    scene = env.get("scene") or (origin.scene if origin and origin.environment.startswith(OURS) else None)
+    scene = env.get("scene") or (origin.scene if origin and is_of_a_scene(origin.environment) else None)
     if not scene:
         return {}
     try:

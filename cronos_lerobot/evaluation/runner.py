@@ -7,6 +7,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,8 +42,6 @@ from cronos_lerobot.locks import FolderLock
 from cronos_lerobot.protocol.streams import Draws, Streams, create_eval_streams, steps_per_task
 from cronos_lerobot.provenance import git_commit, package_versions
 
-FRAMES_KEPT = 4
-"""Chains whose frames are kept, for each video that is wanted."""
 Render = Callable[[np.ndarray], np.ndarray]
 Draw = Callable[[Path, dict[str, Any], Sequence[ChainResult], Render, int, float], None]
 """Draws videos and pictures, see `film.suites.draw_suite`."""
@@ -102,7 +101,7 @@ class Evaluation:
             FolderInUseError: another process evaluates into the output folder.
             ValueError, OSError: a file of the policy is damaged or missing.
         """
-        with FolderLock(self.folder):
+        with FolderLock(self.folder), closing(self.world):
             if self.missing:
                 self._run_missing()
             results = [read_results(self._file(*pair)) for pair in self.chains]
@@ -112,14 +111,13 @@ class Evaluation:
     def _run_missing(self) -> None:
         config = self.config
         num_envs = min(config.eval.batch_size, max(len(self.chains[pair]) for pair in self.missing))
+        # A robot is there once.
         env = self.world if num_envs == 1 else create_eval_streams(config.env, num_envs)
-        try:
+        with closing(env):
             actor = self._load_actor(env)
             for suite, split in self.missing:
                 results = self._run_suite(env, actor, suite, split)
                 write_json(self._file(suite, split), results)
-        finally:
-            env.close()
 
     def _load_actor(self, env: Streams) -> Actor:
         config = self.config
@@ -167,7 +165,7 @@ class Evaluation:
                 lambda q: env.render_positions(q.astype(np.float64)),
             )
         if isinstance(env, Draws):
-            return Film(env.render_streams, lambda frames: frames, FRAMES_KEPT * count)
+            return Film(env.render_streams, lambda frames: frames, count)
         return None
 
 

@@ -26,7 +26,7 @@ PICTURED = 4
 """Stuck streams on the sheet, and segments of each."""
 
 Render = Callable[[np.ndarray], np.ndarray]
-"""Frames (k, H, W, 3) uint8 of what trajectories keep (k, ...), joint positions say."""
+"""Frames (k, H, W, 3) uint8 of what trajectories keep, (k, ...)."""
 
 
 def draw_suite(
