@@ -15,8 +15,6 @@ from lerobot_env_cronos.scene.arms.widowx.kinematics import inverse_kinematics
 
 from cronos_lerobot.ranges import ranged
 
-ACTION_LOW, ACTION_HIGH = WIDOWX.action_low, WIDOWX.action_high
-
 
 @dataclass
 class NoiseConfig:
@@ -151,7 +149,7 @@ class GraspMisses:
         if self._descending[stream] and arrived and low:
             self._closed_steps[stream] += 1
             return np.zeros(3), 0.0
-        return np.clip(goal - position, ACTION_LOW[:3], ACTION_HIGH[:3]), 1.0
+        return np.clip(goal - position, WIDOWX.action_low[:3], WIDOWX.action_high[:3]), 1.0
 
 
 MIN_TARGET_HEIGHT_M = 0.032

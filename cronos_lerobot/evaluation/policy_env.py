@@ -24,7 +24,7 @@ from lerobot.utils.constants import (
     OBS_STATE,
 )
 from lerobot_env_cronos import CronosEnvConfig
-from lerobot_env_cronos.scene.cameras import CAMERAS
+from lerobot_env_cronos.scene.arms.registry import ARMS
 from lerobot_env_cronos.scene.scenes import SCENES, get_scene
 from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS
 
@@ -98,7 +98,8 @@ def trained_observations(features: Features, path: Path | None) -> dict[str, Any
     if not images:
         return {"obs_type": "environment_state_agent_pos"} if takes_state else {}
     derived: dict[str, Any] = {"obs_type": "pixels_agent_pos", "privileged_state": takes_state}
-    if cameras := [name for name in CAMERAS if f"{OBS_IMAGES}.{name}" in images]:
+    known = dict.fromkeys(name for arm in ARMS.values() for name in arm.cameras)
+    if cameras := [name for name in known if f"{OBS_IMAGES}.{name}" in images]:
         derived["camera_name"] = ",".join(cameras)
     # LeRobot passes images of another size on without a word.
     _, height, width = next(iter(images.values())).shape

@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 from lerobot_env_cronos import CronosVectorEnv
-from lerobot_env_cronos.scene.cameras import CAMERAS, camera_projection
+from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
 from lerobot_env_cronos.scene.scenes import BODIES
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("camera", WIDOWX.cameras)
 @pytest.mark.parametrize("size", [(240, 240), (240, 320)])
 def test_bodies_are_drawn_where_the_projection_says(camera, size):
     env = CronosVectorEnv(1, "kitchen_2x2", obs_type="environment_state_agent_pos")
@@ -23,7 +23,7 @@ def test_bodies_are_drawn_where_the_projection_says(camera, size):
     renderer.update_scene(data, camera)
     geoms = renderer.render()[..., 0]
     renderer.close()
-    projection, tight = camera_projection(camera, *size), 0
+    projection, tight = WIDOWX.cameras[camera].projection(*size), 0
     for name in env.scene.bodies:
         body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
         drawn = np.argwhere(np.isin(geoms, np.flatnonzero(model.geom_bodyid == body)))[:, ::-1] + 0.5

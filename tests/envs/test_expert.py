@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from env_rollouts import STILL, keep_still, make, run_expert
-from lerobot_env_cronos import ACTION_HIGH, ACTION_LOW, SCENES, CronosVectorEnv, ScriptedExpert, Task, get_scene
+from lerobot_env_cronos import SCENES, CronosVectorEnv, ScriptedExpert, Task, get_scene
 from lerobot_env_cronos.benchmark.configurations import load_configurations
+from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
 
 TASKS = get_scene("kitchen_2x2").tasks
 N = 16
@@ -58,7 +59,7 @@ def test_it_keeps_succeeding_without_scene_resets_and_puts_objects_back(scene):
 def test_it_starts_from_any_arm_pose_and_recovers_from_perturbed_actions(env):
     rng, expert = np.random.default_rng(0), start(env)
     for _ in range(8):
-        action = rng.uniform(ACTION_LOW, ACTION_HIGH, (N, 7))
+        action = rng.uniform(WIDOWX.action_low, WIDOWX.action_high, (N, 7))
         for _ in range(5):
             env.step(action)
     expert.reset(EVERYONE)
@@ -66,7 +67,7 @@ def test_it_starts_from_any_arm_pose_and_recovers_from_perturbed_actions(env):
     success = np.zeros(N, dtype=bool)
     for _ in range(80):
         new = (left == 0) & (rng.random(N) < 0.08)
-        bias[new] = rng.uniform(ACTION_LOW, ACTION_HIGH, (new.sum(), 7))
+        bias[new] = rng.uniform(WIDOWX.action_low, WIDOWX.action_high, (new.sum(), 7))
         left = np.where(new, 3, np.maximum(left - 1, 0))
         success |= env.step(np.where((left > 0)[:, None], bias, expert.act()))[-1]["is_success"]
     assert success.mean() >= 0.8
@@ -111,7 +112,7 @@ def test_grasped_objects_do_not_slip_at_full_speed(env, obj):
         return np.einsum("nji,nj->ni", R, sim.body_pose(obj)[:, :3] - p)
 
     start_pose = in_hand()
-    towards_centre = np.where(sim.end_effector()[0][:, 1] > 0, ACTION_LOW[1], ACTION_HIGH[1])
+    towards_centre = np.where(sim.end_effector()[0][:, 1] > 0, WIDOWX.action_low[1], WIDOWX.action_high[1])
     for step in range(20):
         action = np.zeros((N, 7))
         action[:, 1] = towards_centre if (step // 5) % 2 == 0 else -towards_centre

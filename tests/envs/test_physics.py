@@ -6,15 +6,14 @@ import pytest
 from env_rollouts import WIDOWX_SCENES, make
 from lerobot_env_cronos import get_scene
 from lerobot_env_cronos.scene.arms.widowx.geometry import EE_SITE, HOME_QPOS
+from lerobot_env_cronos.scene.arms.widowx.kinematics import forward_kinematics, inverse_kinematics
 from lerobot_env_cronos.scene.model import build_model
-from lerobot_env_cronos.scene.scenes import BODIES
-from lerobot_env_cronos.simulation.kinematics import (
-    forward_kinematics,
-    inverse_kinematics,
+from lerobot_env_cronos.scene.rotations import (
     matrix_to_rotation_vector,
     quaternion_to_matrix,
     rotation_vector_to_matrix,
 )
+from lerobot_env_cronos.scene.scenes import BODIES
 
 SCENE, GRAVITY = "kitchen_2x2", 9.81
 FLAT = get_scene(SCENE).receptacles

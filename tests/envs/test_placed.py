@@ -8,9 +8,9 @@ from env_rollouts import STILL, WIDOWX_SCENES, keep_still, make
 from lerobot_env_cronos import CronosVectorEnv, Task, get_scene
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 from lerobot_env_cronos.scene.arms.widowx.geometry import FINGERTIP_REACH, HOME_QPOS
+from lerobot_env_cronos.scene.arms.widowx.kinematics import forward_kinematics, inverse_kinematics
 from lerobot_env_cronos.scene.model import TABLE, hand_sensor, support_sensor
 from lerobot_env_cronos.scene.scenes import BODIES, SCENES
-from lerobot_env_cronos.simulation.kinematics import forward_kinematics, inverse_kinematics
 
 CENTRE = np.array([0.30, 0.0])
 BOTTLE, SHOVEL, PLATE = "ketchup bottle", "kitchen shovel", "yellow plate"

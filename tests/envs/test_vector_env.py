@@ -5,7 +5,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 from env_rollouts import STILL, keep_still, make
-from lerobot_env_cronos import ACTION_HIGH, ACTION_LOW, CronosVectorEnv, Task
+from lerobot_env_cronos import CronosVectorEnv, Task
+from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
 from lerobot_env_cronos.scene.arms.widowx.geometry import HOME_QPOS
 from lerobot_env_cronos.simulation import rendering
 
@@ -13,7 +14,7 @@ BOTTLE, PLATE = "ketchup bottle", "yellow plate"
 
 
 def random_actions(rng: np.random.Generator, n: int) -> np.ndarray:
-    return rng.uniform(ACTION_LOW, ACTION_HIGH, (n, 7))
+    return rng.uniform(WIDOWX.action_low, WIDOWX.action_high, (n, 7))
 
 
 def roll(env: CronosVectorEnv, steps: int, seed: int = 0) -> np.ndarray:
@@ -79,7 +80,7 @@ def test_the_executed_action_is_clipped_and_does_the_same_again(dtype):
         executed = info["executed_action"]
         assert executed.dtype == np.float32
         assert env.action_space.contains(executed)
-        np.testing.assert_allclose(executed, np.clip(actions, ACTION_LOW, ACTION_HIGH), atol=2e-8)
+        np.testing.assert_allclose(executed, np.clip(actions, WIDOWX.action_low, WIDOWX.action_high), atol=2e-8)
         again, *_, replayed = other.step(executed)
         np.testing.assert_array_equal(again["environment_state"], seen["environment_state"])
         np.testing.assert_array_equal(replayed["executed_action"], executed)

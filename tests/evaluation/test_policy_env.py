@@ -45,6 +45,12 @@ def policy_of(make=ACTConfig, **shown):
     return make(device="cpu", input_features={key: f for key, f in features.items() if key != "action"})
 
 
+def test_the_cameras_of_either_arm_are_those_that_a_policy_takes():
+    for cameras, scene in (("front,bridge", "kitchen_2x2"), ("front,wrist", "so101_desk_2x2")):
+        features = policy_of(scene=scene, camera_name=cameras).input_features
+        assert trained_observations(features, None)["camera_name"] == cameras
+
+
 @pytest.mark.parametrize(
     ("make", "shown", "reads"),
     [

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from flags import parse_flags
 from lerobot_env_cronos.config import CronosEnvConfig
-from lerobot_env_cronos.scene.cameras import CAMERAS
+from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
 from synthetic_evaluations import write_evaluation
 from synthetic_runs import edit_lines, edit_starts
 
@@ -189,8 +189,10 @@ def test_the_size_of_a_cloned_policys_state_says_whether_it_is_told_its_task(siz
 
 
 def test_what_a_clone_renamed_is_in_its_commands(tmp_path):
-    names = {f"observation.images.{camera}": f"observation.images.camera{i}" for i, camera in enumerate(CAMERAS)}
-    env = CronosEnvConfig(camera_name=",".join(CAMERAS))
+    names = {
+        f"observation.images.{camera}": f"observation.images.camera{i}" for i, camera in enumerate(WIDOWX.cameras)
+    }
+    env = CronosEnvConfig(camera_name=",".join(WIDOWX.cameras))
     features = {names.get(key, key): feature for key, feature in features_of(env).items()}
     model = write_model(tmp_path / "clone", features, {"rename_map": names, "dataset": {"repo_id": "me/demos"}})
     card = dry_run(model, tmp_path / "out", scene="kitchen_3x3")

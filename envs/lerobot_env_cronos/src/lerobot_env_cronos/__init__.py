@@ -28,14 +28,11 @@ if TYPE_CHECKING:
     from lerobot_env_cronos.episodic import CronosEnv as CronosEnv
     from lerobot_env_cronos.episodic import IndependentVectorEnv as IndependentVectorEnv
     from lerobot_env_cronos.expert.expert import ScriptedExpert as ScriptedExpert
-    from lerobot_env_cronos.scene.scenes import STEPS_PER_TASK as STEPS_PER_TASK
     from lerobot_env_cronos.scene.scenes import Body as Body
     from lerobot_env_cronos.scene.scenes import Scene as Scene
     from lerobot_env_cronos.scene.scenes import Task as Task
     from lerobot_env_cronos.scene.scenes import get_scene as get_scene
     from lerobot_env_cronos.sequential import SequentialVectorEnv as SequentialVectorEnv
-    from lerobot_env_cronos.simulation.simulation import ACTION_HIGH as ACTION_HIGH
-    from lerobot_env_cronos.simulation.simulation import ACTION_LOW as ACTION_LOW
     from lerobot_env_cronos.vector_env import CronosVectorEnv as CronosVectorEnv
     from lerobot_env_cronos.vector_env import EnvIdentity as EnvIdentity
 
@@ -50,9 +47,8 @@ _MODULES = {
     "config": "CronosEnvConfig CronosHubEnvConfig",
     "episodic": "CronosEnv IndependentVectorEnv",
     "expert.expert": "ScriptedExpert",
-    "scene.scenes": "STEPS_PER_TASK Body Scene Task get_scene",
+    "scene.scenes": "Body Scene Task get_scene",
     "sequential": "SequentialVectorEnv",
-    "simulation.simulation": "ACTION_HIGH ACTION_LOW",
     "vector_env": "CronosVectorEnv EnvIdentity",
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names.split()}

@@ -162,7 +162,7 @@ class CronosEnv(gym.Env):
     number of the task in the scene's `tasks`; `task_description` is its instruction.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": CronosVectorEnv.metadata["render_fps"]}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
     def __init__(
         self,

@@ -14,7 +14,7 @@ import numpy as np
 from lerobot_env_cronos.benchmark.configurations import check_split
 from lerobot_env_cronos.benchmark.load import load_benchmark
 from lerobot_env_cronos.benchmark.version import gymnasium_id
-from lerobot_env_cronos.scene.scenes import BODIES, CONTROL_HZ, Task, get_scene
+from lerobot_env_cronos.scene.scenes import BODIES, Task, get_scene
 from lerobot_env_cronos.simulation.observations import ObservationBuilder, environment_state_names
 from lerobot_env_cronos.simulation.simulation import Simulation, check_state
 from lerobot_env_cronos.simulation.workspace import find_free_pose, find_unsuitable
@@ -73,7 +73,6 @@ class CronosVectorEnv(gym.vector.VectorEnv):
 
     metadata = {  # noqa: RUF012 - Gymnasium declares it this way
         "render_modes": ["rgb_array"],
-        "render_fps": CONTROL_HZ,
         "autoreset_mode": gym.vector.AutoresetMode.DISABLED,
     }
     render_mode = "rgb_array"

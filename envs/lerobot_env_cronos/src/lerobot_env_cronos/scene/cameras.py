@@ -1,4 +1,4 @@
-"""What the cameras of an arm's set-up see, and those of the WidowX by name."""
+"""What the cameras of an arm's set-up see."""
 
 from itertools import product
 
@@ -6,16 +6,7 @@ import mujoco
 import numpy as np
 
 from lerobot_env_cronos.scene.arms.arm import Camera
-from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
 from lerobot_env_cronos.scene.scenes import Body, Scene
-
-CAMERAS = WIDOWX.cameras
-"""Of the WidowX, for packages that know one arm; a scene's are `scene.robot.cameras`."""
-
-
-def camera_projection(name: str, height: int, width: int) -> np.ndarray:
-    """`Camera.projection` of one of `CAMERAS`."""
-    return CAMERAS[name].projection(height, width)
 
 
 def camera_quaternion(camera: Camera) -> np.ndarray:

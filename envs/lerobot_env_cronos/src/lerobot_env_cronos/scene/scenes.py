@@ -12,9 +12,6 @@ from lerobot_env_cronos.scene.arms.arm import Arm
 from lerobot_env_cronos.scene.arms.registry import get_arm
 from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
 
-CONTROL_HZ, STEPS_PER_TASK = WIDOWX.fps, WIDOWX.steps_per_task
-"""Of the WidowX, for packages that know one arm; a scene's are `scene.fps` and `scene.steps_per_task`."""
-
 LONG = 1.5
 """Length over width from which on a body has two ends."""
 END_SHARE = 0.8

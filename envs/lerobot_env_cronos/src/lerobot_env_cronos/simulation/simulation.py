@@ -13,14 +13,10 @@ from mujoco.batch import Batch, SimulationError
 
 from lerobot_env_cronos.benchmark.version import VERSION
 from lerobot_env_cronos.scene.arms.arm import Arm, Pose
-from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
 from lerobot_env_cronos.scene.model import SETTLE_CHUNK_S, build_model
 from lerobot_env_cronos.scene.rotations import quaternion_to_matrix
 from lerobot_env_cronos.scene.scenes import BODIES, Scene
 from lerobot_env_cronos.simulation.judging import Judge
-
-ACTION_NAMES, ACTION_LOW, ACTION_HIGH = WIDOWX.action_names, WIDOWX.action_low, WIDOWX.action_high
-"""Of the WidowX, for packages that know one arm; a scene's are those of `scene.robot`."""
 
 MAX_SPEED = 200.0
 """Joint or body speed beyond which a simulation counts as diverged [m/s, rad/s]."""
