@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from env_rollouts import HOME, keep_still, make, run_expert
 from lerobot.envs import make_env_config
+from lerobot.robots.so_follower import SO101Follower
 from lerobot_env_cronos import Scene, ScriptedExpert, Task, gymnasium_id, register_scene
 from lerobot_env_cronos.expert.hands import point_down
 from lerobot_env_cronos.scene.arms.so101 import kinematics
@@ -76,11 +77,10 @@ def test_the_hand_gets_down_as_far_as_measured_and_leans_beyond():
 
 
 def test_names_and_robot_type_are_those_of_the_real_arm():
-    robots = pytest.importorskip("lerobot.robots.so_follower")
     env = make(1, SCENE)
     names = [f"{joint}.pos" for joint in JOINTS]
     assert env.action_names == env.state_names == names
-    assert (env.robot_type, env.fps, env.steps_per_task) == (robots.SO101Follower.name, 30, 480)
+    assert (env.robot_type, env.fps, env.steps_per_task) == (SO101Follower.name, 30, 480)
     assert env.metadata["render_fps"] == 30
 
 
