@@ -42,7 +42,7 @@ FLOORS = {
     "cronos_lerobot": (
         "lazy", "stopwatch", "registry", "ranks", "provenance", "locks", "whole_files", "ranges",
         "command_line", "dataset_metadata", "statistics", "environment_id", "bases", "agents", "protocol",
-        "data", "evaluation", "training", "film", "report", "experiments", "hub", "scripts", "__init__",
+        "robot", "data", "evaluation", "training", "film", "report", "experiments", "hub", "scripts", "__init__",
     ),
     "lerobot_env_cronos": (
         "scene", "benchmark", "simulation", "vector_env", "episodic", "autoreset",

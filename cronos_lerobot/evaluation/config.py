@@ -38,6 +38,7 @@ from cronos_lerobot.evaluation.suites import (
 )
 from cronos_lerobot.protocol.streams import Streams, check_capability, check_makes_streams
 from cronos_lerobot.ranges import check_ranges, limits, ranged
+from cronos_lerobot.robot import config as _robot  # noqa: F401  (registers cronos_robot)
 
 QUICK_CONFIGURATIONS, QUICK_ORDERINGS = 16, 3
 EXPERT = "scripted expert"

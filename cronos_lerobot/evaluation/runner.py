@@ -76,6 +76,8 @@ class Evaluation:
         # What the world is; more streams of it are made where they are needed.
         self.world: Streams = create_eval_streams(config.env, 1)
         config.check_world(self.world)
+        # A world that writes files of its own has them here.
+        self.world.folder = self.folder  # ty: ignore[missing-attribute]
         self.benchmark = benchmark_of(self.world)
         self.chains = {pair: config.chains(self.benchmark, *pair) for pair in dict.fromkeys(pairs)}
         done = [self._check(file) for file in result_files(self.folder) if file.is_file()]

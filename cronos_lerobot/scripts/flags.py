@@ -15,7 +15,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import iter_modules
 
-REGISTERED = re.compile(r"register_subclass\(\s*(?:name=)?[\"'](\w+)[\"']\s*\)\s*\n@dataclass[^\n]*\nclass (\w+)")
+REGISTERED = re.compile(
+    r"register_subclass\(\s*(?:name=)?[\"'](\w+)[\"']\s*\)(?=\s*\n(?:@[^\n]*\n)*class (\w+))"
+)
 """A config that is one type of a choice."""
 DEFAULT_TYPES = {"env": "cronos", "algorithm": "ppo"}
 WIDTH = 100
@@ -146,16 +148,25 @@ def _inner_flags(inner: Source, arguments: Sequence[str], name: str) -> Iterator
 @cache
 def _types(base: str) -> dict[str, Source]:
     """The registered types of a choice, by their names; none if the class is no choice."""
-    policies = [_file_of(["lerobot", "policies"]).parent]
-    policies += [_file_of([m.name]).parent for m in iter_modules() if m.name.startswith("lerobot_policy_")]
+    ours = _file_of(["cronos_lerobot"]).parent
     files = {
-        "EnvConfig": [*_file_of(["lerobot_env_cronos"]).parent.glob("*config.py")],
-        "RLAlgorithmConfig": [*_file_of(["cronos_lerobot"]).parent.glob("agents/**/config.py")],
-        "PreTrainedConfig": [file for folder in policies for file in folder.rglob("configuration_*.py")],
+        "EnvConfig": [*_file_of(["lerobot_env_cronos"]).parent.glob("*config.py"), ours / "robot/config.py"],
+        "RLAlgorithmConfig": [*ours.glob("agents/**/config.py")],
+        "PreTrainedConfig": _files_of_plugins("policies", "lerobot_policy_", "configuration_*.py"),
+        "RobotConfig": _files_of_plugins("robots", "lerobot_robot_", "config*.py"),
+        "TeleoperatorConfig": _files_of_plugins("teleoperators", "lerobot_robot_", "config*.py")
+        + _files_of_plugins("teleoperators", "lerobot_teleoperator_", "config*.py"),
     }.get(base, [])
     found = {name: (file, kind) for file in files for name, kind in REGISTERED.findall(file.read_text())}
     sources = {name: _find(file, kind) for name, (file, kind) in sorted(found.items())}
     return {name: source for name, source in sources.items() if source is not None}
+
+
+def _files_of_plugins(room: str, prefix: str, pattern: str) -> list[Path]:
+    """The files of configs in a room of LeRobot, and in the packages that it finds by their names."""
+    folders = [_file_of(["lerobot", room]).parent]
+    folders += [_file_of([m.name]).parent for m in iter_modules() if m.name.startswith(prefix)]
+    return [file for folder in folders for file in folder.rglob(pattern)]
 
 
 @cache

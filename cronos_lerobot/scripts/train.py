@@ -43,7 +43,12 @@ def train(config: CronosTrainConfig) -> None:
         # What keeps nothing ends at once.
         request = StopRequest()
         with request if config.save_checkpoint else nullcontext(), error_line(only=WORK_ERRORS):
-            has_ended = trainer.train(request)
+            try:
+                has_ended = trainer.train(request)
+            except KeyboardInterrupt:
+                # A robot stops at once, and the run resumes from its last checkpoint.
+                request.number = request.number or signal.SIGINT
+                has_ended = False
     ranks = trainer.run.ranks
     if not has_ended:
         ranks.leave()

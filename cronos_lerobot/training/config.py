@@ -28,6 +28,7 @@ from cronos_lerobot.protocol.resets import EXTRA_RESETS
 from cronos_lerobot.protocol.streams import Streams, check_capability, check_makes_streams, steps_per_task
 from cronos_lerobot.protocol.task_orders import TASK_ORDERS
 from cronos_lerobot.ranges import check_ranges, limits, ranged
+from cronos_lerobot.robot import config as _robot  # noqa: F401  (registers cronos_robot)
 
 EVALUATION_ONLY = ("task", "suite", "split", "advance", "end_effector_reset")
 """Fields of the environment that only evaluations read."""

@@ -62,6 +62,8 @@ class Run:
         env: Any = parts.env
         # A world that times its own work does it by this.
         self.stopwatch = env.timer = Stopwatch()
+        # And one that writes files of its own has them in the run's folder.
+        env.folder = config.output_dir
         self.keeps_state = isinstance(env, KeepsState)
         self.task_set = TaskSet.of(env, config.protocol)
         policy = parts.policy

@@ -109,6 +109,8 @@ class Trainer:
             self._end(env_state)
             return True
         finally:
+            if "_eval_env" in self.__dict__:
+                self._eval_env.close()
             self.recorder.close()
             self.logger.close()
 

@@ -1,0 +1,1 @@
+"""Practice on one LeRobot robot, simulated or real: `--env.type=cronos_robot`."""
