@@ -34,7 +34,7 @@ PRELOADED = (
     "lerobot.policies.pi05.modeling_pi05", "datasets", "peft", "pandas", "matplotlib.pyplot", "rich.console",
     "torch.utils.tensorboard",
 )  # fmt: skip
-OURS = ("cronos_lerobot", "lerobot_env_", "lerobot_policy_")
+OURS = ("cronos_lerobot", "lerobot_env_", "lerobot_robot_", "lerobot_policy_")
 
 
 def run_forked(

@@ -10,9 +10,10 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = {
     "cronos_lerobot": ROOT / "cronos_lerobot",
     "lerobot_env_cronos": ROOT / "envs/lerobot_env_cronos/src/lerobot_env_cronos",
+    "lerobot_robot_cronos": ROOT / "envs/lerobot_robot_cronos/src/lerobot_robot_cronos",
 } | {path.name: path for path in sorted(ROOT.glob("policies/*/src/lerobot_policy_*")) if path.is_dir()}
 
-MAY_IMPORT = {"cronos_lerobot": {"lerobot_env_cronos"}}
+MAY_IMPORT = {"cronos_lerobot": {"lerobot_env_cronos"}, "lerobot_robot_cronos": {"lerobot_env_cronos"}}
 
 
 def imported_packages(folder: Path) -> dict[str, set[str]]:

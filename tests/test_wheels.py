@@ -21,7 +21,10 @@ ROOT = Path(__file__).parents[1]
 PROJECTS = [ROOT, *sorted((ROOT / "envs").iterdir()), *sorted((ROOT / "policies").iterdir())]
 OPTIONAL = {"peft", "transformers"}
 """Of policies that LeRobot itself does not load without them."""
-WHEELS = ("cronos_lerobot", "lerobot_env_cronos", "lerobot_policy_openvla", "lerobot_policy_pocketvla")
+WHEELS = (
+    "cronos_lerobot", "lerobot_env_cronos", "lerobot_robot_cronos", "lerobot_policy_openvla",
+    "lerobot_policy_pocketvla",
+)  # fmt: skip
 
 USE_THEM = """
 import sys
