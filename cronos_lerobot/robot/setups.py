@@ -135,8 +135,8 @@ def _of_arm(arm: Arm) -> dict[str, Any]:
     home = arm.hold(arm.home_qpos[None, : arm.num_joints])[0]
     return {
         "home": home.astype(np.float32),
-        "low": arm.action_low,
-        "high": arm.action_high,
+        "low": arm.action_low.astype(np.float32),
+        "high": arm.action_high.astype(np.float32),
         "hand": hand,
         "action_names": arm.action_names,
     }

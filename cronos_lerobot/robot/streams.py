@@ -177,7 +177,7 @@ class RobotStreams:
         station, events = self.station, self.station.person.look()
         for kind in ("success", "failure"):
             if getattr(events, kind):
-                self._note(kind)
+                self._note(kind, task=self._task.instruction)
         if events.stop:
             self._note("emergency_stop")
         if events.pause:
@@ -188,7 +188,7 @@ class RobotStreams:
         if events.takes_over and self._helping is None:
             self._helping = now
         elif not events.takes_over and self._helping is not None:
-            self._note("take_over", now - self._helping)
+            self._note("take_over", now - self._helping, task=self._task.instruction)
             self._helping = None
         return events
 
@@ -201,5 +201,4 @@ class RobotStreams:
         return np.array([given[name] for name in self.action_names], np.float32)
 
     def _note(self, kind: str, seconds: float = 0.0, **details: Any) -> None:
-        said = {"during": self.purpose, "task": self._task.instruction}
-        self.station.person.note(kind, seconds, **said, **details)
+        self.station.person.note(kind, seconds, during=self.purpose, **details)
