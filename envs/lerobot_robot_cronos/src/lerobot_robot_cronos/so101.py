@@ -150,4 +150,6 @@ class CronosSO101(Robot):
         self.bus.disconnect()
         for camera in self.cameras.values():
             camera.disconnect()
-        del connected_robots[self.id]
+        # Another one may have been connected under its id.
+        if connected_robots.get(self.id) is self:
+            del connected_robots[self.id]
