@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import select
 import sys
 import termios
@@ -79,12 +80,10 @@ class Terminal:
 
     def read(self) -> str:
         """The keys pressed since the last time."""
-        keys = ""
-        while self._before is not None and select.select([sys.stdin], [], [], 0)[0]:
-            if not (key := sys.stdin.read(1)):
-                break
-            keys += key
-        return keys
+        if self._before is None or not select.select([sys.stdin], [], [], 0)[0]:
+            return ""
+        # Not by Python's buffer, which select does not see.
+        return os.read(sys.stdin.fileno(), 64).decode(errors="ignore")
 
     def close(self) -> None:
         """Give the terminal back as it was."""

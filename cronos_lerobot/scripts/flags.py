@@ -15,9 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import iter_modules
 
-REGISTERED = re.compile(
-    r"register_subclass\(\s*(?:name=)?[\"'](\w+)[\"']\s*\)(?=\s*\n(?:@[^\n]*\n)*class (\w+))"
-)
+REGISTERED = re.compile(r"register_subclass\(\s*(?:name=)?[\"'](\w+)[\"']\s*\)(?=\s*\n(?:@[^\n]*\n)*class (\w+))")
 """A config that is one type of a choice."""
 DEFAULT_TYPES = {"env": "cronos", "algorithm": "ppo"}
 WIDTH = 100

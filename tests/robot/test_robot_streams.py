@@ -196,7 +196,7 @@ def test_ctrl_c_moves_the_arm_home_at_once(make):
             hold(env, 1)
     finally:
         signal.signal(signal.SIGINT, before)
-    assert np.allclose(env.station.robot.desk.positions(), env.station.setup.home, atol=2)
+    assert np.allclose(env.station.robot.desk.positions(), env.station.setup.home, atol=4)
     env.station._signal = None
 
 

@@ -85,14 +85,15 @@ class CronosPerson(Teleoperator):
     @property
     def feedback_features(self) -> dict[str, type]:
         """What a program tells the person, see `send_feedback`."""
-        return {"task": str, "scene_reset": int, "split": str, "judge": bool}
+        return {"task": str, "scene_reset": int, "split": str, "judge": bool, "lost": str}
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
         """Tell the person something.
 
         Args:
             feedback: some of `task`, the instruction of a segment that begins; `scene_reset`, the start that is
-                wanted, of `split` ("train" if absent); `judge`, whether to press SUCCESS from now on.
+                wanted, of `split` ("train" if absent); `judge`, whether to press SUCCESS from now on; `lost`, what
+                failed: every cable is plugged in, and that is reported as a reset is.
         """
         robot = self._look()
         self.judges = feedback.get("judge", self.judges)
@@ -102,6 +103,10 @@ class CronosPerson(Teleoperator):
             takes *= 1 + by * (late < self.config.late_rate)
             split = feedback.get("split", "train")
             self._reset = (robot.clock.time() + takes, feedback["scene_reset"], split)
+        if "lost" in feedback:
+            for device in (robot.bus, *robot.cameras.values()):
+                device.plug_in()
+            self.press("scene_reset")
         if "task" in feedback:
             self._begin(robot, feedback["task"])
 
