@@ -284,7 +284,7 @@ def test_buttons_of_a_teleoperator_judge(make):
     begin(env)
     assert not hold(env, 1)[0]["is_success"][0]
     env.station.person.teleop.press(TeleopEvents.SUCCESS)
-    observation, reward, _, _, info = env.step(env.station.target[None])
+    _, reward, _, _, info = env.step(env.station.target[None])
     assert (reward.tolist(), info["is_success"].tolist()) == ([1.0], [True])
     assert ledger(env)[-1]["kind"] == "success"
     with pytest.raises(ValueError, match="num_envs=1"):

@@ -10,6 +10,7 @@ from lerobot.utils.constants import HF_LEROBOT_CALIBRATION, ROBOTS
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 from lerobot_env_cronos import CronosVectorEnv, get_scene
 from lerobot_env_cronos.scene.arms.so101.arm import SO101_ARM
+from lerobot_env_cronos.simulation.observations import environment_state_names
 
 from lerobot_robot_cronos.bus import SimulatedBus
 from lerobot_robot_cronos.camera import SimulatedCamera
@@ -37,6 +38,9 @@ class CronosSO101Config(RobotConfig):
     """Which cameras there are, of `front` and `wrist`; may be empty."""
     camera_height: int = 240
     camera_width: int = 320
+    privileged_state: bool = False
+    """Observe where the objects are, too, as with a motion-capture system: the numbers of the scene's
+    `environment_state` by their names."""
     max_relative_target: float | dict[str, float] | None = None
     """Furthest that a goal may be from where the arm is, for all motors or by motor; see LeRobot's SO-101."""
 
@@ -90,7 +94,11 @@ class CronosSO101(Robot):
     def observation_features(self) -> dict[str, type | tuple]:
         """See `Robot`."""
         cameras = {name: (camera.height, camera.width, 3) for name, camera in self.cameras.items()}
-        return {**self.action_features, **cameras}
+        return {**self.action_features, **dict.fromkeys(self._body_names, float), **cameras}
+
+    @property
+    def _body_names(self) -> tuple[str, ...]:
+        return environment_state_names(self.world.scene) if self.config.privileged_state else ()
 
     @property
     def is_connected(self) -> bool:
@@ -131,7 +139,9 @@ class CronosSO101(Robot):
     def get_observation(self) -> RobotObservation:
         """See `Robot`."""
         positions = {f"{motor}.pos": value for motor, value in self.bus.sync_read("Present_Position").items()}
-        return {**positions, **{name: camera.read_latest() for name, camera in self.cameras.items()}}
+        bodies = zip(self._body_names, self.world.observe()["environment_state"][0].tolist())
+        pictures = {name: camera.read_latest() for name, camera in self.cameras.items()}
+        return {**positions, **dict(bodies), **pictures}
 
     @check_if_not_connected
     def send_action(self, action: RobotAction) -> RobotAction:
