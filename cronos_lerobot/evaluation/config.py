@@ -144,6 +144,9 @@ class CronosEvalConfig:
         # The size of the state tells it, in the scene that is known by now.
         if self.policy is not None and "task_observation" not in given:
             env.task_observation = task_observation_of(self.policy.input_features or {}, env)
+        if "fps" not in given:
+            # Of the scene, which may be another one by now.
+            env.fps = 0
         env.__post_init__()
         if self.eval.videos:
             check_video_size("--env.render_size", env.render_size)
