@@ -53,7 +53,7 @@ def test_the_cameras_of_either_arm_are_those_that_a_policy_takes():
 
 def test_a_policy_of_another_arm_is_evaluated_at_its_rate(tmp_path, monkeypatch):
     shown = {"scene": "so101_desk_2x2", "obs_type": "environment_state_agent_pos"}
-    folder = save_policy(tmp_path, "pocketvla", shown, hidden_width=16, hidden_depth=1)
+    folder = save_policy(tmp_path, "act", shown, **TINY_ACT)
     write_train_config(folder, env={"type": "cronos", "scene": "so101_desk_2x2", "fps": 30})
     monkeypatch.setattr(sys, "argv", ["cronos-eval", f"--policy.path={folder}"])
     env = read_command_line().env
