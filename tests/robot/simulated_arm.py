@@ -5,6 +5,7 @@ from pathlib import Path
 from lerobot_robot_cronos import CronosPerson, CronosPersonConfig, CronosSO101, CronosSO101Config
 
 SCENE, CUBE_ON_PLATE = "so101_desk_2x2", "put the cube on the plate"
+CAMERAS = {"camera_names": ["front", "wrist"], "camera_height": 48, "camera_width": 64}
 
 
 def make_robot(folder: Path, **options) -> CronosSO101:

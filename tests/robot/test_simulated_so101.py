@@ -4,14 +4,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from lerobot.cameras.opencv import OpenCVCameraConfig
-from lerobot.robots.so_follower import SO101Follower, SO101FollowerConfig, so_follower
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from lerobot_env_cronos import CronosVectorEnv
 from lerobot_robot_cronos import connected_robots
-from simulated_arm import SCENE, make_robot
+from simulated_arm import CAMERAS, SCENE, make_robot
 
-CAMERAS = {"camera_names": ["front", "wrist"], "camera_height": 48, "camera_width": 64}
 ONE = np.arange(1)
 
 
@@ -30,19 +27,6 @@ def wander(env: CronosVectorEnv, steps: int) -> np.ndarray:
 
 def as_action(env: CronosVectorEnv, goal: np.ndarray) -> dict:
     return dict(zip(env.action_names, goal, strict=True))
-
-
-@pytest.fixture
-def real_arm(monkeypatch, tmp_path) -> SO101Follower:
-    """LeRobot's robot, but for its serial port."""
-    monkeypatch.setattr(
-        so_follower, "FeetechMotorsBus", lambda port, motors, calibration: SimpleNamespace(motors=motors)
-    )
-    cameras = {
-        name: OpenCVCameraConfig(index_or_path=i, fps=30, width=64, height=48)
-        for i, name in enumerate(CAMERAS["camera_names"])
-    }
-    return SO101Follower(SO101FollowerConfig(port="none", cameras=cameras, calibration_dir=tmp_path))
 
 
 def test_features_names_and_motors_are_the_real_arms(real_arm, tmp_path):
