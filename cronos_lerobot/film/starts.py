@@ -199,9 +199,9 @@ def _draw_plan(axes: Axes, outlines: Sequence[Outline], font: float) -> None:
             _draw_arrow(axes, outline.centre, outline.centre + outline.heading)
         bottom = min(polygon[:, 1].min() for polygon in outline.polygons)
         axes.text(outline.centre[0], bottom - 2, outline.name, fontsize=font, ha="center", va="top", clip_on=True)
-    for direction, name in (((1, 0), "y"), ((0, -1), "x")):
-        _draw_arrow(axes, np.zeros(2), AXIS * np.array(direction))
-        axes.text(*((AXIS + 3) * np.array(direction)), name, fontsize=font, ha="center", va="center", clip_on=True)
+    for x, y, name in ((AXIS, 0, "y"), (0, -AXIS, "x")):
+        _draw_arrow(axes, np.zeros(2), np.array([x, y]))
+        axes.text(1.15 * x, 1.15 * y, name, fontsize=font, ha="center", va="center", clip_on=True)
 
 
 def _draw_arrow(axes: Axes, start: np.ndarray, tip: np.ndarray) -> None:
