@@ -5,45 +5,16 @@ from __future__ import annotations
 import io
 
 import numpy as np
-from lerobot_env_cronos import Benchmark, CronosVectorEnv
+from lerobot_env_cronos import Benchmark
 from PIL import Image, ImageDraw
 
 from cronos_lerobot.film.sheets import PICTURE, caption_font, draw_task_sheet, encode_palette_png
+from cronos_lerobot.film.starts import render_poses
 
 ROW_PICTURE = (320, 240)
 """Width and height of a configuration's picture [px]."""
 SHEET_PICTURE, SHEET_COLUMNS, SHEET_ROWS = (200, 150), 6, 2
 """Of the contact sheet, for each split."""
-BATCH = 16
-
-
-def render_poses(
-    benchmark: Benchmark, poses: np.ndarray, size: tuple[int, int], cameras: tuple[str, ...] = ("front",)
-) -> list[list[np.ndarray]]:
-    """Frames (height, width, 3) uint8 of poses (n, bodies, 7) with the arm at home, one for each camera.
-
-    `size` is (width, height) [px].
-    """
-    width, height = size
-    env = CronosVectorEnv(
-        min(BATCH, len(poses)),
-        benchmark.scene.name,
-        observation_height=height,
-        observation_width=width,
-        camera_name=",".join(cameras),
-        num_threads=1,
-    )
-    frames: list[list[np.ndarray]] = []
-    try:
-        for start in range(0, len(poses), env.num_envs):
-            some = poses[start : start + env.num_envs]
-            ids = np.arange(len(some))
-            env.place_bodies(ids, some)
-            pixels = env.observe(ids)["pixels"]
-            frames += [[pixels[camera][i] for camera in cameras] for i in ids]
-    finally:
-        env.close()
-    return frames
 
 
 def task_sheet(benchmark: Benchmark) -> bytes:

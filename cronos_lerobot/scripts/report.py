@@ -26,6 +26,8 @@ examples:
       cronos-report outputs/train/eer --before outputs/eval/base --after outputs/eval/eer
   two policies on the same episodes: the difference, its interval and p (cronos-report compare --help)
       cronos-report compare outputs/eval/base outputs/eval/eer
+  where everything lies at a start, to print (cronos-report starts --help)
+      cronos-report starts --scene=so101_desk_2x2 --starts 0 1
 
 OUTPUT/index.html is self-contained. Figures (PNG) and tables (CSV) lie beside it.
 """
@@ -41,6 +43,13 @@ examples:
       cronos-report compare outputs/reproduce/runs/kitchen_2x2_state_paper_small/{t80,t1280_eer}_307k
 
 docs/design.md says how the intervals and p-values are computed.
+"""
+STARTS_EPILOG = """\
+OUTPUT/<split>_<start>.png is the front camera's picture, with names. OUTPUT/<split>_<start>.pdf has the same
+picture, a plan, and A4 sheets that show the arm's base and every object at true size.
+
+example:
+  cronos-report starts --scene=so101_desk_2x2 --split=held_out --starts 0 1 --output=outputs/starts
 """
 
 
@@ -72,6 +81,19 @@ def make_compare_parser() -> argparse.ArgumentParser:
     parser.add_argument("a", type=Path, metavar="A", help="folder of one side")
     parser.add_argument("b", type=Path, metavar="B", help="folder of the other side")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    return parser
+
+
+def make_starts_parser() -> argparse.ArgumentParser:
+    """The flags of `cronos-report starts`."""
+    text = "Where everything lies at the starts of a scene: pictures, and sheets to print."
+    parser = _parser("cronos-report starts", text, STARTS_EPILOG)
+    parser.add_argument("--scene", default="kitchen_2x2", help="name of the scene (default: kitchen_2x2)")
+    parser.add_argument("--split", default="train", help="train or held_out (default: train)")
+    parser.add_argument(
+        "--starts", nargs="+", type=int, metavar="N", help="numbers of configurations (default: all of the split)"
+    )
+    parser.add_argument("--output", type=Path, default=Path("starts"), help="folder to write (default: starts)")
     return parser
 
 
@@ -114,10 +136,31 @@ def compare(arguments: Sequence[str]) -> None:
         print(json.dumps(to_json(comparisons, notes), indent=2) if args.json else to_text(comparisons))
 
 
+def draw_starts(arguments: Sequence[str]) -> None:
+    """Draw the starts that the arguments of `cronos-report starts` name."""
+    args = make_starts_parser().parse_args(arguments)
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    # Scenes of plugins.
+    register_third_party_plugins()
+    from lerobot_env_cronos import load_benchmark
+    from lerobot_env_cronos.simulation.gl import RenderingError
+
+    from cronos_lerobot.film.starts import write_starts
+    from cronos_lerobot.scripts.errors import error_line
+
+    with error_line(RenderingError):
+        write_starts(load_benchmark(None, args.scene), args.split, args.starts, args.output)
+    print(f"Starts: {args.output}")
+
+
 def main() -> None:
     """Entry point of `cronos-report`."""
     if sys.argv[1:2] == ["compare"]:
         compare(sys.argv[2:])
+        return
+    if sys.argv[1:2] == ["starts"]:
+        draw_starts(sys.argv[2:])
         return
     parser = make_parser()
     args = parser.parse_args()

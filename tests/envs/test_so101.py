@@ -259,11 +259,12 @@ def test_gymnasium_and_lerobot_make_it():
         make_env_config("cronos", scene=SCENE, fps=5)
 
 
-def test_a_moving_camera_has_no_projection():
-    env = make(1, SCENE, obs_type="pixels_agent_pos", camera_name="front,wrist")
-    details = env.observation_details
+def test_a_moving_camera_has_no_projection_and_no_camera_without_the_bodies():
+    options = {"obs_type": "pixels_agent_pos", "camera_name": "front,wrist"}
+    details = make(1, SCENE, privileged_state=True, **options).observation_details
     assert "observation.images.wrist" not in details
     assert np.shape(details["observation.images.front"]["projection"]) == (3, 4)
+    assert "observation.images.front" not in make(1, SCENE, **options).observation_details
 
 
 def test_a_scene_of_your_own_declares_the_arm(monkeypatch):

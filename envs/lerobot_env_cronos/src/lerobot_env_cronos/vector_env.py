@@ -144,7 +144,8 @@ class CronosVectorEnv(gym.vector.VectorEnv):
                 },
             }
         }
-        for camera in self._observations.cameras:
+        # Without the bodies' poses, pictures are described as a real robot's are: LeRobot merges both.
+        for camera in self._observations.cameras if self._observations.privileged else ():
             chosen = self.scene.robot.cameras[camera]
             # That of a camera that moves is another one in every picture.
             if chosen.body is None:
