@@ -25,6 +25,7 @@ from lerobot.teleoperators import (  # noqa: F401
     so_leader,
 )
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS
 
 from cronos_lerobot.ranges import check_ranges, ranged
 from cronos_lerobot.robot.judges import PERSON, SIM, Judge, PersonJudge, SimJudge
@@ -48,6 +49,8 @@ class CronosRobotConfig(EnvConfig):
     """LeRobot's leader arm, to take over, or gamepad, whose buttons judge: --env.teleop.type=so101_leader ..."""
     tasks: str = "so101_desk_2x2"
     """A file with tasks, pictures of the starts, home pose and limits; or a scene, built as its sheets say."""
+    task_observation: str = ranged("none", choices=TASK_OBSERVATIONS)
+    """one_hot appends the task to the robot's state, for policies that read no instructions, such as ACT."""
     steps_per_task: int = ranged(480, minimum=1)
     """Control steps that a task has."""
     judge: str = ranged(PERSON, choices=JUDGES)
@@ -67,11 +70,11 @@ class CronosRobotConfig(EnvConfig):
         check_ranges(self, "env.")
         if self.robot is None:
             raise ValueError("--env.type=cronos_robot needs a robot: --env.robot.type=so101_follower ...")
-        station = self.station
+        station, told = self.station, len(self._told)
         self.features = {ACTION: PolicyFeature(FeatureType.ACTION, (len(station.action_names),))}
         self.features_map = {ACTION: ACTION}
         for name, (kind, key), size in (
-            ("agent_pos", (FeatureType.STATE, OBS_STATE), len(station.state_names)),
+            ("agent_pos", (FeatureType.STATE, OBS_STATE), len(station.state_names) + told),
             ("environment_state", (FeatureType.ENV, OBS_ENV_STATE), len(station.other_names)),
         ):
             if size:
@@ -98,6 +101,10 @@ class CronosRobotConfig(EnvConfig):
         teleop = None if self.teleop is None else make_teleoperator_from_config(self.teleop)
         return Station(robot, teleop, self.setup, self.fps, self.max_step, self.dry_run)
 
+    @property
+    def _told(self) -> tuple[str, ...]:
+        return self.setup.task_names if self.task_observation == "one_hot" else ()
+
     def create_streams(self, num_envs: int) -> RobotStreams:
         """The robot as one stream.
 
@@ -113,7 +120,7 @@ class CronosRobotConfig(EnvConfig):
         return self._streams("evaluation")
 
     def _streams(self, purpose: str) -> RobotStreams:
-        return RobotStreams(self.station, self._judge(), f"judge {self.judge}", purpose)
+        return RobotStreams(self.station, self._judge(), f"judge {self.judge}", purpose, self._told)
 
     def _judge(self) -> Judge:
         if self.judge == PERSON:

@@ -14,6 +14,7 @@ from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.scene.arms.arm import Arm
 from lerobot_env_cronos.scene.arms.registry import ARMS
 from lerobot_env_cronos.scene.scenes import get_scene
+from lerobot_env_cronos.simulation.observations import agent_pos_names, one_hot
 from PIL import Image
 
 SPLITS = ("train", "held_out")
@@ -44,6 +45,9 @@ class Setup:
     low: np.ndarray
     high: np.ndarray
     """(A,) limits of an action."""
+    task_names: tuple[str, ...]
+    tell: Callable[[Any], np.ndarray]
+    """A task as numbers (len(task_names),) float32, for policies that read no instructions."""
     action_names: tuple[str, ...] | None = None
     """Of the arm that home and limits are of; None if they were given."""
     reset_tasks: tuple[Any, ...] = ()
@@ -96,6 +100,8 @@ def _of_file(path: Path, said: dict[str, Any]) -> Setup:
         starts={split: len(photos.get(split, [])) for split in SPLITS},
         picture=lambda split, number: Image.open(photos[split][number]),
         fingerprint=digest.hexdigest(),
+        task_names=tuple(f"task.{task.instruction.replace(' ', '_')}" for task in tasks),
+        tell=lambda task: np.eye(len(tasks), dtype=np.float32)[tasks.index(task)],
         box=None if box is None else np.array(box, dtype=float).reshape(2, 3),
         **known,
     )
@@ -123,6 +129,8 @@ def _of_scene(name: str) -> Setup:
         starts=world.num_starts,
         picture=picture,
         fingerprint=world.identity.fingerprint,
+        task_names=agent_pos_names(scene, "one_hot")[len(scene.robot.state_names) :],
+        tell=lambda task: one_hot(scene, [task])[0],
         **_of_arm(scene.robot),
     )
 

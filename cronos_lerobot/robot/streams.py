@@ -36,18 +36,21 @@ class RobotStreams:
         judge: says whether the task is complete.
         by_whom: the judge in words, for recordings and results.
         purpose: `training` or `evaluation`; the ledger counts them apart.
+        told: names of the task's numbers in `agent_pos`; none if the task is not told there.
     """
 
     num_envs = 1
 
-    def __init__(self, station: Station, judge: Judge, by_whom: str, purpose: str) -> None:
+    def __init__(
+        self, station: Station, judge: Judge, by_whom: str, purpose: str, told: Sequence[str] = ()
+    ) -> None:
         self.station, self._judge, self.purpose = station, judge, purpose
         setup = station.setup
         self.fps, self.robot_type = station.fps, station.robot.name
         self.tasks, self.reset_tasks = setup.tasks, setup.reset_tasks
         self.num_starts = setup.starts
         self.identity = Identity(f"cronos_robot/{setup.name}-v1", setup.fingerprint, f"{setup.name}, {by_whom}")
-        self.state_names, self.action_names = station.state_names, station.action_names
+        self.state_names, self.action_names = [*station.state_names, *told], station.action_names
         self.single_action_space = spaces.Box(setup.low, setup.high, dtype=np.float32)
         numbers = {"agent_pos": self.state_names, "environment_state": station.other_names}
         shown: dict[str, spaces.Space] = {
@@ -93,9 +96,11 @@ class RobotStreams:
         rows = 1 if ids is None else len(ids)
         if not self._seen:
             self._look()
+        setup = self.station.setup
+        numbers = {**self._seen, **dict(zip(setup.task_names, setup.tell(self._task), strict=True))}
         names = {"agent_pos": self.state_names, "environment_state": self.station.other_names}
         seen: dict[str, Any] = {
-            key: np.tile(np.array([self._seen[name] for name in some], np.float32), (rows, 1))
+            key: np.tile(np.array([numbers[name] for name in some], np.float32), (rows, 1))
             for key, some in names.items()
             if some
         }

@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 from lerobot.teleoperators.utils import TeleopEvents
+from lerobot_env_cronos import CronosVectorEnv
 from lerobot_robot_cronos import CronosPersonConfig, CronosSO101Config
 from PIL import Image
 
@@ -32,6 +33,7 @@ def make(tmp_path):
         teleop = CronosPersonConfig(robot_id="desk", reset_s=2.0, judges=False, **(person or {}))
         config = CronosRobotConfig(robot=robot, teleop=teleop, **{"judge": "sim"} | flags)
         env = config.create_streams(1)
+        env.config = config
         env.folder = tmp_path
         made.append(env)
         return env
@@ -54,23 +56,35 @@ def hold(env, steps):
     return [env.step(env.station.target[None])[4] for _ in range(steps)]
 
 
+def test_it_observes_what_the_scene_does(make):
+    env = make(task_observation="one_hot", camera_names=["front"])
+    begin(env, task=2)
+    world = CronosVectorEnv(
+        1, "so101_desk_2x2", obs_type="environment_state_agent_pos", task_observation="one_hot"
+    )
+    world.scene_reset(ONE, np.array([3]))
+    world.set_task(ONE, [world.tasks[2]])
+    assert env.state_names == world.state_names
+    assert np.allclose(env.observe()["agent_pos"], world.observe()["agent_pos"], atol=1e-4)
+    assert {key: f.shape for key, f in env.config.features.items()} == {
+        "action": (6,), "agent_pos": (11,), "observation.images.front": (240, 320, 3)
+    }  # fmt: skip
+
+
 def test_a_scene_reset_waits_for_the_person_and_costs_what_it_takes(make):
     env = make()
     before = env.station.clock.time()
     env.scene_reset(ONE, np.array([3]))
     # Two seconds home and two of the person's.
     assert env.station.clock.time() - before == pytest.approx(4.0, abs=0.1)
-    assert np.array_equal(env.station.robot.world.benchmark.configurations["train"][3], placed(env))
+    wanted = CronosVectorEnv(1, "so101_desk_2x2", obs_type="environment_state_agent_pos")
+    wanted.scene_reset(ONE, np.array([3]))
+    bodies = "environment_state"
+    assert np.allclose(env.station.robot.world.observe()[bodies], wanted.observe()[bodies], atol=1e-3)
     (line,) = ledger(env)
     assert (line["kind"], line["start"], line["during"]) == ("scene_reset", 3, "training")
     assert line["seconds"] == pytest.approx(2.0, abs=0.1)
     assert (env.folder / "starts/train_003.png").is_file()
-
-
-def placed(env):
-    world = env.station.robot.world
-    world.scene_reset(ONE, np.array([3]))
-    return world.benchmark.configurations["train"][3]
 
 
 def test_what_was_sent_is_what_is_told_and_help_is_marked(make):

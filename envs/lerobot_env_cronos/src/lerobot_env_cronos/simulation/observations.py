@@ -49,6 +49,16 @@ def agent_pos_names(scene: Scene, task_observation: str = "none") -> tuple[str, 
     return scene.robot.state_names + tuple(name.replace(" ", "_") for name in bodies)
 
 
+def one_hot(scene: Scene, tasks: Sequence[Task]) -> np.ndarray:
+    """What `agent_pos_names` has of tasks (k,), (k, ...) float32."""
+    receptacles = (*scene.receptacles, None)
+    vectors = np.zeros((len(tasks), len(scene.objects) + len(receptacles)), dtype=np.float32)
+    for vector, task in zip(vectors, tasks, strict=True):
+        vector[scene.objects.index(task.object)] = 1.0
+        vector[len(scene.objects) + receptacles.index(task.receptacle)] = 1.0
+    return vectors
+
+
 class ObservationBuilder:
     """Reads observations from a simulation; renders lazily, so state-only runs need no OpenGL."""
 
@@ -111,7 +121,7 @@ class ObservationBuilder:
         sim = self.simulation
         agent_pos = sim.scene.robot.proprioception(sim)[ids].clip(-self._limit, self._limit)
         if self.tells_task:
-            agent_pos = np.concatenate([agent_pos, self._one_hot(tasks)], axis=1)
+            agent_pos = np.concatenate([agent_pos, one_hot(self.simulation.scene, tasks)], axis=1)
         observation: dict[str, Any] = {"agent_pos": agent_pos}
         if self.privileged:
             observation["environment_state"] = self._environment_state(sim.end_effector()[0])[ids]
@@ -126,20 +136,13 @@ class ObservationBuilder:
         if not self.tells_task:
             return observation
         agent_pos = observation["agent_pos"][:, : len(self.simulation.scene.robot.state_names)]
-        return observation | {"agent_pos": np.concatenate([agent_pos, self._one_hot(tasks)], axis=1)}
+        return observation | {
+            "agent_pos": np.concatenate([agent_pos, one_hot(self.simulation.scene, tasks)], axis=1)
+        }
 
     def render(self, qpos: np.ndarray) -> np.ndarray:
         """Frames (k, height, width, 3) of states `qpos` (k, nq) for videos, from the first camera."""
         return self._renderer(self.render_size, self.cameras[0]).render(qpos)
-
-    def _one_hot(self, tasks: Sequence[Task]) -> np.ndarray:
-        scene = self.simulation.scene
-        receptacles = (*scene.receptacles, None)
-        vectors = np.zeros((len(tasks), len(scene.objects) + len(receptacles)), dtype=np.float32)
-        for vector, task in zip(vectors, tasks, strict=True):
-            vector[scene.objects.index(task.object)] = 1.0
-            vector[len(scene.objects) + receptacles.index(task.receptacle)] = 1.0
-        return vectors
 
     def _environment_state(self, p: np.ndarray) -> np.ndarray:
         position = self.simulation.body_poses()[..., :3]
