@@ -146,7 +146,15 @@ def test_act_of_either_acts_in_the_scene(folders, tmp_path):
         *ENV,
         "--eval.n_episodes=1",
     ]
-    run_forked([*command, "--env.task=put the cube on the plate", f"--output_dir={outputs['real']}"], check=True)
+    run_forked(
+        [
+            *command,
+            "--env.task=put the cube on the plate",
+            "--env.render_size=[32, 32]",
+            f"--output_dir={outputs['real']}",
+        ],
+        check=True,
+    )
     assert json.loads((outputs["real"] / "eval_info.json").read_text())["overall"]["n_episodes"] == 1
     command = ["cronos-eval", f"--policy.path={policies['simulated']}", "--policy.device=cpu", *ENV]
     command += ["--eval.n_episodes=1", "--eval.suites=[independent]", "--eval.splits=[train]", "--eval.videos=0"]
