@@ -191,7 +191,7 @@ class Trainer:
         self.logger.log("update", record | {"time_share": shares})
         self._update = None
         if self.loop.updates % self.config.log_freq == 0:
-            rates = {name: rollout[name].rate for name in ("found_complete", "never_grasped")}
+            rates = {name: rollout[name].rate for name in ("found_complete", "never_grasped") if name in rollout}
             self.logger.progress({"success": rollout["success"], **rates, "steps_per_s": steps_per_s})
 
     @cached_property
