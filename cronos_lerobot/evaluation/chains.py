@@ -65,8 +65,9 @@ class ChainResult:
     """Control steps."""
     found_complete: list[int] = field(default_factory=list)
     """Positions of successes whose task was complete when it was given."""
-    never_grasped: list[int] = field(default_factory=list)
-    """Positions of other successes without a grasp of the object from the task's start to its success."""
+    never_grasped: list[int] | None = field(default_factory=list)
+    """Positions of other successes without a grasp of the object from the task's start to its success; None if the
+    world does not say what is grasped."""
     starts: list[str] = field(default_factory=list)
     """How each task's bodies lay when it was given, if the runner was asked to look."""
     is_kept: bool = False
@@ -99,11 +100,13 @@ class ChainResult:
         """If the runner keeps it."""
         return Trajectory(*map(np.array, zip(*self.frames, strict=True))) if self.frames else None
 
-    def record(self, is_success: bool, is_grasped: bool) -> None:
-        """Note a control step."""
+    def record(self, is_success: bool, is_grasped: bool | None) -> None:
+        """Note a control step; `is_grasped` is None where that is unknown."""
         self.steps += 1
         self.elapsed += 1
-        self.was_grasped |= is_grasped
+        if is_grasped is None:
+            self.never_grasped = None
+        self.was_grasped |= bool(is_grasped)
         if self.was_found is None:
             # No task can be done in one step.
             self.was_found = is_success
@@ -111,7 +114,7 @@ class ChainResult:
             self.success[-1] = True
             if self.was_found:
                 self.found_complete.append(len(self.success) - 1)
-            elif not self.was_grasped:
+            elif self.never_grasped is not None and not self.was_grasped:
                 self.never_grasped.append(len(self.success) - 1)
 
 
@@ -239,11 +242,12 @@ class ChainRunner:
     def _record(self, info: dict[str, np.ndarray]) -> list[int]:
         """Note what a step did; returns the streams whose chains are over."""
         over = []
-        diverged, grasped = info.get("diverged"), info.get("is_grasped")
+        diverged = info.get("diverged")
+        grasped = info.get("is_grasped", [None] * self.env.num_envs)
         for i, run in sorted(self._runs.items()):
             # A simulation that broke down proves nothing, whatever it shows.
             broke_down = diverged is not None and bool(diverged[i])
-            run.record(bool(info["is_success"][i]) and not broke_down, grasped is None or bool(grasped[i]))
+            run.record(bool(info["is_success"][i]) and not broke_down, grasped[i])
             self._keep_state(i, run)
             window_over = run.elapsed >= self.rules.window
             if self.rules.stops:

@@ -28,8 +28,9 @@ FIELDS = {"policy": str, "policy_fingerprint": str, "scene": str, "benchmark": d
 
 Episode = Mapping[str, Any]
 """Outcome of a chain: `number` (task, ordering, or first task of the stream), `configuration`, `seed` (of the
-action sampling), `length` (tasks completed), `steps`, `found_complete` and `never_grasped` (positions, see
-`ChainResult`). Of a stream also `success` and, if the world says it, `starts` (by segment)."""
+action sampling), `length` (tasks completed), `steps`, `found_complete` and, if the world says what is grasped,
+`never_grasped` (positions, see `ChainResult`). Of a stream also `success` and, if the world says it, `starts` (by
+segment)."""
 
 
 def folder_name(suite: str, split: str) -> str:
@@ -105,7 +106,9 @@ def describe_episodes(
     for r in results:
         episode: dict[str, Any] = {"number": r.chain.number, "configuration": r.chain.configuration, "seed": seed}
         episode |= {"length": r.length, "steps": r.steps}
-        episode |= {"found_complete": r.found_complete, "never_grasped": r.never_grasped}
+        episode |= {"found_complete": r.found_complete}
+        if r.never_grasped is not None:
+            episode |= {"never_grasped": r.never_grasped}
         if of_streams:
             episode |= {"success": r.success}
         if r.starts:
@@ -121,11 +124,13 @@ def success_rate(episodes: Sequence[Episode], position: int = 0) -> dict[str, An
     interval is clustered by configuration.
 
     Returns:
-        `success`, `n`, `ci95`, `effective_n`, and the counts `found_complete` and `never_grasped`.
+        `success`, `n`, `ci95`, `effective_n`, and the counts `found_complete` and, if known, `never_grasped`.
     """
     success = np.array([e["length"] > position for e in episodes])
     return _rate(success, np.array([e["configuration"] for e in episodes])) | {
-        name: sum(position in e[name] for e in episodes) for name in ("found_complete", "never_grasped")
+        name: sum(position in e[name] for e in episodes)
+        for name in ("found_complete", "never_grasped")
+        if all(name in e for e in episodes)
     }
 
 
@@ -221,13 +226,14 @@ def stream_results(episodes: Sequence[Episode], cycle: int) -> dict[str, Any]:
         | {"starts": {name.value: int((starts[:, k] == name).sum()) for name in Start if (starts != "").any()}}
         for k in range(length)
     ]
+    grasps = [e["never_grasped"] for e in episodes if "never_grasped" in e]
     shares = {name: {"share": r["n"] / success.size} for name, r in by_start.items() if r}
     return (rate(np.ones_like(success)) or {}) | {
         "n": num_streams,
         "segments": length,
         "done": rate(~found),
         "share_found_complete": float(found.mean()),
-        "never_grasped": sum(len(e["never_grasped"]) for e in episodes),
+        **({"never_grasped": sum(map(len, grasps))} if grasps else {}),
         "by_segment": segments,
         "by_start": {name: r | shares[name] for name, r in by_start.items() if r},
         "stuck": _stuck(success & ~found, starts, min(cycle, length)),

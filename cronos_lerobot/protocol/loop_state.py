@@ -45,8 +45,8 @@ class LoopState:
     """Whether the next step is the first of a segment."""
     succeeded: np.ndarray = field(init=False)
     """(N,) whether the current task has been complete at any step of its segment."""
-    grasped: np.ndarray = field(init=False)
-    """(N,) whether the current task's object has been grasped at any step of its segment."""
+    grasped: np.ndarray | None = field(init=False)
+    """(N,) whether the current task's object has been grasped at any step of its segment; None if unknown."""
     found_complete: np.ndarray = field(init=False)
     """(N,) whether the task was complete after the segment's first step: an earlier task left it so."""
     diverged: np.ndarray = field(init=False)
@@ -151,13 +151,14 @@ class LoopState:
         """Count one control step of every stream.
 
         Args:
-            info: the environment's `is_success` and `diverged` after the step, (N,) bool each. Where `is_grasped`
-                is missing, nothing is said to be never grasped.
+            info: the environment's `is_success`, `diverged` and, if known, `is_grasped` after the step, (N,) bool
+                each.
             cut: (N,) bool, where the stream's piece ends here.
         """
         self.t += 1
         self.succeeded |= info["is_success"]
-        self.grasped |= info.get("is_grasped", True)
+        now = info.get("is_grasped")
+        self.grasped = None if now is None or self.grasped is None else self.grasped | now
         self.diverged = info["diverged"].copy()
         if self.begins_segment:
             # No task can be done in one step.
@@ -177,12 +178,13 @@ class LoopState:
 
     def end_segment(self) -> SegmentEnd:
         """Close the segment of every stream and return what it came to."""
+        earned = self.succeeded & ~self.found_complete
         end = SegmentEnd(
             self.task,
             self.segments_since_reset.copy(),
             success=self.succeeded,
             found_complete=self.found_complete,
-            never_grasped=self.succeeded & ~self.found_complete & ~self.grasped,
+            never_grasped=None if self.grasped is None else earned & ~self.grasped,
             helped=self.helped,
         )
         streams, own = np.arange(self.num_streams), ~self.helped
@@ -263,8 +265,9 @@ class SegmentEnd:
     """(N,) bool, complete at any step of the segment."""
     found_complete: np.ndarray
     """(N,) bool, a success for which nothing had to be done: an earlier task had left it complete."""
-    never_grasped: np.ndarray
-    """(N,) bool, another success whose object was grasped at no step of the segment: pushed or dropped."""
+    never_grasped: np.ndarray | None
+    """(N,) bool, another success whose object was grasped at no step of the segment: pushed or dropped. None where
+    the environment does not say what is grasped."""
     helped: np.ndarray
     """(N,) bool, a person or a script acted at any step of it."""
 

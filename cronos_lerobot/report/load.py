@@ -37,7 +37,7 @@ UPDATES = [
 SEGMENTS = [*IDENTITY, "steps", "cycle", "is_late", "kind", "part", "successes", "n"]
 TABLES = ("evaluations", "updates", "segments", "interventions")
 APART = ("found_complete", "never_grasped")
-"""Of the successes: those of tasks that were complete when they were given, and others without a grasp."""
+"""Of the successes: those of tasks that were complete when they were given; others without a grasp, if known."""
 LENGTH = 300
 """Characters of a sentence on what is left out."""
 
@@ -252,7 +252,7 @@ def _rate(found: Cells) -> Cells:
     cells = {"n": int(found["n"]), "success": float(found["success"]), "ci95_low": low, "ci95_high": high}
     if cells["n"] < 1 or not all(0 <= value <= 1 for value in (low, high, cells["success"])):
         raise ValueError(f"no success rate: {cells}")
-    return cells | {name: int(found.get(name) or 0) for name in APART}
+    return cells | {name: int(found[name]) for name in APART if name in found}
 
 
 def _said_of(run: TrainingRun) -> Iterator[str]:
@@ -292,7 +292,7 @@ def _parts(results: Cells) -> Iterator[Cells]:
             length, (low, high) = found["average_chain_length"], found["average_chain_length"]["ci95"]
             cells: Cells = {"part": "chain length", "orderings": orderings, "n": int(found["n"])}
             cells |= {"success": float(length["mean"]), "ci95_low": float(low), "ci95_high": float(high)}
-            yield cells | {"std": length["std"]} | dict.fromkeys(APART, 0)
+            yield cells | {"std": length["std"]}
     for k, segment in enumerate(results.get("by_segment", ())):
         yield {"part": f"segment {k + 1}"} | _rate(segment)
 

@@ -146,11 +146,14 @@ def part_table(evaluations: pd.DataFrame, columns: Sequence[str], *, with_all: b
         with_all: whether to begin with a row of all.
     """
     rows = []
-    rate = ["n", "success", "ci95_low", "ci95_high", *APART]
+    apart = [name for name in APART if evaluations[name].notna().any()]
+    rate = ["n", "success", "ci95_low", "ci95_high", *apart]
     for _, one in evaluations.iterrows():
         overall = [{"part": ALL} | one[rate].to_dict()] if with_all else []
         rows += [one[list(columns)].to_dict() | cells for cells in (*overall, *one["parts"])]
     table = pd.DataFrame(rows)
+    # Whole numbers, beside rows that have none.
+    table = table.astype({name: "Int64" for name in APART if name in table})
     return table.rename(columns={"ci95_low": "success ci95_low", "ci95_high": "success ci95_high", "part": "task"})
 
 

@@ -27,7 +27,7 @@ from cronos_lerobot.protocol.config import ProtocolConfig
 from cronos_lerobot.protocol.resets import EXTRA_RESETS
 from cronos_lerobot.protocol.streams import Streams, check_capability, check_makes_streams, steps_per_task
 from cronos_lerobot.protocol.task_orders import TASK_ORDERS
-from cronos_lerobot.ranges import check_ranges, limits, ranged
+from cronos_lerobot.ranges import check_ranges, ranged
 from cronos_lerobot.robot import config as _robot  # noqa: F401  (registers cronos_robot)
 
 EVALUATION_ONLY = ("task", "suite", "split", "advance", "end_effector_reset")
@@ -134,8 +134,6 @@ class CronosTrainConfig:
     """The periodic evaluation."""
     eval_freq: int = ranged(102_400, minimum=0)
     """Interaction steps between two evaluations; one more before the first step, one after the last. 0: none."""
-    eval_at_interventions: list[int] = field(default_factory=list, metadata=limits(minimum=1))
-    """Evaluate also at the first policy update at which the interventions have reached each of these counts."""
     save_checkpoint: bool = True
     """Save checkpoints."""
     save_freq: int = ranged(102_400, minimum=0)
@@ -169,11 +167,6 @@ class CronosTrainConfig:
         if self.checkpoint_path is not None:
             return self.checkpoint_path / PRETRAINED_MODEL_DIR
         return None if self.policy is None else self.policy.pretrained_path
-
-    @property
-    def evaluates(self) -> bool:
-        """Whether there are periodic evaluations."""
-        return bool(self.eval_freq or self.eval_at_interventions)
 
     @classmethod
     def __get_path_fields__(cls) -> list[str]:
@@ -268,7 +261,7 @@ def check_world(config: CronosTrainConfig, env: Streams) -> None:
     """
     protocol = config.protocol
     wanted = [("protocol.num_configurations", "train", protocol.num_configurations)]
-    if config.evaluates:
+    if config.eval_freq:
         wanted.append(("eval.n_episodes", config.eval.split, config.eval.n_episodes))
     for flag, split, count in wanted:
         if count is not None and count > (available := env.num_starts[split]):

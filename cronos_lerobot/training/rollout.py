@@ -29,7 +29,7 @@ class RolloutStatistics:
     """
 
     SORTS = ("success", "found_complete", "never_grasped")
-    """Fields of SegmentEnd: all successes, and the two sorts that are counted apart."""
+    """Fields of SegmentEnd: all successes, and the two sorts that are counted apart, as far as they are known."""
 
     def __init__(self, instructions: Sequence[str], num_tasks: int | None = None) -> None:
         self.instructions = list(instructions)
@@ -43,6 +43,8 @@ class RolloutStatistics:
             state["reward"] += float(event.reward[~event.intervened].sum())
             state["diverged"] += int(event.diverged.sum())
         elif isinstance(event, SegmentEnd):
+            if event.never_grasped is None:
+                state["by_segment"].pop("never_grasped", None)
             for stream, task in enumerate(event.task):
                 if event.helped[stream]:
                     state["helped"][0] += int(event.success[stream])
@@ -51,26 +53,26 @@ class RolloutStatistics:
                 self._count(state["by_task"], self.instructions[task], event.success[stream])
                 if task < self.num_tasks:
                     segment = str(event.segments_since_reset[stream])
-                    for sort in self.SORTS:
-                        self._count(state["by_segment"][sort], segment, getattr(event, sort)[stream])
+                    for sort, table in state["by_segment"].items():
+                        self._count(table, segment, getattr(event, sort)[stream])
 
     def pop(self) -> dict[str, Any]:
         """Return the statistics since the last `pop`, and begin anew.
 
         `success` is the rate in all `segments`, [k, n] those `found_complete` (successes for which nothing had to
-        be done) and `never_grasped` (other successes whose object was never grasped). The three `..._by_segment`
-        have one [k, n] for each number of segments since the scene reset, `success_by_task` one for each
-        instruction. Learned reset tasks are in the last one only. Segments with help are counted in `helped`,
-        [k, n], and in none of the others.
+        be done) and `never_grasped` (other successes whose object was never grasped; absent where the environment
+        does not say what is grasped). The `..._by_segment` have one [k, n] for each number of segments since the
+        scene reset, `success_by_task` one for each instruction. Learned reset tasks are in the last one only.
+        Segments with help are counted in `helped`, [k, n], and in none of the others.
         """
         state = self._state
         total = {sort: _total(table.values()) for sort, table in state["by_segment"].items()}
+        success = total.pop("success")
         all_segments = _total(state["by_task"].values()).n
         statistics = {
-            "success": total["success"].rate,
-            "segments": total["success"].n,
-            "found_complete": total["found_complete"],
-            "never_grasped": total["never_grasped"],
+            "success": success.rate,
+            "segments": success.n,
+            **total,
             **{
                 f"{sort}_by_segment": {key: Count(*table[key]) for key in sorted(table, key=int)}
                 for sort, table in state["by_segment"].items()

@@ -57,9 +57,8 @@ class Trainer:
         self.statistics = RolloutStatistics([task.instruction for task in run.task_set.all], num_tasks)
         if "statistics" in observers:
             self.statistics.load_state_dict(observers["statistics"])
-        evaluated = observers.get("evaluated", {"steps": 0, "interventions": 0})
+        evaluated = observers.get("evaluated", {"steps": 0})
         self._evaluations = Schedule(self.config.eval_freq, evaluated["steps"])
-        self._evaluated_interventions = evaluated["interventions"]
         self._saves = Schedule(self.config.save_freq, self.loop.n)
         self._update: dict[str, Any] | None = None
         """Metrics of the latest update, until they are logged."""
@@ -93,7 +92,7 @@ class Trainer:
         try:
             # A run that was told to stop has left an evaluation to this one. Between two updates, where a budget
             # ends a run, there is none.
-            if self.loop.t == 0 or (self._is_between_rollouts and self._is_evaluation_due()):
+            if self.loop.t == 0 or (self._is_between_rollouts and self._evaluations.due(self.loop.n)):
                 self._evaluate()
             self._logged_steps = self.loop.n
             self.run.stopwatch.lap()
@@ -125,7 +124,7 @@ class Trainer:
         # Before the evaluation, which may take long: a kill in it loses the evaluation alone.
         if stopped or self._saves.due(self.loop.n):
             self._save(env_state)
-        if not stopped and self._is_evaluation_due():
+        if not stopped and self._evaluations.due(self.loop.n):
             self._evaluate()
             stopped = self._is_stopped(stop)
             if stopped:
@@ -162,14 +161,6 @@ class Trainer:
         asked = self.run.ranks.concatenate(np.array([stop.number is not None])).any()
         return bool(asked) and self.loop.n < self.config.total_steps
 
-    def _is_evaluation_due(self) -> bool:
-        return self._evaluations.due(self.loop.n) or bool(self._reached())
-
-    def _reached(self) -> list[int]:
-        """Those of `eval_at_interventions` that were reached since the last evaluation."""
-        wanted = self.config.eval_at_interventions
-        return [count for count in wanted if self._evaluated_interventions < count <= self.loop.b]
-
     def _observe(self, event: Event) -> None:
         self.statistics.on_event(event)
         if isinstance(event, Step):
@@ -193,7 +184,7 @@ class Trainer:
         self.logger.log("update", record | {"time_share": shares})
         self._update = None
         if self.loop.updates % self.config.log_freq == 0:
-            rates = {name: rollout[name].rate for name in ("found_complete", "never_grasped")}
+            rates = {name: rollout[name].rate for name in ("found_complete", "never_grasped") if name in rollout}
             self.logger.progress({"success": rollout["success"], **rates, "steps_per_s": steps_per_s})
 
     @cached_property
@@ -204,9 +195,8 @@ class Trainer:
         return run.make_eval_env(min(options.batch_size, num_episodes))
 
     def _evaluate(self) -> None:
-        reached = self._reached()
-        self._evaluations.last, self._evaluated_interventions = self.loop.n, self.loop.b
-        if not self.config.evaluates:
+        self._evaluations.last = self.loop.n
+        if not self.config.eval_freq:
             return
         options, run = self.config.eval, self.run
         result = evaluate_independent(
@@ -221,7 +211,7 @@ class Trainer:
             window=steps_per_task(self.config.env),
             ranks=run.ranks,
         )
-        self.logger.log("evaluation", result | {"at_interventions": reached})
+        self.logger.log("evaluation", result)
         run.stopwatch.lap()
 
     def _save(self, env_state: dict[str, np.ndarray] | None) -> None:
@@ -232,7 +222,7 @@ class Trainer:
         observers = {
             "recorder": recorder,
             "logger": self.logger.state_dict(),
-            "evaluated": {"steps": self._evaluations.last, "interventions": self._evaluated_interventions},
+            "evaluated": {"steps": self._evaluations.last},
             "statistics": self.statistics.state_dict(),
         }
         self.logger.log_checkpoint(save_checkpoint(self.run, observers, env_state))

@@ -11,7 +11,7 @@ from lerobot_env_cronos import Scene, ScriptedExpert, Task, gymnasium_id, regist
 from lerobot_env_cronos.expert.hands import point_down
 from lerobot_env_cronos.scene.arms.so101 import kinematics
 from lerobot_env_cronos.scene.arms.so101.arm import SO101_ARM, from_joints, to_joints
-from lerobot_env_cronos.scene.arms.so101.geometry import EE_SITE, FINGERTIP_REACH
+from lerobot_env_cronos.scene.arms.so101.geometry import EE_OFFSET, EE_SITE, FINGERTIP_REACH
 from lerobot_env_cronos.scene.model import build_model
 from lerobot_env_cronos.scene.scenes import get_scene
 from lerobot_env_cronos.simulation.judging import IN_HAND, ON_TABLE
@@ -61,6 +61,20 @@ def test_inverse_kinematics_come_back():
     assert found.mean() > 0.9
     assert np.linalg.norm(p - goal[found], axis=1).max() < 1e-3
     np.testing.assert_allclose(R[:, 2, 2], np.cos(tilt[found]), atol=1e-6)
+
+
+def test_a_hand_on_the_pan_axis_has_joint_positions_and_is_not_there():
+    yaw = np.array([0.3])
+    above = kinematics.hand_rotation(np.zeros(1), yaw, np.zeros(1)) @ EE_OFFSET + [0, 0, 0.15]
+    # This one is out of reach at every tilt, and comes to the axis at the last one.
+    high = np.array([[0.057, 0.002, 0.1]])
+    with np.errstate(all="raise"):
+        for q, found in (
+            kinematics.inverse_kinematics(above, yaw, np.zeros(1)),
+            point_down(high, np.zeros(1)),
+        ):
+            assert np.isfinite(q).all()
+            assert not found
 
 
 def test_the_hand_gets_down_as_far_as_measured_and_leans_beyond():

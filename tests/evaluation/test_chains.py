@@ -162,6 +162,8 @@ def test_found_and_ungrasped_successes_and_trajectories():
     assert (result.found_complete, result.never_grasped) == ([1], [0, 3])
     trajectory = result.trajectory
     assert trajectory.states.shape == (result.steps + 1, 2)
+    # Where the world does not say what is grasped, nobody knows.
+    assert run(1, chains=CHAINS[:1])[0][0].never_grasped is None
     # Complete from the step on which it was, until the window is over.
     assert np.flatnonzero(np.diff(trajectory.is_complete.astype(int)) == 1).tolist() == [9, 99, 189, 279]
     assert np.flatnonzero(np.diff(trajectory.position)).tolist() == [80, 160, 240]

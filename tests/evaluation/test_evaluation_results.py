@@ -99,6 +99,9 @@ def test_successes_that_were_found_or_came_without_a_grasp_are_counted_at_their_
     )
     counts = [[success_rate(some, k)[name] for k in range(4)] for name in ("found_complete", "never_grasped")]
     assert counts == [[0, 1, 0, 1], [2, 0, 0, 0]]
+    for episode in some:
+        del episode["never_grasped"]
+    assert "never_grasped" not in success_rate(some)
 
 
 FREE, OTHER, FALLEN, FOUND = "free", "on_other_receptacle", "fallen", "complete"

@@ -20,7 +20,9 @@ TRAINING = (
 def run(commands, tmp_path_factory):
     """480 steps: of each stream six tasks of 40 steps, and a scene reset after every second one."""
     folder = tmp_path_factory.mktemp("train") / "run"
-    commands.run("cronos-train", *TRAINING, "--steps=480", f"--output_dir={folder}")
+    output = commands.run("cronos-train", *TRAINING, "--steps=480", f"--output_dir={folder}")
+    assert "found complete" in output
+    assert "never grasped" not in output
     return folder
 
 
@@ -67,6 +69,12 @@ def test_its_policies_are_published_and_evaluated_from_there(run, commands, serv
     assert results["by_start"] == {}
     assert all(e["steps"] == 16 * 40 for e in results["episodes"])
     assert list((tmp_path / "eval/independent_train/videos").glob("*.mp4"))
-    monkeypatch.setattr("sys.argv", ["cronos-report", str(run), f"--output={tmp_path / 'report'}"])
+    folders = str(run), str(tmp_path / "eval")
+    monkeypatch.setattr("sys.argv", ["cronos-report", *folders, f"--output={tmp_path / 'report'}"])
     report()
     assert (tmp_path / "report/index.html").is_file()
+    # It does not say what is grasped.
+    written = [run / "metrics.jsonl", *tmp_path.rglob("results.json"), tmp_path / "report/independent.csv"]
+    texts = [file.read_text() for file in written]
+    assert len(texts) == 8
+    assert all("found_complete" in text and "never_grasped" not in text for text in texts)

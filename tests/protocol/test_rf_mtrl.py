@@ -232,6 +232,11 @@ def test_successes_are_told_apart_by_what_was_done_for_them():
         assert end.never_grasped.tolist() == [False, False, True, False]
 
 
+def test_what_was_grasped_is_unknown_where_the_environment_does_not_say_it():
+    ends = [event for event in run(protocol(), steps=16)[-1] if isinstance(event, SegmentEnd)]
+    assert [end.never_grasped for end in ends] == [None] * 4
+
+
 def test_history_is_of_segments_by_stream_and_task():
     env = DummyEnv(2)
     config = protocol(scene_reset_interval=None)

@@ -67,7 +67,6 @@ WRONG = {
     "--torch_threads": {"torch_threads": 0},
     "--eval.split": {"eval": PeriodicEvaluationConfig(split="test")},
     "--eval.repetitions": {"eval": PeriodicEvaluationConfig(repetitions=2, temperature=0)},
-    "--eval_at_interventions": {"eval_at_interventions": [5, 0]},
     "--resume": {"resume": "maybe"},
     "--env.split": {"env": CronosEnvConfig(split="held_out")},
     "--save_checkpoint": {

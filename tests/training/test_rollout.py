@@ -12,7 +12,7 @@ TASKS = ["a", "b", "put a back"]
 
 
 def end(task, since_reset, success, found, ungrasped):
-    flags = [np.array(flag, bool) for flag in (success, found, ungrasped)]
+    flags = [None if flag is None else np.array(flag, bool) for flag in (success, found, ungrasped)]
     return SegmentEnd(np.array(task), np.array(since_reset), *flags, np.zeros(len(task), bool))
 
 
@@ -33,6 +33,14 @@ def test_successes_found_complete_and_never_grasped_are_counted_apart():
     assert record["found_complete_by_segment"] == {"0": [1, 2], "1": [0, 1], "2": [0, 1], "10": [0, 1]}
     assert record["never_grasped_by_segment"] == {"0": [1, 2], "1": [0, 1], "2": [0, 1], "10": [0, 1]}
     assert record["success_by_task"] == {"a": [1, 2], "b": [2, 3], "put a back": [1, 1]}
+
+
+def test_what_was_grasped_may_be_unknown():
+    rollout = RolloutStatistics(TASKS)
+    rollout.on_event(end([0, 1], [0, 0], [1, 1], [0, 1], None))
+    record = rollout.pop()
+    assert record["found_complete"] == (1, 2)
+    assert not [name for name in record if name.startswith("never_grasped")]
 
 
 def test_counts_are_rates_on_tensorboard_whatever_they_are_called():

@@ -74,17 +74,6 @@ def test_metrics_hold_both_axes_and_the_rollouts_success(tmp_path):
     assert manifest["finished"]["steps"] == 4 * STEPS_PER_UPDATE
 
 
-def test_evaluations_at_so_many_interventions(tmp_path):
-    """Four streams, reset every 16 steps, updates every 8: 4 counted interventions at every second update."""
-    options = {"eval_freq": 0, "eval_at_interventions": [1, 4, 5], "steps": 6 * STEPS_PER_UPDATE}
-    train(config(tmp_path / "run", **options), env=DummyEnv(STREAMS))
-    names = ("interaction_steps", "interventions", "at_interventions")
-    found = [tuple(line[name] for name in names) for line in metrics(tmp_path / "run", "evaluation")]
-    assert found == [(0, 0, []), (64, 4, [1, 4]), (128, 8, [5]), (192, 12, [])]
-    train(config(tmp_path / "without", **options | {"eval_at_interventions": []}), env=DummyEnv(STREAMS))
-    assert_same_weights(tmp_path / "run", tmp_path / "without")
-
-
 def test_tensorboard_has_every_point_once_after_a_resume(tmp_path):
     train(config(tmp_path / "run", steps=2 * STEPS_PER_UPDATE, tensorboard=True, eval_freq=0))
     train(resumed(tmp_path / "run", steps=4 * STEPS_PER_UPDATE, tensorboard=True, eval_freq=0))

@@ -93,8 +93,11 @@ def inverse_kinematics(p: np.ndarray, yaw: np.ndarray, tilt: np.ndarray) -> tupl
     # The end effector is 8 mm off the plane in which the arm bends: three rounds are exact to a hundredth of that.
     for _ in range(3):
         hand = p - hand_rotation(azimuth, yaw - azimuth, tilt) @ EE_OFFSET
-        azimuth = np.arctan2(hand[:, 1], hand[:, 0]) - np.arcsin(_ASIDE / np.hypot(hand[:, 0], hand[:, 1]))
-    r = np.hypot(hand[:, 0], hand[:, 1]) - _WRIST_TO_HAND * np.sin(tilt) - _SHOULDER[0]
+        away = np.hypot(hand[:, 0], hand[:, 1])
+        azimuth = np.arctan2(hand[:, 1], hand[:, 0]) - np.arcsin(_ASIDE / np.maximum(away, abs(_ASIDE)))
+    # Near the pan axis, or beyond it, they are not.
+    is_exact = np.linalg.norm(p - hand_rotation(azimuth, yaw - azimuth, tilt) @ EE_OFFSET - hand, axis=1) < 1e-3
+    r = away - _WRIST_TO_HAND * np.sin(tilt) - _SHOULDER[0]
     z = hand[:, 2] + _WRIST_TO_HAND * np.cos(tilt) - _SHOULDER[1]
     distance, angle = np.maximum(np.hypot(r, z), 1e-6), np.arctan2(z, r)
     upper = (_UPPER**2 + distance**2 - _FORE**2) / (2 * _UPPER * distance)
@@ -105,7 +108,7 @@ def inverse_kinematics(p: np.ndarray, yaw: np.ndarray, tilt: np.ndarray) -> tupl
     roll = (yaw - azimuth + np.pi) % (2 * np.pi) - np.pi
     q = np.stack([-azimuth, lift, elbow, np.pi / 2 - tilt - lift - elbow, roll], axis=1)
     within = np.clip(q, JOINT_LOW[:NUM_JOINTS], JOINT_HIGH[:NUM_JOINTS])
-    return within, (within == q).all(1) & (np.abs(upper) <= 1) & (np.abs(fore) <= 1)
+    return within, is_exact & (within == q).all(1) & (np.abs(upper) <= 1) & (np.abs(fore) <= 1)
 
 
 def hand_rotation(azimuth: np.ndarray, roll: np.ndarray, tilt: np.ndarray) -> np.ndarray:
