@@ -9,6 +9,7 @@ from pathlib import Path
 
 import lerobot_policy_openvla  # noqa: F401
 import lerobot_policy_pocketvla  # noqa: F401
+import lerobot_robot_cronos  # noqa: F401
 import numpy as np
 import pytest
 from flags import parse_flags
@@ -60,6 +61,8 @@ def readable(flags):
     groups = [flag.split(".")[0] for flag in flags if re.match(r"--\w+\.path=", flag)]
     elsewhere = ["--config_path=", "--env.benchmark=", "--env.hub_path=", "--env.type=cronos_hub"]
     elsewhere += [f"{group}." for group in groups]
+    if any(flag.startswith("--config_path=") for flag in flags):
+        elsewhere.append("--env.")
     if any(PACKAGE in flag for flag in flags):
         elsewhere.append("--env.scene=")
     said = [flag for flag in flags if "<>" not in flag and PACKAGE not in flag]
