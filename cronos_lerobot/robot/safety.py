@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from cronos_lerobot.robot.setups import Setup
@@ -19,6 +21,10 @@ class Safety:
         self._setup, self._max_step = setup, max_step
         self.limited = 0
         """Control steps in which an action was changed."""
+
+    def steps_for(self, distance: float) -> int:
+        """Control steps that a target needs for a distance, in the action's units."""
+        return 1 if self._max_step is None else math.ceil(distance / self._max_step)
 
     def limit(self, action: np.ndarray, last: np.ndarray) -> np.ndarray:
         """Return the action (A,) that is allowed after the target `last` (A,): out of the box it is `last`."""

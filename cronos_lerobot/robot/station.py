@@ -177,7 +177,7 @@ class Station:
     def go_home(self) -> None:
         """Move to the home pose in a straight line of joint positions."""
         start = self._position()
-        steps = round(HOME_S * self.fps)
+        steps = max(round(HOME_S * self.fps), self.safety.steps_for(np.abs(self.setup.home - start).max()))
         self.begin()
         for step in range(1, steps + 1):
             self.target = self._send(start + (self.setup.home - start) * step / steps)

@@ -110,6 +110,7 @@ def test_targets_keep_to_limits_steps_and_the_box():
     assert np.allclose(safety.limit(home + 3, home), home + 3)
     assert safety.limited == 0
     assert np.allclose(safety.limit(home + 50, home), home + 5)
+    assert (safety.steps_for(101), Safety(setup, None).steps_for(101)) == (21, 1)
     far = np.full(6, 1e4, np.float32)
     assert np.allclose(Safety(setup, None).limit(far, home), setup.high)
     assert safety.limited == 1
