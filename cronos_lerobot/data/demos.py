@@ -14,6 +14,7 @@ from cronos_lerobot.data.perturbations import (
     ActionNoise,
     GraspMisses,
     MissConfig,
+    MistakenGrasps,
     NoiseConfig,
     move_arm_at_random,
 )
@@ -58,10 +59,8 @@ class DemoConfig:
 
 def check_arm(config: DemoConfig, scene: Scene) -> None:
     """Raise a ValueError for what is shown by the WidowX alone."""
-    if scene.arm != "widowx" and (config.misses.share or config.start.arm_pose == "random"):
-        raise ValueError(
-            f"--misses.share and --start.arm_pose=random are for the WidowX, {scene.name} has {scene.arm}"
-        )
+    if scene.arm != "widowx" and config.start.arm_pose == "random":
+        raise ValueError(f"--start.arm_pose=random is for the WidowX, {scene.name} has {scene.arm}")
 
 
 @dataclass
@@ -126,7 +125,7 @@ class DemoCollector:
         self._arm = env.scene.robot
         self._max_steps = config.max_steps or env.steps_per_task
         self._noise = ActionNoise(config.noise, env.num_envs, self._arm)
-        self._misses = GraspMisses(config.misses, env)
+        self._misses = (GraspMisses if env.scene.arm == "widowx" else MistakenGrasps)(config.misses, env)
         self._failures_in_a_row = 0
         check_starts(config.start, env.scene, tasks)
 

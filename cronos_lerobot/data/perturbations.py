@@ -8,7 +8,7 @@ itself in, so the data show how to come back from states the expert alone would 
 from dataclasses import dataclass
 
 import numpy as np
-from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos import CronosVectorEnv, ScriptedExpert
 from lerobot_env_cronos.scene.arms.arm import Arm
 from lerobot_env_cronos.scene.arms.widowx.arm import WIDOWX
 from lerobot_env_cronos.scene.arms.widowx.kinematics import inverse_kinematics
@@ -114,9 +114,7 @@ class GraspMisses:
         self._descending[stream] = False
         self._closed_steps[stream] = self._steps[stream] = 0
         if rng.random() < self._config.share:
-            angle = rng.uniform(0, 2 * np.pi)
-            distance = rng.uniform(self._config.min_offset_m, self._config.max_offset_m)
-            self._offset[stream] = distance * np.array([np.cos(angle), np.sin(angle), 0.0])
+            self._offset[stream] = _draw_offset(self._config, rng)
 
     def apply(self, actions: np.ndarray, active: np.ndarray) -> np.ndarray:
         """Replace translation and gripper of actions (n, 7) in the `active` streams that are missing.
@@ -150,6 +148,48 @@ class GraspMisses:
             self._closed_steps[stream] += 1
             return np.zeros(3), 0.0
         return np.clip(goal - position, WIDOWX.action_low[:3], WIDOWX.action_high[:3]), 1.0
+
+
+class MistakenGrasps:
+    """Misses of any arm: an expert that believes the object elsewhere acts until the hand has closed there.
+
+    The misses of the WidowX's official bases are those of `GraspMisses`.
+    """
+
+    CLOSED_S, MAX_S = 0.6, 6.0
+    """Time for which the hand closes, and time after which a miss is given up [s]."""
+
+    def __init__(self, config: MissConfig, env: CronosVectorEnv) -> None:
+        """No misses until `reset`."""
+        self._config, self._expert = config, ScriptedExpert(env)
+        self._max_closed, self._max_steps = round(self.CLOSED_S * env.fps), round(self.MAX_S * env.fps)
+        self._is_missing = np.zeros(env.num_envs, dtype=bool)
+        self._closed, self._steps = (np.zeros(env.num_envs, dtype=np.int64) for _ in range(2))
+
+    def reset(self, stream: int, rng: np.random.Generator) -> None:
+        """A new episode begins in `stream`; `rng` decides whether and where it misses first."""
+        self._expert.reset(np.array([stream]))
+        self._closed[stream] = self._steps[stream] = 0
+        self._is_missing[stream] = rng.random() < self._config.share
+        self._expert.mistake[stream] = _draw_offset(self._config, rng)
+
+    def apply(self, actions: np.ndarray, active: np.ndarray) -> np.ndarray:
+        """Replace actions (n, a) in the `active` streams that are missing."""
+        missing = self._is_missing & active
+        if not missing.any():
+            return actions
+        mistaken = self._expert.act().astype(np.float32)
+        self._steps += missing
+        # The last number is the gripper's, and 0 closes it.
+        self._closed += missing & (mistaken[:, -1] == 0)
+        self._is_missing &= (self._closed < self._max_closed) & (self._steps < self._max_steps)
+        return np.where(missing[:, None], mistaken, actions)
+
+
+def _draw_offset(config: MissConfig, rng: np.random.Generator) -> np.ndarray:
+    angle = rng.uniform(0, 2 * np.pi)
+    distance = rng.uniform(config.min_offset_m, config.max_offset_m)
+    return distance * np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
 MIN_TARGET_HEIGHT_M = 0.032

@@ -104,6 +104,16 @@ def test_a_miss_closes_beside_the_object_and_shows_the_recovery(env, tmp_path, m
         assert recovers.any()
 
 
+def test_a_miss_of_another_arm_closes_beside_the_object_and_shows_the_recovery(tmp_path):
+    env = CronosVectorEnv(2, "so101_desk_2x2", obs_type="environment_state_agent_pos")
+    dataset, collector = collect(env, tmp_path / "d", DemoConfig(misses=MissConfig(share=1.0, min_offset_m=0.04)))
+    assert collector.successes == 4
+    for episode in episodes_of(dataset):
+        gripper, command = episode["observation.state"][:, 5], episode["action"][:, 5]
+        # Shut further than on any object, and told to open: the expert finds nothing between the jaws.
+        assert ((gripper < 5) & (command > 20) & ~episode["next.success"]).any()
+
+
 @pytest.mark.parametrize("arm_pose", ["random", "after_task"])
 def test_starts_elsewhere(env, tmp_path, arm_pose):
     start = StartConfig(arm_pose=arm_pose, layouts="random")

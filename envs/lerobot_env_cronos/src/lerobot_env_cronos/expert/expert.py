@@ -50,6 +50,10 @@ class ScriptedExpert:
     Args:
         env: whose state is read; it is never changed.
         streams: act in these alone (k,); n is k then, and streams are numbered by their place in here.
+
+    Attributes:
+        mistake: (n, 3) how far from where it is the object to move is believed to be [m]; 0 but for misses on
+            purpose.
     """
 
     def __init__(self, env: CronosVectorEnv, streams: np.ndarray | None = None):
@@ -58,6 +62,7 @@ class ScriptedExpert:
         self._let_go_steps, self._max_vain_steps = round(LET_GO_S * fps), round(MAX_VAIN_S * fps)
         self._max_clearing_steps = round(MAX_CLEARING_S * fps)
         n, bodies = env.num_envs if streams is None else len(streams), self.scene.bodies
+        self.mistake = np.zeros((n, 3))
         self._mine = slice(None) if streams is None else streams
         self._boxes = SceneBoxes.from_model(self.sim.model, self.scene)
         self._candidates = {
@@ -147,6 +152,7 @@ class ScriptedExpert:
         self._goal = goal
         self._holding = self._held_objects[i, goal[:, 0]]
         self._object = self._poses[i, goal[:, 0]]
+        self._object[:, :3] += self.mistake
         self._object_R = quaternion_to_matrix(self._object[:, 3:])
 
     def _measure_held(self) -> None:
