@@ -30,6 +30,8 @@ from cronos_lerobot.statistics import wilson_interval
 
 SCENE, CAMERA, SIZE = "so101_desk_2x2", "observation.images.front", 128
 STREAMS, SEGMENTS_PER_START = 16, 4
+LATEST_STOP = {"train": 480, "held_out": 160}
+"""Control steps. The later, the more segments succeed all the same; what is measured has failures, too."""
 EVERY = 8
 """Frames from one picture that the encoder learns to the next."""
 STEADY = 8
@@ -57,7 +59,7 @@ def record(split: str, segments: int, output: Path) -> None:
             expert.reset(everyone)
             for stream in everyone:
                 noise.reset(stream, rng)
-            stops = np.where(rng.random(STREAMS) < 0.5, rng.integers(30, window, STREAMS), window)
+            stops = np.where(rng.random(STREAMS) < 0.5, rng.integers(30, LATEST_STOP[split], STREAMS), window)
             print(f"segment {segment} of {segments}", flush=True)
         seen = env.observe()
         acts = step < stops

@@ -72,8 +72,6 @@ class CronosRobotConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         check_ranges(self, "env.")
-        if self.judge not in JUDGES and not Path(self.judge).is_dir():
-            raise ValueError(f"--env.judge must be one of {JUDGES} or a folder, got {self.judge!r}")
         if self.robot is None:
             raise ValueError("--env.type=cronos_robot needs a robot: --env.robot.type=so101_follower ...")
         station, told = self.station, len(self._told)
@@ -134,6 +132,8 @@ class CronosRobotConfig(EnvConfig):
         if self.judge == PERSON:
             return PersonJudge()
         if self.judge != SIM:
+            if not Path(self.judge).is_dir():
+                raise ValueError(f"--env.judge must be one of {JUDGES} or a folder, got {self.judge!r}")
             return RewardModelJudge(
                 Path(self.judge), self.setup.tasks, self.setup.reset_tasks, self.station.cameras
             )

@@ -1,15 +1,15 @@
 """LeRobot's reward classifiers, one for each task, as the judge of practice.
 
 A checkpoint may come from a stranger. LeRobot loads the encoder that it names with `trust_remote_code=True`, and
-processors by whatever class they name. Here the encoder must be one of transformers' own, or LeRobot's default. The
-processors are those that LeRobot gives a classifier.
+processors by whatever class they name. Here the encoder must be one of transformers' own, or LeRobot's default.
+The processors are those that LeRobot gives a classifier.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -120,8 +120,8 @@ class RewardModel:
         config.pretrained_path, config.pretrained_revision = str(folder), None
         assert isinstance(config, RewardClassifierConfig)
         with _encoder_without_code(config.model_name):
-            self._model: Any = make_reward_model(config, strict=True)
-        self._preprocess = PolicyProcessorPipeline.from_pretrained(
+            self._model: Any = make_reward_model(config)
+        self._preprocess: Any = PolicyProcessorPipeline.from_pretrained(
             folder, PROCESSOR, overrides={"device_processor": {"device": config.device}}, local_files_only=True
         )
         self._shapes = {
@@ -151,7 +151,7 @@ class RewardModel:
 
 
 @contextmanager
-def _encoder_without_code(name: str) -> Iterator[None]:
+def _encoder_without_code(name: str) -> Generator[None]:
     """While a model is loaded, transformers runs no code that comes with its encoder `name`.
 
     LeRobot's own default is what LeRobot's makers published, and has code.
