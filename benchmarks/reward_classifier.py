@@ -30,12 +30,14 @@ from cronos_lerobot.statistics import wilson_interval
 
 SCENE, CAMERA, SIZE = "so101_desk_2x2", "observation.images.front", 128
 STREAMS, SEGMENTS_PER_START = 16, 4
-LATEST_STOP = {"train": 480, "held_out": 160}
+LATEST_STOP = {"train": 480, "held_out": 60}
 """Control steps. The later, the more segments succeed all the same; what is measured has failures, too."""
 EVERY = 8
 """Frames from one picture that the encoder learns to the next."""
 STEADY = 8
 """Verdicts in a row that `measure` tries against flicker [control steps]."""
+EARLY = 15
+"""A verdict is too early if the truth follows later than this [control steps]."""
 
 
 def record(split: str, segments: int, output: Path) -> None:
@@ -90,7 +92,7 @@ def train_encoder(dataset: Path, steps: int, output: Path) -> None:
         optimizer = torch.optim.AdamW([*encoder.parameters(), *head.parameters()], lr=1e-3)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1e-3, steps)
         for step in range(steps):
-            some = torch.randint(len(pictures), (64,))
+            some = torch.randint(len(pictures), (32,))
             features = encoder(_normalized(pictures[some])).last_hidden_state
             loss = (head(features.flatten(1)) - places[some]).square().mean()
             optimizer.zero_grad()
@@ -121,30 +123,36 @@ def _normalized(pictures: torch.Tensor) -> torch.Tensor:
 
 
 def measure(dataset: Path, judges: Path) -> None:
-    """Print how often the judge of each task is wrong: in a frame, at the end of a segment, at any time of it."""
+    """Print how often the judges are wrong: in a frame, at the end of a segment, at any time, too early."""
     streams = StreamDataset("local/streams", dataset)
-    errors: dict[str, list[np.ndarray]] = {}
-    for task in sorted({segment.task for segment in streams.segments}):
-        model = RewardModel(judges / task.replace(" ", "_"))
+    errors: dict[tuple[str, str], list[np.ndarray]] = {}
+    for folder in sorted(judges.iterdir()):
+        task, model = folder.name.replace("_", " "), RewardModel(folder)
         for segment in (one for one in streams.segments if one.task == task):
             verdicts = model.successes({"front": streams.pixels(segment, CAMERA)[1:]})
             # What a picture shows was true after the action before.
             truth = streams.columns(segment, ["next.success"])["next.success"][:-1].astype(bool).ravel()
             steady = np.convolve(verdicts, np.ones(STEADY))[: len(verdicts)] >= STEADY - 0.5
-            for name, said, true in (
-                ("frame", verdicts, truth),
-                ("segment, at its end", verdicts[-1:], truth[-1:]),
-                ("segment, at any time", [verdicts.any()], [truth.any()]),
-                (f"segment, {STEADY} in a row", [steady.any()], [truth.any()]),
-            ):
-                for one in (task, "all"):
-                    errors.setdefault(f"{one}: {name}", []).append(np.stack([said, true], axis=1))
-    print("| what | n | wrong, 95 % | false successes | missed successes |\n|---|---|---|---|---|")
-    for name, pairs in errors.items():
-        said, true = np.concatenate(pairs).T
-        low, high = wilson_interval((said != true).sum(), len(true))
+            begins = truth.argmax() if truth.any() else len(truth)
+            found = {
+                "frame": (verdicts, truth),
+                "segment, at its end": (verdicts[-1:], truth[-1:]),
+                "segment, at any time": ([verdicts.any()], [truth.any()]),
+                f"segment, {STEADY} in a row": ([steady.any()], [truth.any()]),
+            }
+            if begins > EARLY:
+                found["segment, too early"] = ([verdicts[: begins - EARLY].any()], [False])
+                found[f"segment, too early, {STEADY} in a row"] = ([steady[: begins - EARLY].any()], [False])
+            for what, pair in found.items():
+                for of in (task, "all tasks"):
+                    errors.setdefault((of, what), []).append(np.stack(pair, axis=1))
+    print("| task | of a | n | wrong, 95 % | false successes | missed successes |\n|---|---|---|---|---|---|")
+    for (of, what), pairs in sorted(errors.items(), key=lambda one: one[0][0] != "all tasks"):
+        said, true = np.concatenate(pairs).astype(bool).T
+        wrong, n = int((said != true).sum()), len(true)
+        low, high = wilson_interval(wrong, n)
         print(
-            f"| {name} | {len(true)} | {(said != true).mean():.3f} ({low:.3f} to {high:.3f})"
+            f"| {of} | {what} | {n} | {wrong / n:.3f} ({low:.3f} to {high:.3f})"
             f" | {(said & ~true).sum()} of {(~true).sum()} | {(~said & true).sum()} of {true.sum()} |"
         )
 
@@ -159,7 +167,7 @@ def main() -> None:
     one.add_argument("--output", type=Path, required=True)
     one = commands.add_parser("encoder")
     one.add_argument("--dataset", type=Path, required=True)
-    one.add_argument("--steps", type=int, default=1500)
+    one.add_argument("--steps", type=int, default=600)
     one.add_argument("--output", type=Path, required=True)
     one = commands.add_parser("measure")
     one.add_argument("--dataset", type=Path, required=True)
