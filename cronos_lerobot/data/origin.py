@@ -31,7 +31,7 @@ DEMONSTRATIONS, STREAMS, SEGMENTS = "demonstrations", "streams", "segments"
 the columns of demonstrations."""
 NO_FLAGS = ("root", "discover_packages_path", "features", "features_map")
 """Fields that are left out: folders of whoever made the dataset, and what follows from the flags."""
-MAYBE_FOLDERS = ("benchmark", "policy", "pretrained_path", "checkpoint", "adapter")
+MAYBE_FOLDERS = ("benchmark", "policy", "pretrained_path", "checkpoint", "adapter", "judge")
 """Fields that name a folder or something on the Hub; of a folder only that it was one. A hash says which."""
 
 README = """---

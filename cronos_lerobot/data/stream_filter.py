@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.utils.constants import DEFAULT_FEATURES
+from lerobot.utils.constants import DEFAULT_FEATURES, REWARD
 from tqdm import tqdm
 
 from cronos_lerobot.data.origin import SEGMENTS, create_dataset
@@ -99,6 +99,7 @@ def filter_streams(
     *,
     schema: str = "demonstrations",
     frames_after_success: int | None = None,
+    success_as_reward: bool = False,
 ) -> int:
     """Write the wanted segments of `source`, in the order in which they ended, as the dataset `repo_id` in `root`.
 
@@ -111,6 +112,8 @@ def filter_streams(
         root: its folder, which must not exist yet.
         schema: of SCHEMAS.
         frames_after_success: cut a segment this many frames after the first in which its task was complete.
+        success_as_reward: write rewards of 1 where a frame's pictures show the task complete and 0 elsewhere, as
+            LeRobot's reward classifier learns them.
 
     Returns:
         Segments written.
@@ -118,10 +121,13 @@ def filter_streams(
     Raises:
         FileExistsError: `root` exists.
         FolderInUseError: another process writes it.
-        ValueError: no segment is wanted, or a stream or task that is not there; or `source` is on the Hub.
+        ValueError: no segment is wanted, or a stream or task that is not there; or `source` is on the Hub; or a
+            stream, whose rewards are as they were paid, is to have others.
     """
     root = Path(root)
     check_path(root)
+    if success_as_reward and schema == "streams":
+        raise ValueError("--success_as_reward=true needs --schema=demonstrations, got --schema=streams")
     segments = _wanted_segments(source, wanted)
     done = {
         "source": source.repo_id,
@@ -129,6 +135,7 @@ def filter_streams(
         "segments": len(segments),
         "filter": asdict(wanted),
         "frames_after_success": frames_after_success,
+        "success_as_reward": success_as_reward,
     }
     origin = replace(source.origin, filters=[*source.origin.filters, done])
     dropped = set(DEFAULT_FEATURES)
@@ -143,6 +150,8 @@ def filter_streams(
         meta = create_dataset(repo_id, partial, source.meta.fps, features, origin, source.meta.robot_type)
         dataset = GrowingDataset(meta, DatasetStats(meta.features), CopiedVideoFile)
         for segment, rows, stats in _read(source, segments):
+            if success_as_reward:
+                rows, stats = _reward_success(rows, stats, meta)
             _copy(source, segment, rows, stats, meta, dataset, frames_after_success)
         dataset.publish()
         shutil.rmtree(partial / INCOMPLETE)
@@ -208,6 +217,16 @@ def _copy(
     if STREAM_ID not in meta.features:
         row = {SUCCESS: row[SUCCESS]}
     dataset.copy(rows, clips, segment.task, row, stats)
+
+
+def _reward_success(rows: pa.Table, stats: Stats, meta: LeRobotDatasetMetadata) -> tuple[pa.Table, Stats]:
+    """`next.success` is of the moment after a frame's action, its pictures are of the moment before."""
+    after = to_array(rows[SUCCESS])
+    # Found complete: no task can be done in one step.
+    seen = np.concatenate([after[:1], after[:-1]]).astype(np.float32)
+    place = rows.schema.get_field_index(REWARD)
+    rows = rows.set_column(place, rows.schema.field(REWARD), pa.array(seen))
+    return rows, stats | episode_stats({REWARD: seen}, {REWARD: meta.features[REWARD]})
 
 
 def _end_with_cut(rows: pa.Table) -> pa.Table:

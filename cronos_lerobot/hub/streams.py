@@ -103,6 +103,7 @@ def _filter_flags(one: dict[str, Any]) -> str:
     """The flags of a call of `cronos-streams filter`."""
     flags = {f"filter.{name}": value for name, value in one["filter"].items()}
     flags["frames_after_success"] = one["frames_after_success"]
+    flags["success_as_reward"] = one.get("success_as_reward") or None
     return " ".join(f"--{name}={value}" for name, value in flags.items() if value is not None)
 
 

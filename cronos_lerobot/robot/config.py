@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from lerobot.cameras import opencv, realsense  # noqa: F401  (registers them)
@@ -29,6 +30,7 @@ from lerobot_env_cronos.simulation.observations import TASK_OBSERVATIONS
 
 from cronos_lerobot.ranges import check_ranges, ranged
 from cronos_lerobot.robot.judges import PERSON, SIM, Judge, PersonJudge, SimJudge
+from cronos_lerobot.robot.reward_models import RewardModelJudge
 from cronos_lerobot.robot.setups import Setup, load_setup
 from cronos_lerobot.robot.station import Station
 from cronos_lerobot.robot.streams import RobotStreams
@@ -53,10 +55,12 @@ class CronosRobotConfig(EnvConfig):
     """one_hot appends the task to the robot's state, for policies that read no instructions, such as ACT."""
     steps_per_task: int = ranged(480, minimum=1)
     """Control steps that a task has."""
-    judge: str = ranged(PERSON, choices=JUDGES)
-    """Who says that a task is done: person (keys or buttons) or sim (the truth of a simulated robot)."""
-    judge_error: float = ranged(0.0, minimum=0, maximum=1)
-    """Share of the segments in which the judge is wrong. `sim` is wrong as often; of others it is noted."""
+    judge: str = PERSON
+    """Who says that a task is done: person (keys or buttons), sim (the truth of a simulated robot), or a folder
+    with LeRobot's reward classifiers, a sub-folder for each task: put_the_cube_on_the_plate."""
+    judge_error: float | None = ranged(None, minimum=0, maximum=1)
+    """Share of the segments in which the judge is wrong; null if nobody knows. `sim` is wrong as often; of others
+    it is noted."""
     judge_seed: int = ranged(0, minimum=0)
     """Of the errors of `sim`."""
     max_step: float | None = ranged(None, above=0)
@@ -120,11 +124,20 @@ class CronosRobotConfig(EnvConfig):
         return self._streams("evaluation")
 
     def _streams(self, purpose: str) -> RobotStreams:
-        return RobotStreams(self.station, self._judge(), f"judge {self.judge}", purpose, self._told)
+        judge = self._judge()
+        error = "" if self.judge_error is None else f", wrong in {self.judge_error:.1%} of the segments"
+        return RobotStreams(self.station, judge, f"judge {judge.name}{error}", purpose, self._told)
 
     def _judge(self) -> Judge:
         if self.judge == PERSON:
             return PersonJudge()
+        if self.judge != SIM:
+            if not Path(self.judge).is_dir():
+                raise ValueError(f"--env.judge must be one of {JUDGES} or a folder, got {self.judge!r}")
+            return RewardModelJudge(
+                Path(self.judge), self.setup.tasks, self.setup.reset_tasks, self.station.cameras
+            )
         if (world := getattr(self.station.robot, "world", None)) is None:
             raise ValueError(f"--env.judge=sim needs a simulated robot, got {self.station.robot}")
-        return SimJudge(world, self.judge_error, self.steps_per_task, np.random.default_rng(self.judge_seed))
+        rng = np.random.default_rng(self.judge_seed)
+        return SimJudge(world, self.judge_error or 0.0, self.steps_per_task, rng)

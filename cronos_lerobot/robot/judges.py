@@ -1,4 +1,4 @@
-"""Who says that a task is done: a person, or the simulator's truth."""
+"""Who says that a task is done: a person, the simulator's truth, or a model (reward_models.py)."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ PERSON, SIM = "person", "sim"
 class Judge(Protocol):
     """Judges every control step. It never ends a segment."""
 
+    name: str
+    """For recordings and results."""
+
     def begin(self, task: Any) -> None:
         """A segment of a task begins."""
         ...
@@ -26,6 +29,8 @@ class Judge(Protocol):
 
 class PersonJudge:
     """Complete from the success key on, until the failure key or the end of the segment."""
+
+    name = PERSON
 
     def begin(self, task: Any) -> None:
         """See `Judge`."""
@@ -46,6 +51,8 @@ class SimJudge:
         window: control steps of a segment.
         rng: draws them.
     """
+
+    name = SIM
 
     def __init__(self, world: Any, error: float, window: int, rng: np.random.Generator) -> None:
         self._world, self._error, self._window, self._rng = world, error, window, rng

@@ -118,6 +118,9 @@ class FilterConfig(CheckConfig):
     `cronos-streams` needs them."""
     frames_after_success: int | None = ranged(None, minimum=0)
     """Cut a segment this many frames after the first in which its task was complete; null keeps it whole."""
+    success_as_reward: bool = False
+    """Write rewards of 1 where a frame's pictures show the task complete and 0 elsewhere, as LeRobot's reward
+    classifier learns them."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -182,6 +185,7 @@ def filter_segments(config: FilterConfig) -> None:
         root,
         schema=config.schema,
         frames_after_success=config.frames_after_success,
+        success_as_reward=config.success_as_reward,
     )
     print(f"{written} of {len(streams.segments)} segments in {root}")
 

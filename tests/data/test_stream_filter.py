@@ -48,6 +48,20 @@ def test_what_is_kept(source, options, expected):
     assert {(s.stream, s.index) for s in source.segments if wanted(s)} == expected
 
 
+def test_success_as_reward_is_of_what_a_frame_shows(source, tmp_path):
+    """`next.success` comes one frame later: it is of the moment after the action."""
+    wanted, root = SegmentFilter(tasks=[TASKS[0]]), tmp_path / "d"
+    filter_streams(source, wanted, "me/judge", root, success_as_reward=True, frames_after_success=1)
+    dataset = LeRobotDataset("me/judge", root=root).hf_dataset
+    rewards = np.split(np.array(dataset["next.reward"]), np.flatnonzero(np.array(dataset["frame_index"]) == 0)[1:])
+    # Streams 0 and 1 succeed from their third frame on, stream 2 from its first.
+    assert sorted(map(tuple, rewards)) == sorted([(0, 0, 0, 1)] * 8 + [(1, 1)] * 4)
+    stats = json.loads((root / "meta/stats.json").read_text())["next.reward"]
+    assert stats["mean"] == pytest.approx([np.concatenate(rewards).mean()])
+    with pytest.raises(ValueError, match="--success_as_reward=true needs --schema=demonstrations"):
+        filter_streams(source, wanted, "me/two", tmp_path / "two", success_as_reward=True, schema="streams")
+
+
 def test_a_filtered_dataset_is_an_ordinary_one_with_the_columns_of_demonstrations(source, tmp_path):
     wanted = SegmentFilter(success=True, found_complete=False)
     assert filter_streams(source, wanted, "me/successes", tmp_path / "d") == 8

@@ -1,0 +1,185 @@
+"""How often LeRobot's reward classifier is wrong, by the simulator's truth.
+
+    python benchmarks/reward_classifier.py record  --split=train    --output=outputs/judge/streams
+    python benchmarks/reward_classifier.py record  --split=held_out --output=outputs/judge/held_out
+    python benchmarks/reward_classifier.py encoder --dataset=outputs/judge/streams --output=outputs/judge/encoder
+    python benchmarks/reward_classifier.py measure --dataset=outputs/judge/held_out --judge=outputs/judge/judges
+
+Before `measure`, run the commands of docs/robot.md, "Let a model judge", once for each task. The Hub's pretrained
+encoders are not needed: `encoder` trains a small one, which says from a picture where the bodies are. With
+`--steps=0` its numbers are random.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from lerobot_env_cronos import CronosVectorEnv
+from lerobot_env_cronos.expert.expert import ScriptedExpert
+from transformers import ResNetConfig, ResNetModel
+
+from cronos_lerobot.agents.base import ActionSample
+from cronos_lerobot.data.perturbations import ActionNoise, NoiseConfig
+from cronos_lerobot.data.recorder import StreamRecorder
+from cronos_lerobot.data.streams import StreamDataset
+from cronos_lerobot.protocol.interventions import Intervention
+from cronos_lerobot.protocol.loop_state import Step
+from cronos_lerobot.robot.reward_models import RewardModel
+from cronos_lerobot.statistics import wilson_interval
+
+SCENE, CAMERA, SIZE = "so101_desk_2x2", "observation.images.front", 128
+STREAMS, SEGMENTS_PER_START = 16, 4
+LATEST_STOP = {"train": 480, "held_out": 60}
+"""Control steps. The later, the more segments succeed all the same; what is measured has failures, too."""
+EVERY = 8
+"""Frames from one picture that the encoder learns to the next."""
+STEADY = 8
+"""Verdicts in a row that `measure` tries against flicker [control steps]."""
+EARLY = 15
+"""A verdict is too early if the truth follows later than this [control steps]."""
+
+
+def record(split: str, segments: int, output: Path) -> None:
+    """Streams of an expert that is noisy in half of the segments, and stops at a random step in half of them."""
+    env = CronosVectorEnv(STREAMS, SCENE, privileged_state=True, observation_height=SIZE, observation_width=SIZE)
+    everyone, window = np.arange(STREAMS), env.steps_per_task
+    rng = np.random.default_rng([segments, split == "train"])
+    expert, noise = ScriptedExpert(env), ActionNoise(NoiseConfig(share=0.5), STREAMS, env.scene.robot)
+    recorder = StreamRecorder.open(env, "local/streams", output, segment_length=window, describes=())
+    starts, action = np.zeros(STREAMS, int), np.zeros((STREAMS, len(env.action_names)), np.float32)
+    for t in range(segments * window):
+        segment, step = divmod(t, window)
+        position, event = segment % SEGMENTS_PER_START, Intervention.NONE
+        if step == 0:
+            event = Intervention.TASK_SWITCH if position else Intervention.SCENE_RESET
+            if position == 0:
+                starts = rng.permutation(env.num_starts[split])[:STREAMS]
+                env.scene_reset(everyone, starts, split)
+            env.end_effector_reset(everyone)
+            env.set_task(everyone, [env.tasks[i] for i in rng.integers(len(env.tasks), size=STREAMS)])
+            expert.reset(everyone)
+            for stream in everyone:
+                noise.reset(stream, rng)
+            stops = np.where(rng.random(STREAMS) < 0.5, rng.integers(30, LATEST_STOP[split], STREAMS), window)
+            print(f"segment {segment} of {segments}", flush=True)
+        seen = env.observe()
+        acts = step < stops
+        action = np.where(acts[:, None], noise.apply(expert.act(), acts), action).astype(np.float32)
+        _, reward, _, _, info = env.step(action)
+        same = np.full(STREAMS, 0)
+        recorder.on_step(
+            Step(
+                t, seen, env.instructions, ActionSample(action), reward, info["is_success"], info["diverged"],
+                cut=np.full(STREAMS, step == window - 1), piece=same + segment, preceded_by=same + int(event),
+                segments_since_reset=same + position, interventions=same + segment // SEGMENTS_PER_START + 1,
+                policy_version=0, intervened=np.zeros(STREAMS, bool),
+            )
+        )  # fmt: skip
+    recorder.close()
+
+
+def train_encoder(dataset: Path, steps: int, output: Path) -> None:
+    """A ResNet of 128 x 128 pictures, trained to say where the bodies are, and saved as transformers does."""
+    torch.manual_seed(0)
+    encoder = ResNetModel(
+        ResNetConfig(embedding_size=32, hidden_sizes=[32, 64, 128, 128], depths=[1, 1, 1, 1], layer_type="basic")
+    )
+    if steps:
+        pictures, places = _pictures_and_places(dataset)
+        places = (places - places.mean(0)) / places.std(0).clamp(min=1e-3)
+        head = torch.nn.Linear(128 * 4 * 4, places.shape[1])
+        optimizer = torch.optim.AdamW([*encoder.parameters(), *head.parameters()], lr=1e-3)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1e-3, steps)
+        for step in range(steps):
+            some = torch.randint(len(pictures), (32,))
+            features = encoder(_normalized(pictures[some])).last_hidden_state
+            loss = (head(features.flatten(1)) - places[some]).square().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+            if step % 100 == 0:
+                print(f"step {step}: {loss.item():.3f} of the variance", flush=True)
+    encoder.eval().save_pretrained(output)
+
+
+def _pictures_and_places(dataset: Path) -> tuple[torch.Tensor, torch.Tensor]:
+    """Pictures (n, 128, 128, 3) uint8 and the bodies' positions (n, d) [m] of every EVERY-th frame."""
+    streams, pictures, places = StreamDataset("local/streams", dataset), [], []
+    for segment in streams.segments:
+        pictures.append(streams.pixels(segment, CAMERA)[::EVERY])
+        state = streams.columns(segment, ["observation.environment_state"])["observation.environment_state"]
+        # Of 12 numbers a body: where it is, and where it is from the hand.
+        bodies = state[::EVERY].reshape(len(pictures[-1]), -1, 12)[..., [0, 1, 2, 9, 10, 11]]
+        places.append(bodies.reshape(len(bodies), -1))
+    return torch.from_numpy(np.concatenate(pictures)), torch.from_numpy(np.concatenate(places))
+
+
+def _normalized(pictures: torch.Tensor) -> torch.Tensor:
+    """Pictures (n, 3, H, W) about as LeRobot's processor normalizes them."""
+    pictures = pictures.permute(0, 3, 1, 2).float() / 255
+    return (pictures - pictures.mean((0, 2, 3), keepdim=True)) / pictures.std((0, 2, 3), keepdim=True)
+
+
+def measure(dataset: Path, judges: Path) -> None:
+    """Print how often the judges are wrong: in a frame, at the end of a segment, at any time, too early."""
+    streams = StreamDataset("local/streams", dataset)
+    errors: dict[tuple[str, str], list[np.ndarray]] = {}
+    for folder in sorted(judges.iterdir()):
+        task, model = folder.name.replace("_", " "), RewardModel(folder)
+        for segment in (one for one in streams.segments if one.task == task):
+            verdicts = model.successes({"front": streams.pixels(segment, CAMERA)[1:]})
+            # What a picture shows was true after the action before.
+            truth = streams.columns(segment, ["next.success"])["next.success"][:-1].astype(bool).ravel()
+            steady = np.convolve(verdicts, np.ones(STEADY))[: len(verdicts)] >= STEADY - 0.5
+            begins = truth.argmax() if truth.any() else len(truth)
+            found = {
+                "frame": (verdicts, truth),
+                "segment, at its end": (verdicts[-1:], truth[-1:]),
+                "segment, at any time": ([verdicts.any()], [truth.any()]),
+                f"segment, {STEADY} in a row": ([steady.any()], [truth.any()]),
+            }
+            if begins > EARLY:
+                found["segment, too early"] = ([verdicts[: begins - EARLY].any()], [False])
+                found[f"segment, too early, {STEADY} in a row"] = ([steady[: begins - EARLY].any()], [False])
+            for what, pair in found.items():
+                for of in (task, "all tasks"):
+                    errors.setdefault((of, what), []).append(np.stack(pair, axis=1))
+    print("| task | of a | n | wrong, 95 % | false successes | missed successes |\n|---|---|---|---|---|---|")
+    for (of, what), pairs in sorted(errors.items(), key=lambda one: one[0][0] != "all tasks"):
+        said, true = np.concatenate(pairs).astype(bool).T
+        wrong, n = int((said != true).sum()), len(true)
+        low, high = wilson_interval(wrong, n)
+        print(
+            f"| {of} | {what} | {n} | {wrong / n:.3f} ({low:.3f} to {high:.3f})"
+            f" | {(said & ~true).sum()} of {(~true).sum()} | {(~said & true).sum()} of {true.sum()} |"
+        )
+
+
+def main() -> None:
+    """One of the three commands."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    one = commands.add_parser("record")
+    one.add_argument("--split", choices=("train", "held_out"), required=True)
+    one.add_argument("--segments", type=int, default=12, help=f"of each of the {STREAMS} streams")
+    one.add_argument("--output", type=Path, required=True)
+    one = commands.add_parser("encoder")
+    one.add_argument("--dataset", type=Path, required=True)
+    one.add_argument("--steps", type=int, default=600)
+    one.add_argument("--output", type=Path, required=True)
+    one = commands.add_parser("measure")
+    one.add_argument("--dataset", type=Path, required=True)
+    one.add_argument("--judge", type=Path, required=True)
+    args = parser.parse_args()
+    if args.command == "record":
+        record(args.split, args.segments, args.output)
+    elif args.command == "encoder":
+        train_encoder(args.dataset, args.steps, args.output)
+    else:
+        measure(args.dataset, args.judge)
+
+
+if __name__ == "__main__":
+    main()
