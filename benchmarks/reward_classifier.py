@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from lerobot.utils.constants import IMAGENET_STATS
 from lerobot_env_cronos import CronosVectorEnv
 from lerobot_env_cronos.expert.expert import ScriptedExpert
 from transformers import ResNetConfig, ResNetModel
@@ -25,7 +26,7 @@ from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.streams import StreamDataset
 from cronos_lerobot.protocol.interventions import Intervention
 from cronos_lerobot.protocol.loop_state import Step
-from cronos_lerobot.robot.reward_models import RewardModel
+from cronos_lerobot.robot.reward_models import STEADY, RewardModel
 from cronos_lerobot.statistics import wilson_interval
 
 SCENE, CAMERA, SIZE = "so101_desk_2x2", "observation.images.front", 128
@@ -34,8 +35,6 @@ LATEST_STOP = {"train": 480, "held_out": 60}
 """Control steps. The later, the more segments succeed all the same; what is measured has failures, too."""
 EVERY = 8
 """Frames from one picture that the encoder learns to the next."""
-STEADY = 8
-"""Verdicts in a row that `measure` tries against flicker [control steps]."""
 EARLY = 15
 """A verdict is too early if the truth follows later than this [control steps]."""
 
@@ -117,9 +116,9 @@ def _pictures_and_places(dataset: Path) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def _normalized(pictures: torch.Tensor) -> torch.Tensor:
-    """Pictures (n, 3, H, W) about as LeRobot's processor normalizes them."""
-    pictures = pictures.permute(0, 3, 1, 2).float() / 255
-    return (pictures - pictures.mean((0, 2, 3), keepdim=True)) / pictures.std((0, 2, 3), keepdim=True)
+    """Pictures (n, H, W, 3) as `lerobot-train` shows them to its models, (n, 3, H, W)."""
+    mean, std = (torch.tensor(IMAGENET_STATS[name]) for name in ("mean", "std"))
+    return (pictures.permute(0, 3, 1, 2) / 255 - mean) / std
 
 
 def measure(dataset: Path, judges: Path) -> None:

@@ -35,11 +35,13 @@ LAST = Path("checkpoints/last/pretrained_model")
 """Of a folder that `lerobot-train` wrote."""
 STEPS = ("normalizer_processor", "device_processor")
 """What LeRobot gives a classifier. Other steps of LeRobot load models."""
+STEADY = 8
+"""Verdicts in a row that make a success [control steps]. Single ones flicker, and one counts for its segment."""
 FILES = (CONFIG_NAME, PROCESSOR, SAFETENSORS_SINGLE_FILE)
 
 
 class RewardModelJudge:
-    """Complete in every control step whose pictures LeRobot's classifier of the task calls a success.
+    """Complete once LeRobot's classifier of the task has called the pictures of STEADY control steps a success.
 
     Args:
         folder: with a sub-folder for each task, its instruction with underscores: what `lerobot-train` wrote, or a
@@ -72,12 +74,14 @@ class RewardModelJudge:
         """See `Judge`."""
         if task.instruction not in self._models:
             raise ValueError(f"--env.judge has no model for {task.instruction!r}, only for {list(self._models)}")
-        self._task = task.instruction
+        self._task, self._in_a_row = task.instruction, 0
 
     def judge(self, observation: Mapping[str, Any], events: Events) -> bool:
         """See `Judge`."""
         model = self._models[self._task]
-        return bool(model.successes({camera: observation[camera][None] for camera in model.cameras})[0])
+        says = model.successes({camera: observation[camera][None] for camera in model.cameras})[0]
+        self._in_a_row = self._in_a_row + 1 if says else 0
+        return self._in_a_row >= STEADY
 
 
 class RewardModel:
