@@ -5,9 +5,10 @@
     python benchmarks/reward_classifier.py encoder --dataset=outputs/judge/streams --output=outputs/judge/encoder
     python benchmarks/reward_classifier.py measure --dataset=outputs/judge/held_out --judge=outputs/judge/judges
 
-Before `measure`, run the commands of docs/robot.md, "Let a model judge", once for each task. The Hub's pretrained
-encoders are not needed: `encoder` trains a small one, which says from a picture where the bodies are. With
-`--steps=0` its numbers are random.
+Before `measure`, run the commands of docs/robot.md, "Let a model judge", for each task. `encoder` stands in for
+the Hub's pretrained encoders: a small one that says from a picture where the bodies are. With `--steps=0` its
+numbers are random. Trained on 32 scenes it remembers them: of the variance of the bodies' places, a linear readout
+leaves 1 % on its own pictures and 73 % on held-out ones. It needs more scenes.
 """
 
 import argparse
