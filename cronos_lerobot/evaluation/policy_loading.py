@@ -68,6 +68,10 @@ def damage_named(path: Path | str | None) -> Generator[None]:
         raise ValueError(f"a configuration of a processor in {path} is damaged: {error}") from error
 
 
+REWARD_STEPS = ("reward_classifier_processor", "robometer_encoder", "topreward_encoder")
+"""Steps of LeRobot that load a reward model with the code that comes with it. No policy needs one."""
+
+
 def check_processor_classes(path: str | Path, revision: str | None = None) -> None:
     """Check that a checkpoint's processors name steps of LeRobot, or of modules that are imported already.
 
@@ -86,6 +90,10 @@ def check_processor_classes(path: str | Path, revision: str | None = None) -> No
         if not file.is_file():
             continue
         for step in json.loads(file.read_text())["steps"]:
+            if (known := step.get("registry_name")) in REWARD_STEPS:
+                raise ValueError(
+                    f"{file} has the step {known}, which runs the code of a reward model: it is not run."
+                )
             if (named := step.get("class")) and not _is_step(str(named)):
                 raise ValueError(
                     f"{file} names {named}, which is no step of LeRobot or of an imported module: it is not run. "

@@ -108,6 +108,11 @@ def test_a_strangers_processors_run_nothing_but_processor_steps(pocketvla, tmp_p
     known = {"class": "lerobot.processor.rename_processor.RenameObservationsProcessorStep", "config": {}}
     file.write_text(json.dumps(content | {"steps": [known]}))
     check_processor_classes(file.parent)
+    # It would load an encoder from anywhere, with its code.
+    reward = {"registry_name": "reward_classifier_processor", "config": {"pretrained_path": "stranger/model"}}
+    file.write_text(json.dumps(content | {"steps": [reward]}))
+    with pytest.raises(ValueError, match="reward_classifier_processor"):
+        check_processor_classes(file.parent)
 
 
 def act_config():
