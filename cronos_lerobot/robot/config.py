@@ -55,7 +55,7 @@ class CronosRobotConfig(EnvConfig):
     """one_hot appends the task to the robot's state, for policies that read no instructions, such as ACT."""
     steps_per_task: int = ranged(480, minimum=1)
     """Control steps that a task has."""
-    judge: str = PERSON
+    judge: str = "person"
     """Who says that a task is done: person (keys or buttons), sim (the truth of a simulated robot), or a folder
     with LeRobot's reward classifiers, a sub-folder for each task: put_the_cube_on_the_plate."""
     judge_error: float | None = ranged(None, minimum=0, maximum=1)

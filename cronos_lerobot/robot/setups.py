@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,7 @@ class Setup:
     reset_tasks: tuple[Any, ...] = ()
     hand: Callable[[np.ndarray], np.ndarray] | None = None
     """Where the hand is under an action (A,), (3,) in the base frame [m]; None if nobody knows."""
-    box: np.ndarray | None = field(default=None)
+    box: np.ndarray | None = None
     """(2, 3) corners of the box that the hand stays in [m]; None is no box."""
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import signal
 from collections.abc import Callable, Mapping
-from functools import cached_property
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -72,21 +71,17 @@ class Station:
         self._users = self._shown = 0
         self._handlers: dict[int, Any] = {}
 
-    @cached_property
-    def person(self) -> Person:
-        """Who stands by it."""
-        return Person(self._teleop, self.clock)
-
     def open(self) -> None:
-        """Connect, and move home; for each of its users."""
+        """Connect, once for all of its users."""
         self._users += 1
         if self._users > 1:
             return
+        # Without a person the arm gets no power.
+        self.person = Person(self._teleop, self.clock)
         if not self.robot.is_connected:
             self.robot.connect()
         if self._teleop is not None and not self._teleop.is_connected:
             self._teleop.connect()
-        self.person  # noqa: B018 - takes the keys
 
     def close(self) -> None:
         """Go home, release the motors and disconnect, once nobody uses it any more."""
@@ -108,9 +103,14 @@ class Station:
         """Say what a person is to do, and wait until they have; returns how long that took [s]."""
         print(text, flush=True)
         start = self.clock.time()
-        while not is_over(self.person.look()):
+        is_waiting = True
+        while is_waiting:
+            events = self.person.look()
+            if events.stop:
+                self._stop()
             self._check_signals()
-            self.clock.sleep(POLL_S)
+            if is_waiting := not is_over(events):
+                self.clock.sleep(POLL_S)
         return self.clock.time() - start
 
     def _check_signals(self) -> None:
@@ -144,6 +144,9 @@ class Station:
             What was sent (A,) float32.
         """
         self._check_signals()
+        if self.lost is not None:
+            # By an emergency stop while the arm waited.
+            raise ConnectionError(self.lost)
         self.target = self._send(self.safety.limit(action, self.target))
         self._wait()
         if self.dry_run:
@@ -180,12 +183,20 @@ class Station:
         steps = max(round(HOME_S * self.fps), self.safety.steps_for(np.abs(self.setup.home - start).max()))
         self.begin()
         for step in range(1, steps + 1):
+            if self.person.look().stop:
+                self._stop()
+                raise ConnectionError(self.lost)
             self.target = self._send(start + (self.setup.home - start) * step / steps)
             self._wait()
 
     def _position(self) -> np.ndarray:
         seen = self.observe()
         return np.array([seen[name] for name in self.action_names], dtype=np.float32)
+
+    def _stop(self) -> None:
+        """The emergency stop, while no policy acts."""
+        self.person.note("emergency_stop")
+        self.release("Emergency stop")
 
     def release(self, why: str) -> None:
         """Something failed: torque off, and nothing is sent until `be_ready`."""

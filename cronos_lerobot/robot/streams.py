@@ -120,7 +120,7 @@ class RobotStreams:
             if events.stop:
                 raise ConnectionError("Emergency stop")
             if events.takes_over:
-                action = self._taken_over(action)
+                action = self._taken_over()
             action = station.act(action)
             self._seen = station.observe()
         except FAULTS as error:
@@ -197,7 +197,7 @@ class RobotStreams:
             self._helping = None
         return events
 
-    def _taken_over(self, action: np.ndarray) -> np.ndarray:
+    def _taken_over(self) -> np.ndarray:
         """The person's action, if their device has one; otherwise the arm waits."""
         teleop = self.station.person.teleop
         if teleop is None or list(teleop.action_features) != self.action_names:

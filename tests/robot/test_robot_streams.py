@@ -183,6 +183,29 @@ def test_an_emergency_stop_moves_nothing_until_the_person_says_so(make):
     assert all(env.station.robot.bus.sync_read("Torque_Enable").values())
 
 
+def test_an_emergency_stop_on_the_way_home_or_in_a_pause_counts_too(make):
+    env = make()
+    begin(env)
+    robot, teleop = env.station.robot, env.station.person.teleop
+    for _ in range(60):
+        env.step(env.station.setup.home[None] + 20)
+    teleop.press("emergency_stop")
+    before = robot.desk.goal.copy()
+    with pytest.raises(ConnectionError, match="Emergency"):
+        env.station.go_home()
+    assert np.array_equal(robot.desk.goal, before)
+    assert not any(robot.bus.sync_read("Torque_Enable").values())
+    env.scene_reset(ONE, np.array([5]))
+    teleop.press("emergency_stop")
+    env.station.wait("", lambda events: events.stop)
+    goal = robot.desk.goal.copy()
+    assert env.step(env.station.target[None] + 5)[4]["diverged"][0]
+    assert np.array_equal(robot.desk.goal, goal)
+    env.scene_reset(ONE, np.array([5]))
+    assert [line["kind"] for line in ledger(env)].count("emergency_stop") == 2
+    assert not hold(env, 1)[0]["diverged"][0]
+
+
 def test_a_pause_is_waited_for_and_noted(make):
     env = make()
     begin(env)
