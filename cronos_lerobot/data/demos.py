@@ -52,6 +52,10 @@ class DemoConfig:
     """Also keep episodes that did not succeed within `max_steps`."""
     reset_tasks: bool = False
     """Demonstrate "put the [object] on the table" as well, as often as any other task, each from a receptacle."""
+    record_perturbed: bool = True
+    """Also record the frames of noise and misses, each with the action that the expert would have taken. With
+    `false` a recording begins anew after them: for policies that predict chunks of actions, of which the later
+    ones would lead where the expert was pushed."""
     start: StartConfig = field(default_factory=StartConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     misses: MissConfig = field(default_factory=MissConfig)
@@ -147,10 +151,12 @@ class DemoCollector:
             arm = self._arm
             labels = np.clip(self.expert.act(), arm.action_low, arm.action_high).astype(np.float32)
             columns = observation_columns(observation) | {ACTION: labels}
-            observation, reward, _, _, info = self.env.step(self._perturb(labels))
+            executed = self._perturb(labels)
+            is_left_out = (executed != labels).any(1) & (not self.config.record_perturbed)
+            observation, reward, _, _, info = self.env.step(executed)
             columns |= {REWARD: reward, SUCCESS: info["is_success"]}
             for stream in range(self.env.num_envs):
-                self._after_step(stream, columns, info)
+                self._after_step(stream, columns, info, is_left_out[stream])
             self._start_idle_streams(total)
 
     def _perturb(self, labels: np.ndarray) -> np.ndarray:
@@ -163,7 +169,9 @@ class DemoCollector:
                 executed[stream] = resting[stream]
         return executed
 
-    def _after_step(self, stream: int, columns: Mapping[str, np.ndarray], info: Mapping[str, np.ndarray]) -> None:
+    def _after_step(
+        self, stream: int, columns: Mapping[str, np.ndarray], info: Mapping[str, np.ndarray], is_left_out: bool
+    ) -> None:
         episode = self._episodes[stream]
         if episode is None:
             return
@@ -175,7 +183,9 @@ class DemoCollector:
         episode.steps += 1
         resting = info["is_success"][stream] and not info["is_grasped"][stream]
         episode.released = episode.released + 1 if resting else 0
-        if not episode.preludes:
+        if is_left_out:
+            episode.frames.clear()
+        elif not episode.preludes:
             for key, column in columns.items():
                 episode.frames.setdefault(key, []).append(column[stream].copy())
         succeeded = episode.released > self.config.steps_after_release
@@ -198,16 +208,17 @@ class DemoCollector:
         else:
             last = f"to {episode.task.instruction!r} within --max_steps={self._max_steps}"
             self._count_failure("the expert failed", last)
-        if keep:
+        if keep and episode.frames:
             frames = {key: np.stack(values) for key, values in episode.frames.items()}
-            is_last = np.arange(episode.steps) == episode.steps - 1
+            length = len(frames[ACTION])
+            is_last = np.arange(length) == length - 1
             # The expert stops because its task is done; a failure that is kept ran out of time.
             frames |= {DONE: is_last & succeeded, TRUNCATED: is_last & (not succeeded)}
             # As in a stream: a failure may have lost again what it had put in its place.
             metadata = {CONFIGURATION: episode.configuration, SUCCESS: bool(frames[SUCCESS].any())}
             self.writer.add_segment(frames, episode.task.instruction, episode_metadata=metadata)
             self._kept[episode.task] += 1
-            self._on_episode(episode.steps)
+            self._on_episode(length)
 
     def _end_prelude(self, stream: int, episode: _Episode) -> None:
         ids = np.array([stream])

@@ -29,7 +29,8 @@ class NoiseConfig:
     max_steps: int = 4
     """Longest burst [0.2 s]."""
     scale: float = ranged(0.6, minimum=0)
-    """Standard deviation of the push: of half the range of the WidowX's actions, of 6 degrees of the SO-101's."""
+    """Standard deviation of the push: of half the range of the WidowX's actions, of 6 degrees in 0.2 s of the
+    SO-101's."""
 
     def __post_init__(self) -> None:
         """Check what goes with what."""

@@ -79,6 +79,28 @@ def test_noise_is_executed_but_not_recorded(env, tmp_path, monkeypatch):
     assert all((a.tobytes(), s.tobytes()) in known for a, s in zip(rows["action"], rows["observation.state"]))
 
 
+def test_without_perturbed_frames_what_is_recorded_was_executed(env, tmp_path, monkeypatch):
+    spy = Spy(env, monkeypatch)
+    config = DemoConfig(
+        record_perturbed=False, noise=NoiseConfig(share=0.5, rate=0.1), misses=MissConfig(share=0.5)
+    )
+    dataset, _ = collect(env, tmp_path / "d", config, 8, expert=spy)
+    labels, executed = np.stack(spy.labels), np.stack(spy.executed)
+    perturbed = (labels != executed).any(-1)
+    assert perturbed.any()
+    # Every recorded frame is one that was not perturbed, and all of an episode follow one another.
+    frames = np.concatenate([np.stack(spy.seen), labels], -1)
+    when = {frames[at].tobytes(): at for at in np.ndindex(frames.shape[:2])}
+    for episode in episodes_of(dataset):
+        rows = np.concatenate([episode["observation.state"], episode["action"]], -1)
+        # The first may be the pose at home, which all streams have.
+        steps, streams = zip(*(when[row.tobytes()] for row in rows[1:]), strict=True)
+        assert len(set(streams)) == 1
+        assert np.diff(steps).tolist() == [1] * (len(steps) - 1)
+        assert not perturbed[list(steps), streams[0]].any()
+        assert episode["next.done"].tolist() == [False] * len(steps) + [True]
+
+
 def test_noise_leaves_the_gripper_and_the_bounds_alone():
     noise = ActionNoise(NoiseConfig(share=1.0, rate=1.0, scale=5.0), 2, WIDOWX)
     for stream in range(2):

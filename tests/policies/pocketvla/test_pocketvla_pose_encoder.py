@@ -50,6 +50,17 @@ def labelled_batch(n: int, seed: int = 0) -> dict:
     return batch | {CAMERA: images, "action": torch.zeros(n, 7)}
 
 
+def test_bodies_are_read_without_the_hands_position_but_pictures_need_it():
+    """The SO-101's proprioception is its joints alone."""
+    features = FEATURES | {"observation.state": {"names": ["shoulder_pan.pos", "gripper.pos"]}}
+    from_state, from_pictures = make_config(observation="environment_state"), make_config(observation="image")
+    for config in (from_state, from_pictures):
+        config.set_dataset_feature_metadata(features)
+    assert (from_state.bodies, from_state.hand) == (["stick", "ball"], [])
+    assert from_state.normalization_mapping["ENV"] is NormalizationMode.IDENTITY
+    assert from_pictures.bodies == []
+
+
 def test_bodies_are_described_in_units_of_ten_centimetres_and_by_twice_their_yaw():
     described = describe_bodies(torch.tensor([pose(0.2, -0.1, 0.05, math.pi / 3, hand=(0.1, 0, 0))]))
     assert described.shape == (1, 14)

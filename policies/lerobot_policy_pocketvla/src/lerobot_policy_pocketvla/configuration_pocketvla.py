@@ -268,14 +268,15 @@ class PocketVLAConfig(PreTrainedConfig):
         names = list(state.get("names") or [])
         hand = [f"ee.{axis}" for axis in "xyz"]
         bodies = bodies_named(privileged.get("names"))
-        if not bodies or not set(hand) <= set(names):
+        from_pictures, has_hand = self.actor_observation == "image", set(hand) <= set(names)
+        if not bodies or (from_pictures and not has_hand):
             return
         self.bodies = bodies
-        self.hand = [names.index(name) for name in hand]
+        self.hand = [names.index(name) for name in hand] if has_hand else []
         # The policy's own step scales them; see bodies.py.
         self.normalization_mapping["ENV"] = NormalizationMode.IDENTITY
         keypoints = privileged.get("keypoints")
-        if self.actor_observation == "image" and keypoints and "projection" in features[self.camera[0]]:
+        if from_pictures and keypoints and "projection" in features[self.camera[0]]:
             self.view = View(features[self.camera[0]]["projection"], [keypoints[body] for body in self.bodies])
 
     def validate_features(self) -> None:

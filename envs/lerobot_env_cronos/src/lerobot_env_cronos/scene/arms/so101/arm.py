@@ -49,7 +49,8 @@ class SO101(Arm):
 
     action_names = tuple(f"{joint}.pos" for joint in JOINTS)
     action_low, action_high = (from_joints(bound[None])[0].round(6) for bound in (JOINT_LOW, JOINT_HIGH))
-    push = np.full(NUM_JOINTS, 6.0)
+    # The expert goes on from where it was pushed, so that pushes add up: 6 degrees in 0.2 s.
+    push = np.full(NUM_JOINTS, 1.0)
     state_names = action_names
     state_limit = 360.0
 
