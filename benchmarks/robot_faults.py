@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from lerobot.teleoperators.utils import TeleopEvents
 from lerobot_robot_cronos import CronosPersonConfig, CronosSO101Config
 
 from cronos_lerobot.robot.config import CronosRobotConfig
@@ -54,6 +55,17 @@ def long_update(env: RobotStreams) -> None:
     env.station.begin()
 
 
+def late_reset(env: RobotStreams) -> None:
+    """A person takes two minutes to put the scene to a start."""
+    env.station.person.teleop.config.reset_s = 120.0
+    env.scene_reset(ONE, ONE)
+
+
+def wrong_key(env: RobotStreams) -> None:
+    """The person presses the key of a success that was none."""
+    env.station.person.teleop.press(TeleopEvents.SUCCESS)
+
+
 def far_action(env: RobotStreams) -> None:
     """The policy wants 1,000 degrees of every joint."""
     env.far = True
@@ -65,22 +77,30 @@ FAULTS: dict[str, Callable[[RobotStreams], None]] = {
     "emergency stop": emergency,
     "Ctrl-C": ctrl_c,
     "update of 20 s": long_update,
+    "reset of 120 s": late_reset,
+    "wrong key: success": wrong_key,
     "action of 1,000 degrees, max_step 10": far_action,
 }
 
 
-def play(name: str, folder: Path) -> dict:
-    """Let a fault happen, and say what followed."""
+def begin(folder: Path, judge: str = "sim") -> RobotStreams:
+    """The arm at home, a task begun."""
     env = CronosRobotConfig(
         robot=CronosSO101Config(id="desk", real_time=False, camera_names=["wrist"]),
         teleop=CronosPersonConfig(robot_id="desk", reset_s=2.0, judges=False),
-        judge="sim",
+        judge=judge,
         max_step=10.0,
     ).create_streams(1)
-    env.folder, env.far = folder / name, False
-    robot, station = env.station.robot, env.station
+    env.folder, env.far = folder, False
     env.scene_reset(ONE, ONE)
     env.set_task(ONE, env.tasks[:1])
+    return env
+
+
+def play(name: str, folder: Path) -> dict:
+    """Let a fault happen, and say what followed."""
+    env = begin(folder / name, "person" if FAULTS[name] is wrong_key else "sim")
+    robot, station = env.station.robot, env.station
     for step in range(BEFORE):
         env.step(swing(env, step))
     before, goals, diverged, stopped = robot.desk.goal.copy(), [], 0, ""
@@ -90,6 +110,7 @@ def play(name: str, folder: Path) -> dict:
             action = np.full((1, 6), 1000.0) if env.far else swing(env, step)
             info = env.step(action)[4]
             goals.append(robot.desk.goal.copy())
+            stopped = stopped or "counted as success" * bool(info["is_success"][0])
             if info["diverged"][0]:
                 diverged = step - BEFORE + 1
                 break

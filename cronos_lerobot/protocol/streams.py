@@ -50,7 +50,8 @@ class Streams(Protocol):
 
     A world may also have the methods of the protocols below. A flag that needs one says so if it is missing. Two
     more attributes are optional. `observation_details` is what a dataset's features say of the observations beside
-    their shapes, a dict by LeRobot's name. `benchmark` has `groups(suite, split)`, its own choice of episodes.
+    their shapes, a dict by LeRobot's name. `benchmark` has `groups(suite, split)`, its own choice of episodes. A
+    run or evaluation sets `folder`, for files of the world's own.
     """
 
     @property

@@ -184,7 +184,9 @@ def _warn(policy: PreTrainedConfig, config: CronosTrainConfig) -> None:
 
 
 def check_demonstrations(algorithm: Any, environment: str) -> None:
-    """Check that an agent's demonstrations, if they are on this machine, are of the run's environment.
+    """Check that an agent's demonstrations, if they are on this machine, are of the run's scene.
+
+    They may be of its simulation where the run is on a robot.
 
     Raises:
         ValueError: they are of another one, whose columns may have the same sizes.
@@ -192,7 +194,8 @@ def check_demonstrations(algorithm: Any, environment: str) -> None:
     demos = getattr(algorithm, "demos", None)
     if not isinstance(demos, DemosConfig) or demos.repo_id is None:
         return
-    if (other := environment_of_dataset(demos.repo_id, demos.root)) not in (None, environment):
+    other = environment_of_dataset(demos.repo_id, demos.root)
+    if other and other.split("/")[-1] != environment.split("/")[-1]:
         raise ValueError(f"--algorithm.demos.repo_id={demos.repo_id} is of {other}, not of {environment}.")
 
 

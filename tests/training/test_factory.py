@@ -18,7 +18,12 @@ from cronos_lerobot.evaluation.policy_env import check_observations
 from cronos_lerobot.evaluation.policy_loading import check_processor_classes
 from cronos_lerobot.ranks import Ranks
 from cronos_lerobot.training.config import CronosTrainConfig
-from cronos_lerobot.training.factory import check_pictures, make_parts, make_policy_and_processors
+from cronos_lerobot.training.factory import (
+    check_demonstrations,
+    check_pictures,
+    make_parts,
+    make_policy_and_processors,
+)
 
 
 @pytest.fixture
@@ -41,6 +46,8 @@ def test_a_policy_and_demonstrations_of_another_scene_are_told(pocketvla, tmp_pa
     config.num_envs = 1
     with pytest.raises(ValueError, match="playroom_2x2"):
         make_parts(config, Ranks())
+    # A robot's scene is that of its simulation.
+    check_demonstrations(config.algorithm, "cronos_robot/playroom_2x2-v1")
 
 
 @pytest.mark.parametrize(("told", "is_warned"), [("none", True), ("one_hot", False)])
