@@ -20,7 +20,7 @@ from cronos_lerobot.robot.config import CronosRobotConfig
 from cronos_lerobot.robot.station import Stopped
 from cronos_lerobot.robot.streams import RobotStreams
 
-ONE, FPS, BEFORE, AFTER = np.array([0]), 30, 45, 45
+ONE, BEFORE, AFTER = np.array([0]), 45, 45
 
 
 def swing(env: RobotStreams, step: int) -> np.ndarray:
@@ -110,7 +110,8 @@ def play(name: str, folder: Path) -> dict:
             action = np.full((1, 6), 1000.0) if env.far else swing(env, step)
             info = env.step(action)[4]
             goals.append(robot.desk.goal.copy())
-            stopped = stopped or "counted as success" * bool(info["is_success"][0])
+            if info["is_success"][0]:
+                stopped = "counted as success"
             if info["diverged"][0]:
                 diverged = step - BEFORE + 1
                 break

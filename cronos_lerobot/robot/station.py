@@ -103,15 +103,14 @@ class Station:
         """Say what a person is to do, and wait until they have; returns how long that took [s]."""
         print(text, flush=True)
         start = self.clock.time()
-        is_waiting = True
-        while is_waiting:
+        while True:
             events = self.person.look()
             if events.stop:
                 self._stop()
             self._check_signals()
-            if is_waiting := not is_over(events):
-                self.clock.sleep(POLL_S)
-        return self.clock.time() - start
+            if is_over(events):
+                return self.clock.time() - start
+            self.clock.sleep(POLL_S)
 
     def _check_signals(self) -> None:
         """Stop at once on Ctrl-C and its like, whoever else listens to them: the arm goes home first."""
