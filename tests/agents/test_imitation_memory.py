@@ -52,6 +52,17 @@ def test_the_memory_keeps_successes_up_to_a_step_after_the_first():
         assert segment.columns["next.reward"].tolist() == steps
 
 
+def test_only_the_last_steps_before_a_success_are_kept():
+    marks = ["....S.", "S.....", ".S...."]
+    segments = OpenSegments(3)
+    for step in range(6):
+        state = np.full((3, 1), step, np.float32)
+        segments.add({"observation.state": state}, ["go"] * 3, state, state[:, 0], np.zeros(3, bool))
+        segments.note(np.array([mark[step] == "S" for mark in marks]))
+    kept = segments.close(np.array([False, True, False]), tail_steps=1, lead_steps=3)
+    assert [s.columns["observation.state"][:, 0].tolist() for s in kept] == [[2, 3, 4, 5], [0, 1, 2]]
+
+
 def test_failed_segments_are_kept_whole_where_they_are_asked_for():
     segments = OpenSegments(len(TAPE))
     for step in range(6):

@@ -116,6 +116,10 @@ class DenoisingAdapter(CriticAdapter):
     def step(self, context: Any, temperature: float) -> Step:
         """Return the steps of the denoising; temperature 0 is the policy's own, without noise."""
 
+    def actions(self, context: Any, x: Tensor) -> Tensor:
+        """Return the normalised actions (B, H, D) that the end of a chain (B, H, D) stands for."""
+        return x
+
     def values(self, batch: Batch, context: Any, features: Tensor) -> Tensor:
         """Return the values (B,) of a batch, of which `observe` returned `context` and `features`."""
         return self.critic(features)
@@ -147,7 +151,8 @@ class DenoisingAdapter(CriticAdapter):
             )
         end, trace, log_prob = self.draw(context, noise, temperature, generator)
         value = self.values(batch, context, features)
-        return {"actions": self.scored(end), "trace": trace, "log_prob": log_prob, "value": value}
+        actions = self.scored(self.actions(context, end))
+        return {"actions": actions, "trace": trace, "log_prob": log_prob, "value": value}
 
     def draw(
         self, context: Any, noise: Tensor, temperature: float, generator: torch.Generator | None
@@ -163,10 +168,14 @@ class DenoisingAdapter(CriticAdapter):
 
     def denoise(self, context: Any, noise: Tensor) -> Tensor:
         """See `Steerable`."""
+        return self.scored(self.actions(context, self.integrate(context, noise)))
+
+    def integrate(self, context: Any, noise: Tensor) -> Tensor:
+        """Return, differentiably, x_S (B, H, D) of the policy's own denoising, which adds no noise."""
         step, x = self.step(context, 0.0), noise
         for k in range(self.num_steps):
             x = step(k, x)[0]
-        return self.scored(x)
+        return x
 
     def evaluate_actions(
         self, batch: Batch, trace: Tensor, *, temperature: float = 1.0

@@ -36,6 +36,10 @@ class PocketVLAFlowAdapter(FlowAdapter):
         """See `FlowAdapter`."""
         return self.policy.flow_velocity(context, x, time)
 
+    def actions(self, context: Tensor, x: Tensor) -> Tensor:
+        """See `DenoisingAdapter`."""
+        return self.policy.flow_actions(context, x)
+
     def values(self, batch: Batch, context: Tensor, features: Tensor) -> Tensor:
         """The policy's own."""
         return self.policy.predict_values(batch)

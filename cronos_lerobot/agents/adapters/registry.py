@@ -46,12 +46,14 @@ class AdapterOptions:
     """What an agent asks of an adapter."""
 
     noise_std: float = 0.1
-    """Standard deviation at the start, in normalised units, of the noise that an adapter adds to actions; the
-    least deviation of a diffusion's step."""
+    """Standard deviation, in normalised units, of the noise that an adapter adds to actions, at the start where it
+    is learned; the least deviation of a diffusion's step."""
     noise_level: float = 1.0
     """DDIM's eta of the denoising of a flow or diffusion policy, 0 (no noise) to 1 (that of DDPM)."""
     noise_steps: int | None = None
     """At how many steps of a flow policy's denoising there is noise; None is all but the last."""
+    noise_repeat: bool = False
+    """Whether a flow policy's noise is, instead, one action's of `noise_std` for the whole chunk."""
 
 
 class Adapter(nn.Module):

@@ -103,8 +103,13 @@ class ImitationAgent(LearningAgent):
 
     def end_segment(self, success: np.ndarray, found_complete: np.ndarray) -> None:
         """Remember the successful segments of its streams, and the failed ones if they are weighted."""
-        with_failed = self.config.weighting != "none"
-        for segment in self._open.close(found_complete[self._streams], self.config.tail_steps, with_failed):
+        config = self.config
+        for segment in self._open.close(
+            found_complete[self._streams],
+            config.tail_steps,
+            config.lead_steps,
+            with_failed=config.weighting != "none",
+        ):
             self.memory.add(segment)
 
     def update(self) -> dict[str, float]:

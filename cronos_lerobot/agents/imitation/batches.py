@@ -34,22 +34,20 @@ def segment_batch(draws: Sequence[tuple[Segment, int]], config: PreTrainedConfig
         `task`, B strings.
     """
     batch: Batch = {"task": [segment.instruction for segment, _ in draws]}
+    drawn = np.array([[frame] for _, frame in draws])
+    ends = np.array([[len(segment)] for segment, _ in draws])
     for name in draws[0][0].columns:
         deltas = _delta_indices(name, config)
         if name == REWARD and deltas is None:
             continue
-        wanted = [frame + np.array(deltas or [0]) for _, frame in draws]
-        parts = [
-            segment.columns[name][np.clip(frames, 0, len(segment) - 1)]
-            for (segment, _), frames in zip(draws, wanted, strict=True)
-        ]
+        wanted = drawn + np.array(deltas or [0])
+        inside = np.clip(wanted, 0, ends - 1)
+        parts = [segment.columns[name][rows] for (segment, _), rows in zip(draws, inside, strict=True)]
         column = _tensor(name, np.stack(parts))
         if deltas is None:
             batch[name] = column[:, 0]
             continue
-        ends = np.array([len(segment) for segment, _ in draws])[:, None]
-        beyond = (np.stack(wanted) < 0) | (np.stack(wanted) >= ends)
-        batch |= {name: column, f"{name}_is_pad": torch.from_numpy(beyond)}
+        batch |= {name: column, f"{name}_is_pad": torch.from_numpy(wanted != inside)}
     return batch
 
 

@@ -40,6 +40,9 @@ class ImitationConfig(AgentConfig):
     warmup_segments: int = ranged(32, minimum=0)
     """Successful segments, of all processes together, before the first optimizer step; none where demonstrations
     are cloned, too."""
+    lead_steps: int | None = ranged(None, minimum=1)
+    """Control steps of a segment that are kept up to its first success; null keeps all. A segment that succeeded
+    late is mostly attempts that failed."""
     tail_steps: int = ranged(4, minimum=0)
     """Control steps of a segment that are kept after its first success."""
     memory_gib: float = ranged(4.0, above=0)

@@ -74,11 +74,18 @@ class OpenSegments:
         if self.kept:
             self._success.append(np.array(success))
 
-    def close(self, found_complete: np.ndarray, tail_steps: int, with_failed: bool = False) -> list[Segment]:
-        """Return the successful segments, up to `tail_steps` after the first success, and begin new ones.
+    def close(
+        self,
+        found_complete: np.ndarray,
+        tail_steps: int,
+        lead_steps: int | None = None,
+        with_failed: bool = False,
+    ) -> list[Segment]:
+        """Return the successful segments, and begin new ones.
 
-        One that was found complete is none: nothing had to be done. Those that failed are returned whole, if they
-        are asked for.
+        They are kept from their last `lead_steps` up to the first success, or their beginning, to `tail_steps`
+        after it. One that was found complete is none: nothing had to be done. Those that failed are returned
+        whole, if they are asked for.
         """
         success = np.array(self._success).reshape(len(self._rows), self.num_streams)
         segments = []
@@ -89,7 +96,9 @@ class OpenSegments:
             if found_complete[i] or not (success_i or (with_failed and rows)) or (success_i and steps[0] == 0):
                 continue
             if success_i:
-                rows = rows[: int(steps[0]) + 1 + tail_steps]
+                end = int(steps[0]) + 1
+                kept_from = 0 if lead_steps is None else max(0, end - lead_steps)
+                rows = rows[kept_from : end + tail_steps]
             columns = {name: np.stack([row[name][i] for row in rows]) for name in rows[0]}
             segments.append(Segment(self._instructions[i], columns, success=success_i))
         self.clear()

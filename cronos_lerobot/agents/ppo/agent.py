@@ -140,7 +140,7 @@ def make_ppo_agent(context: AgentContext) -> PPOAgent:
             critic of its own where the config asks for a privileged one.
     """
     config = context.config
-    options = AdapterOptions(config.noise_std, config.noise_level, config.noise_steps)
+    options = AdapterOptions(config.noise_std, config.noise_level, config.noise_steps, config.noise_repeat)
     policy = make_trainable(context.policy, options)
     if config.critic_observation == "environment_state":
         policy = _with_privileged_critic(policy, context)

@@ -83,14 +83,17 @@ class PPOConfig(AgentConfig):
     temperature: float = ranged(1.0, above=0)
     """Sampling temperature while training."""
     noise_std: float = ranged(0.1, above=0)
-    """Standard deviation at the start, in normalised units, of the noise around the actions of a policy that has
-    none of its own (ACT), where it is learned; the least deviation of a step of Diffusion's denoising."""
+    """Standard deviation, in normalised units, of the noise around the actions of a policy that has none of its
+    own (ACT), where this is its start and it is learned, and of `noise_repeat`; the least deviation of a step of
+    Diffusion's denoising."""
     noise_level: float = ranged(1.0, above=0, maximum=1)
     """Noise of the denoising of a flow policy (PocketVLA's flow head, SmolVLA, pi0) or of Diffusion: DDIM's eta.
     1 draws all of the noise anew that the forward process would have added."""
     noise_steps: int | None = ranged(None, minimum=1)
     """At how many steps of a flow policy's denoising there is noise, drawn for each decision; an update evaluates
     the network at these alone. null is all but the last, which has none."""
+    noise_repeat: bool = False
+    """For a flow policy: no noise in the denoising, but one action's of `noise_std` for the whole chunk."""
     critic_observation: str = ranged("policy", choices=("policy", "environment_state"))
     """What the critic beside a policy that has none of its own (ACT, Diffusion, SmolVLA, pi0) reads: what the
     `policy` makes of its observation, or the privileged `environment_state`, the robot's state and the

@@ -35,6 +35,7 @@ def make_batch(n: int, seed: int = 0, size: int = 64) -> dict:
         CAMERA: torch.randint(0, 256, (n, 3, size, size), dtype=torch.uint8, generator=rng),
         "observation.state": torch.randn(n, 13, generator=rng),
         "observation.environment_state": torch.randn(n, 48, generator=rng),
+        "observation.joints": torch.rand(n, 7, generator=rng) - 0.5,
         "task": [TASKS[i % 2] for i in range(n)],
     }
 

@@ -60,6 +60,31 @@ def test_the_loss_by_hand():
     assert policy.forward(batch, **options)[0].item() == pytest.approx((1.0 + 4 * 0.25) / 5)
 
 
+def test_chunks_relative_to_the_joints_by_hand():
+    policy = PocketVLAPolicy(make_config(**FLOW | {"chunk_size": 2, "joints": [3, 4, 5, 6, 7, 8, -1]})).train()
+    joints = torch.tensor([[0.2] * 6 + [0.0], [-0.4] * 6 + [0.0]])
+    actions = joints[:, None] + torch.tensor([[0.1, 0.3], [-0.1, 0.5]])[..., None]
+    noise, time = torch.zeros(2, 2, 7), torch.ones(2)
+    batch = make_batch(2) | {"action": actions, "observation.joints": joints}
+    each, _ = policy.forward(batch, reduction="none", noise=noise, time=time)
+    # The first numbers have mean 0 and deviation .1, the second ones mean .4 and deviation .1: all are +-1.
+    assert each.tolist() == pytest.approx([1.0, 1.0], rel=1e-3)
+    # A second batch, whose first action is 0 and whose second counts once, with .8.
+    batch["action"] = joints[:, None] + torch.tensor([[0.0, 0.8], [0.0, -3.0]])[..., None]
+    batch["action_is_pad"] = torch.tensor([[False, False], [False, True]])
+    policy.forward(batch)
+    torch.testing.assert_close(policy.chunks.mean, torch.tensor([[0.0] * 7, [0.6] * 7]))
+    # (.1^2 + 0) / 2, and the mean of (.3^2 + .5^2) / 2 and .8^2.
+    torch.testing.assert_close(policy.chunks.square, torch.tensor([[0.005] * 7, [0.405] * 7]))
+    # A chunk of 1 is one deviation above the mean, from where the joints are.
+    context = policy.eval().flow_context(batch)
+    played = policy.flow_actions(context, torch.ones(2, 2, 7))
+    expected = torch.tensor([0.005**0.5, 0.6 + (0.405 - 0.36) ** 0.5])[:, None]
+    torch.testing.assert_close(played, joints[:, None] + expected)
+    policy.forward(batch)
+    torch.testing.assert_close(policy.chunks.mean[1], torch.full((7,), 0.6))
+
+
 def test_draws_share_the_trunk_and_are_random():
     policy = make_flow(flow_draws=8)
     rows = []

@@ -1,5 +1,7 @@
 """The flow head under PPO, with values that are the policy's own."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -15,14 +17,16 @@ from cronos_lerobot.agents.processing import make_processors
 
 OBSERVED = {
     "state": {},
+    "joints": {"joints": [0, 1, 2, 3, 4, 5, -1]},
     "pixels": {"image": True, "freeze_encoder": False},
     "privileged": {"image": True, "critic_observation": "environment_state"},
     "frozen": {"image": True},
 }
 
 
-def make_adapter(level=0.5, **options):
-    return make_trainable(make_flow(dtype="float32", **options), AdapterOptions(noise_level=level))
+def make_adapter(level=0.5, repeat=False, **options):
+    noise = AdapterOptions(noise_level=level, noise_std=0.3, noise_repeat=repeat)
+    return make_trainable(make_flow(dtype="float32", **options), noise)
 
 
 def generator(seed):
@@ -40,7 +44,7 @@ def test_tokens_need_no_adapter():
 
 @torch.no_grad()
 @pytest.mark.parametrize("options", [{"temperature": 0.0}, {"level": 0.0}])
-@pytest.mark.parametrize("observed", ["state", "pixels"])
+@pytest.mark.parametrize("observed", ["state", "joints", "pixels"])
 def test_without_noise_it_acts_as_select_action_does(observed, options):
     adapter, batch, noise = (
         make_adapter(options.get("level", 0.5), **OBSERVED[observed]),
@@ -78,9 +82,38 @@ def test_the_ratio_is_one_before_the_first_step(options, temperature):
     assert sample["value"].std() > 0
 
 
+def test_repeated_noise_moves_the_whole_chunk_and_is_judged_by_its_mean():
+    adapter, batch, noise = make_adapter(repeat=True), make_batch(5), make_noise(5)
+    context, _ = adapter.observe(batch)
+    own = adapter.denoise(context, noise)
+    sample = adapter.sample_actions(batch, temperature=0.5, noise=noise, generator=generator(4))
+    shift = sample["actions"] - own
+    assert shift.abs().max() > 0.1
+    torch.testing.assert_close(shift, shift[:, :1].expand_as(shift))
+    # Seven independent normal numbers of deviation 0.5 * 0.3, around the mean of the two actions that are played.
+    expected = -0.5 * (shift[:, 0] / 0.15).square() - math.log(0.15 * math.sqrt(2 * math.pi))
+    assert sample["log_prob"].shape == (5, 1)
+    torch.testing.assert_close(sample["log_prob"][:, 0], expected.sum(-1), atol=1e-3, rtol=1e-4)
+    got = adapter.evaluate_actions(batch, sample["trace"], temperature=0.5)["log_prob"]
+    torch.testing.assert_close(got, sample["log_prob"], atol=1e-3, rtol=1e-4)
+    # Of another policy the same mean is as likely as it is near that policy's.
+    with torch.no_grad():
+        adapter.policy.head.out.bias += 0.1
+    moved = adapter.denoise(context, noise).mean(1)
+    expected = -0.5 * ((sample["actions"].mean(1) - moved) / 0.15).square() - math.log(
+        0.15 * math.sqrt(2 * math.pi)
+    )
+    got = adapter.evaluate_actions(batch, sample["trace"], temperature=0.5)["log_prob"]
+    torch.testing.assert_close(got[:, 0], expected.sum(-1), atol=1e-3, rtol=1e-4)
+    calm = adapter.sample_actions(batch, temperature=0.0, noise=noise)
+    assert torch.equal(calm["actions"], adapter.denoise(context, noise))
+    assert (calm["log_prob"] == 0).all()
+
+
+@pytest.mark.parametrize("repeat", [False, True])
 @pytest.mark.parametrize("options", OBSERVED.values(), ids=OBSERVED)
-def test_each_loss_trains_its_own(options):
-    adapter, batch = make_adapter(**options), make_batch(4)
+def test_each_loss_trains_its_own(options, repeat):
+    adapter, batch = make_adapter(repeat=repeat, **options), make_batch(4)
     PPO(
         adapter,
         make_processors(adapter.policy, *make_pre_post_processors(adapter.config)),

@@ -46,6 +46,32 @@ def test_bridge_bounds_map_to_the_ends_of_the_range_and_back():
     torch.testing.assert_close(postprocessor(normalised), physical, atol=1e-6, rtol=0)
 
 
+def test_joints_are_told_in_the_actions_units_of_the_state_as_it_comes(tmp_path):
+    """Whatever the normaliser makes of it, which `lerobot-train` may give another dataset's statistics."""
+    config = make_config(action_bounds="dataset", joints=[2, 0, 1, 4, 5, 6, -1])
+    for processor in make_pre_post_processors(config, dataset_stats=STATS):
+        processor.save_pretrained(tmp_path)
+    preprocessor, _ = make_pre_post_processors(config, pretrained_path=str(tmp_path))
+    batch = make_batch(1) | {
+        "observation.state": torch.tensor([[5.0, -3.0, 1.0, 9.0, 3.0, -1.0, 1.0] + [9.0] * 6])
+    }
+    # From -3 .. 5 to -1 .. 1; the last dimension moves no joint.
+    expected = torch.tensor([[0.0, 1.0, -1.0, 0.5, -0.5, 0.0, 0.0]])
+    torch.testing.assert_close(preprocessor(batch)["observation.joints"], expected)
+
+
+def test_joints_are_found_by_their_names_in_the_dataset():
+    arm = [f"{joint}.pos" for joint in ("pan", "lift", "gripper")]
+    features = {"observation.state": {"names": ["time", *reversed(arm)]}, "action": {"names": arm}}
+    config = make_config(action_dim=3)
+    config.set_dataset_feature_metadata(features)
+    assert config.joints == [3, 2, -1]
+    features["action"]["names"] = ["dx", "dy", "gripper.pos"]
+    config = make_config(action_dim=3)
+    config.set_dataset_feature_metadata(features)
+    assert config.joints == []
+
+
 def test_dataset_bounds_come_from_the_statistics_and_survive_saving(tmp_path):
     config = make_config(action_bounds="dataset")
     for processor in make_pre_post_processors(config, dataset_stats=STATS):

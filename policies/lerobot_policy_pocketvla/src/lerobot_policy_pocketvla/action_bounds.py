@@ -6,7 +6,11 @@ from typing import Any
 import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.processor import EnvTransition, ProcessorStep, ProcessorStepRegistry, TransitionKey
+from lerobot.utils.constants import OBS_STATE, OBS_STR
 from torch import Tensor
+
+JOINTS = f"{OBS_STR}.joints"
+"""Key of where the joints are that the actions move, (B, D), in the actions' normalised units."""
 
 ActionBounds = tuple[tuple[float, ...], tuple[float, ...]]
 """(low, high), each with one entry per action dimension, in the action's physical units."""
@@ -54,6 +58,9 @@ class ActionBoundsProcessorStep(ProcessorStep):
     """Physical action that +1 stands for, one entry per dimension."""
     inverse: bool = False
     """False: physical to normalised (preprocessor). True: normalised to physical (postprocessor)."""
+    joints: list[int] = field(default_factory=list)
+    """Where `observation.state`, as it comes, has the joint that each dimension moves, -1 if nowhere; empty if the
+    policy does not ask."""
 
     def __post_init__(self) -> None:
         """Check the bounds at once."""
@@ -62,12 +69,17 @@ class ActionBoundsProcessorStep(ProcessorStep):
                 raise ValueError(f"action dimension {dim}: low {low} must be below high {high}")
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        """Convert the transition's action, if it has one (observations alone pass through)."""
-        action = transition.get(TransitionKey.ACTION)
-        if action is None:
-            return transition
+        """Convert the transition's action, if it has one, and add the joints to its observation, if asked."""
+        action, observation = transition.get(TransitionKey.ACTION), transition.get(TransitionKey.OBSERVATION)
         converted = transition.copy()
-        converted["action"] = self.convert(torch.as_tensor(action))
+        if action is not None:
+            converted["action"] = self.convert(torch.as_tensor(action))
+        if self.joints and observation:
+            state = torch.as_tensor(observation[OBS_STATE])
+            where = torch.tensor(self.joints, device=state.device)
+            # At 0, the middle of the box, where there is none: its actions stay as they are.
+            joints = self.convert(state[..., where]) * (where >= 0)
+            converted["observation"] = dict(observation) | {JOINTS: joints}
         return converted
 
     def convert(self, action: Tensor) -> Tensor:
@@ -83,7 +95,7 @@ class ActionBoundsProcessorStep(ProcessorStep):
 
     def get_config(self) -> dict[str, Any]:
         """Return what is written to the processor's JSON."""
-        return {"low": self.low, "high": self.high, "inverse": self.inverse}
+        return {"low": self.low, "high": self.high, "inverse": self.inverse, "joints": self.joints}
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]

@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_policy_pocketvla.action_bounds import BRIDGE_ORIG_BOUNDS
 from lerobot_policy_pocketvla.bodies import BODY_WIDTH, bodies_named
@@ -47,6 +47,10 @@ class PocketVLAConfig(PreTrainedConfig):
     """Bodies that the privileged state describes, in its order; taken from the dataset."""
     hand: list[int] = field(default_factory=list)
     """Where `observation.state` has the hand's position; taken from the dataset."""
+    joints: list[int] = field(default_factory=list)
+    """Where `observation.state` has the joint that each dimension of the action moves, -1 for the gripper and
+    where there is none; taken from the dataset, empty if the actions move no joint of it. The chunks of the `flow`
+    head are relative to these joints."""
     view: View | None = None
     """With an image actor: where the camera sees the bodies, by which cloning teaches the encoder; taken from
     the dataset, null if that does not say."""
@@ -266,6 +270,9 @@ class PocketVLAConfig(PreTrainedConfig):
             return
         state, privileged = features.get(OBS_STATE, {}), features.get(OBS_ENV_STATE, {})
         names = list(state.get("names") or [])
+        moved = [name if "gripper" not in name else None for name in features.get(ACTION, {}).get("names") or []]
+        if set(moved) & set(names):
+            self.joints = [names.index(name) if name in names else -1 for name in moved]
         hand = [f"ee.{axis}" for axis in "xyz"]
         bodies = bodies_named(privileged.get("names"))
         from_pictures, has_hand = self.actor_observation == "image", set(hand) <= set(names)

@@ -10,6 +10,7 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
+from lerobot_policy_pocketvla.action_bounds import JOINTS
 from lerobot_policy_pocketvla.modeling_pocketvla import Batch, PocketVLAPolicy
 
 TIME_WIDTH = 32
@@ -76,12 +77,60 @@ class FlowHead(nn.Module):
         return self.out(self.norm(hidden)).unflatten(-1, self.shape)
 
 
+CHUNK_BATCHES = 100
+"""Batches of cloning that say how chunks are spread."""
+MIN_DEVIATION = 1e-3
+"""Of a number of a chunk, in normalised units: what hardly moved is not blown up."""
+
+
+class RelativeChunks(nn.Module):
+    """Chunks relative to where the joints are, each number with mean 0 and deviation 1 in the demonstrations.
+
+    The first targets of a chunk lie a few degrees from the joints, in a range of 200. Beside noise of deviation 1,
+    what tells one chunk from another would be small.
+
+    Args:
+        shape: (H, D) of the chunk.
+    """
+
+    mean: Tensor
+    square: Tensor
+    batches: Tensor
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        """Begin with mean 0 and deviation 1."""
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(shape))
+        self.register_buffer("square", torch.ones(shape))
+        self.register_buffer("batches", torch.zeros((), dtype=torch.long))
+
+    def count_in(self, actions: Tensor, joints: Tensor, valid: Tensor) -> None:
+        """Let mean and deviation be those of the first batches: actions (B, H, D), joints (B, D), valid (B, H)."""
+        if self.batches < CHUNK_BATCHES:
+            weights = (valid / valid.sum(0).clamp(min=1.0))[..., None]
+            relative = actions - joints[:, None]
+            self.batches += 1
+            self.mean += ((weights * relative).sum(0) - self.mean) / self.batches
+            self.square += ((weights * relative.square()).sum(0) - self.square) / self.batches
+
+    def from_actions(self, actions: Tensor, joints: Tensor) -> Tensor:
+        """Normalised actions (B, H, D) at joints (B, D) to relative chunks (B, H, D)."""
+        return (actions - joints[:, None] - self.mean) / self._deviation()
+
+    def to_actions(self, chunks: Tensor, joints: Tensor) -> Tensor:
+        """The inverse of `from_actions`."""
+        return chunks * self._deviation() + self.mean + joints[:, None]
+
+    def _deviation(self) -> Tensor:
+        return (self.square - self.mean.square()).clamp(min=MIN_DEVIATION**2).sqrt()
+
+
 class PocketVLAFlowPolicy(PocketVLAPolicy, heads=("flow",)):
     """Predicts a velocity v = noise - actions on the way x = t noise + (1 - t) actions, as LeRobot's SmolVLA does.
 
     A chunk of H actions is decided on at once, and n of them are played. It says of no chunk how likely it was;
-    a trainer that makes a stochastic chain of the integration finds what it needs in `flow_context` and
-    `flow_velocity`.
+    a trainer that makes a stochastic chain of the integration finds what it needs in `flow_context`,
+    `flow_velocity` and `flow_actions`.
     """
 
     head: FlowHead
@@ -89,6 +138,7 @@ class PocketVLAFlowPolicy(PocketVLAPolicy, heads=("flow",)):
     def __init__(self, config: Any, **kwargs: Any) -> None:
         """Build the networks."""
         super().__init__(config, **kwargs)
+        self.chunks = RelativeChunks(config.chunk_shape).to(config.device) if config.joints else None
         self.reset()
 
     def _build_head(self) -> FlowHead:
@@ -116,6 +166,13 @@ class PocketVLAFlowPolicy(PocketVLAPolicy, heads=("flow",)):
             log.
         """
         actions = batch[ACTION].float().clamp(-1.0, 1.0)
+        valid = torch.ones_like(actions[..., 0])
+        if "action_is_pad" in batch:
+            valid = 1.0 - batch["action_is_pad"].to(actions.dtype)
+        if self.chunks:
+            if self.training:
+                self.chunks.count_in(actions, batch[JOINTS], valid)
+            actions = self.chunks.from_actions(actions, batch[JOINTS])
         draws = self.config.flow_draws if noise is None else 1
         repeated = actions.repeat(draws, 1, 1)
         if noise is None or time is None:
@@ -126,9 +183,6 @@ class PocketVLAFlowPolicy(PocketVLAPolicy, heads=("flow",)):
             features, taught, metrics = self._cloning_features(batch)
             velocity = self.head(features.repeat(draws, 1), t * noise + (1 - t) * repeated, time)
         errors = (velocity - (noise - repeated)).square().mean(-1).unflatten(0, (draws, -1)).mean(0)
-        valid = torch.ones_like(errors)
-        if "action_is_pad" in batch:
-            valid = 1.0 - batch["action_is_pad"].to(errors.dtype)
         errors = errors * valid
         if reduction == "none":
             return errors.sum(1) / valid.sum(1).clamp(min=1.0) + taught, metrics
@@ -142,12 +196,13 @@ class PocketVLAFlowPolicy(PocketVLAPolicy, heads=("flow",)):
             batch: observations and `task`.
             noise: to begin with, (B, H, D); None draws it from torch's global generator.
         """
-        features = self.flow_context(batch)
+        context = self.flow_context(batch)
         if noise is None:
-            noise = sample_noise((len(features), *self.head.shape), features.device)
-        return euler_integrate(
-            lambda x, time: self.flow_velocity(features, x, time), noise, self.config.num_inference_steps
+            noise = sample_noise((len(context), *self.head.shape), context.device)
+        chunks = euler_integrate(
+            lambda x, time: self.flow_velocity(context, x, time), noise, self.config.num_inference_steps
         )
+        return self.flow_actions(context, chunks)
 
     @torch.no_grad()
     def select_action(self, batch: Batch, noise: Tensor | None = None, **_: Any) -> Tensor:
@@ -167,11 +222,17 @@ class PocketVLAFlowPolicy(PocketVLAPolicy, heads=("flow",)):
     # What a trainer that makes a stochastic chain of the integration needs.
 
     def flow_context(self, batch: Batch) -> Tensor:
-        """What the velocity needs of observations, (B, hidden_width), differentiable."""
+        """What velocity and actions need of observations, (B, hidden_width + D), differentiable."""
         with self._full_precision():
-            return self._features(batch)
+            features = self._features(batch)
+        joints = batch[JOINTS] if self.chunks else features.new_zeros(len(features), self.head.shape[1])
+        return torch.cat((features, joints), dim=-1)
 
     def flow_velocity(self, context: Tensor, x: Tensor, time: Tensor) -> Tensor:
         """Velocities (B, H, D) of chunks x (B, H, D) at times (B,), 1 noise to 0 actions, differentiable."""
         with self._full_precision():
-            return self.head(context, x, time)
+            return self.head(context[:, : self.config.hidden_width], x, time)
+
+    def flow_actions(self, context: Tensor, x: Tensor) -> Tensor:
+        """Normalised actions (B, H, D) that a chunk x (B, H, D) at time 0 stands for."""
+        return self.chunks.to_actions(x, context[:, self.config.hidden_width :]) if self.chunks else x

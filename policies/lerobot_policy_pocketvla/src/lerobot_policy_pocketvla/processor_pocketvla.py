@@ -46,8 +46,9 @@ def make_pocketvla_pre_post_processors(
             steps.add_batch_dim,
             steps.to_device,
             *([BodiesProcessorStep()] if config.bodies else []),
+            # Before the states are normalised: of joints it needs degrees.
+            ActionBoundsProcessorStep(low, high, joints=config.joints),
             steps.normalize,
-            ActionBoundsProcessorStep(low, high),
         ],
         output_steps=[ActionBoundsProcessorStep(low, high, inverse=True), steps.unnormalize, steps.to_cpu],
     )
