@@ -63,11 +63,11 @@ def test_joints_are_told_in_the_actions_units_of_the_state_as_it_comes(tmp_path)
 def test_joints_are_found_by_their_names_in_the_dataset():
     arm = [f"{joint}.pos" for joint in ("pan", "lift", "gripper")]
     features = {"observation.state": {"names": ["time", *reversed(arm)]}, "action": {"names": arm}}
-    config = make_config(action_dim=3)
+    config = make_config(action_dim=3, head="flow")
     config.set_dataset_feature_metadata(features)
     assert config.joints == [3, 2, -1]
     features["action"]["names"] = ["dx", "dy", "gripper.pos"]
-    config = make_config(action_dim=3)
+    config = make_config(action_dim=3, head="flow")
     config.set_dataset_feature_metadata(features)
     assert config.joints == []
 

@@ -48,9 +48,9 @@ class PocketVLAConfig(PreTrainedConfig):
     hand: list[int] = field(default_factory=list)
     """Where `observation.state` has the hand's position; taken from the dataset."""
     joints: list[int] = field(default_factory=list)
-    """Where `observation.state` has the joint that each dimension of the action moves, -1 for the gripper and
-    where there is none; taken from the dataset, empty if the actions move no joint of it. The chunks of the `flow`
-    head are relative to these joints."""
+    """With `head=flow`: where `observation.state` has the joint that each dimension of the action moves, -1 for
+    the gripper and where there is none. Chunks are relative to these joints. Taken from the dataset; empty if the
+    actions move no joint of it."""
     view: View | None = None
     """With an image actor: where the camera sees the bodies, by which cloning teaches the encoder; taken from
     the dataset, null if that does not say."""
@@ -271,7 +271,7 @@ class PocketVLAConfig(PreTrainedConfig):
         state, privileged = features.get(OBS_STATE, {}), features.get(OBS_ENV_STATE, {})
         names = list(state.get("names") or [])
         moved = [name if "gripper" not in name else None for name in features.get(ACTION, {}).get("names") or []]
-        if set(moved) & set(names):
+        if self.head == "flow" and self.robot_state_feature and set(moved) & set(names):
             self.joints = [names.index(name) if name in names else -1 for name in moved]
         hand = [f"ee.{axis}" for axis in "xyz"]
         bodies = bodies_named(privileged.get("names"))
