@@ -33,10 +33,10 @@ class FlowAdapter(DenoisingAdapter):
     With `noise_steps` J < S - 1, only J steps of a decision have noise, drawn anew for each. An update then
     differentiates J evaluations of the network instead of S - 1 (pi_RL's mixed steps).
 
-    With `noise_repeat` no step has noise: one action's, of deviation `noise_std`, is added to the whole chunk that
-    the policy's own denoising ends at. The likelihood is that of the mean of the played actions, which it moves:
-    A numbers for a decision in place of (S - 1) n A, so an advantage says more of each. A trace is (B, H + 1, D),
-    the noise that the denoising begins with and the drawn mean; `log_prob` is (B, 1).
+    With `noise_repeat` no step has noise. One action's noise, of deviation `noise_std`, is added to every action
+    of the denoised chunk. The likelihood is that of the mean of the played actions: A numbers for a decision
+    instead of (S - 1) n A, so an advantage says more of each. A trace is (B, H + 1, D): the noise that the
+    denoising began with, and the drawn mean. `log_prob` is (B, 1).
 
     Args:
         policy: see `DenoisingAdapter`, as the others.
@@ -60,7 +60,7 @@ class FlowAdapter(DenoisingAdapter):
     ) -> None:
         super().__init__(policy, shape=shape, num_steps=num_steps, feature_width=feature_width)
         self.noise_level = options.noise_level
-        self.repeated_std = options.noise_std if options.noise_repeat else None
+        self.noise_repeat, self.noise_std = options.noise_repeat, options.noise_std
         self.noise_steps = num_steps - 1 if options.noise_steps is None else options.noise_steps
         if not 0 < self.noise_steps < num_steps:
             raise ValueError(
@@ -102,7 +102,7 @@ class FlowAdapter(DenoisingAdapter):
         With `noise_steps` J < S - 1 the trace is (B, J, 2 H + 1, D): x before and after each step with noise, and
         a row that is the step's number.
         """
-        if self.repeated_std is not None:
+        if self.noise_repeat:
             end = self.integrate(context, noise)
             mean, std = self._played_mean(end), self._std(temperature, end)
             drawn = mean + std * torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
@@ -124,7 +124,7 @@ class FlowAdapter(DenoisingAdapter):
 
     def judge(self, context: Any, trace: Tensor, temperature: float) -> Tensor:
         """See `DenoisingAdapter`; steps without noise are not looked at."""
-        if self.repeated_std is not None:
+        if self.noise_repeat:
             mean = self._played_mean(self.integrate(context, trace[:, :-1]))
             return step_log_prob(mean, self._std(temperature, mean), trace[:, -1:], self.scored)[:, None]
         if self.noise_steps == self.num_steps - 1:
@@ -141,8 +141,7 @@ class FlowAdapter(DenoisingAdapter):
         return x[:, self.scored.steps].mean(dim=1, keepdim=True)
 
     def _std(self, temperature: float, x: Tensor) -> Tensor:
-        assert self.repeated_std is not None
-        return x.new_full((1, 1, 1), temperature * self.repeated_std)
+        return x.new_full((1, 1, 1), temperature * self.noise_std)
 
     def _tables(self, eta: float) -> Tensor:
         """(4, S): t, 1 - t, what a step adds of the estimated noise beside Euler's, the deviation of new noise."""

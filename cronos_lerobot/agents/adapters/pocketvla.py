@@ -28,7 +28,7 @@ class PocketVLAFlowAdapter(FlowAdapter):
         super().__init__(policy, options, shape=shape, num_steps=config.num_inference_steps, feature_width=None)
 
     def observe(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """See `FlowAdapter`; both are the trunk's features."""
+        """See `FlowAdapter`; both are the policy's `flow_context`."""
         context = self.policy.flow_context(batch)
         return context, context.detach()
 

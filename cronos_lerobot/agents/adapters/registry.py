@@ -53,7 +53,7 @@ class AdapterOptions:
     noise_steps: int | None = None
     """At how many steps of a flow policy's denoising there is noise; None is all but the last."""
     noise_repeat: bool = False
-    """Whether a flow policy's noise is, instead, one action's of `noise_std` for the whole chunk."""
+    """A flow policy has no noise in its denoising, but one action's, of `noise_std`, for the whole chunk."""
 
 
 class Adapter(nn.Module):

@@ -101,6 +101,7 @@ def test_draws_share_the_trunk_and_are_random():
 def test_a_chunk_is_the_integral_and_is_played_from_a_queue():
     policy, batch, noise = make_flow(num_inference_steps=2), make_batch(3), make_noise(3)
     context = policy.flow_context(batch)
+    assert context.shape == (3, 32)
     middle = noise - 0.5 * policy.flow_velocity(context, noise, torch.ones(3))
     expected = middle - 0.5 * policy.flow_velocity(context, middle, torch.full((3,), 0.5))
     chunk = policy.predict_action_chunk(batch, noise=noise)

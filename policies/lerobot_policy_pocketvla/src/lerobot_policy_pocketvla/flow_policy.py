@@ -86,8 +86,8 @@ MIN_DEVIATION = 1e-3
 class RelativeChunks(nn.Module):
     """Chunks relative to where the joints are, each number with mean 0 and deviation 1 in the demonstrations.
 
-    The first targets of a chunk lie a few degrees from the joints, in a range of 200. Beside noise of deviation 1,
-    what tells one chunk from another would be small.
+    Noise of one size for the whole chunk then moves its first target, which is near the joints, by little, and the
+    later ones by more.
 
     Args:
         shape: (H, D) of the chunk.
@@ -222,11 +222,13 @@ class PocketVLAFlowPolicy(PocketVLAPolicy, heads=("flow",)):
     # What a trainer that makes a stochastic chain of the integration needs.
 
     def flow_context(self, batch: Batch) -> Tensor:
-        """What velocity and actions need of observations, (B, hidden_width + D), differentiable."""
+        """What velocity and actions need of observations, differentiable.
+
+        (B, hidden_width), and where the joints are, (B, D), if chunks are relative to them.
+        """
         with self._full_precision():
             features = self._features(batch)
-        joints = batch[JOINTS] if self.chunks else features.new_zeros(len(features), self.head.shape[1])
-        return torch.cat((features, joints), dim=-1)
+        return torch.cat((features, batch[JOINTS]), dim=-1) if self.chunks else features
 
     def flow_velocity(self, context: Tensor, x: Tensor, time: Tensor) -> Tensor:
         """Velocities (B, H, D) of chunks x (B, H, D) at times (B,), 1 noise to 0 actions, differentiable."""

@@ -46,7 +46,7 @@ def make_pocketvla_pre_post_processors(
             steps.add_batch_dim,
             steps.to_device,
             *([BodiesProcessorStep()] if config.bodies else []),
-            # Before the states are normalised: of joints it needs degrees.
+            # Before the states are normalised: it needs the joints in the actions' units.
             ActionBoundsProcessorStep(low, high, joints=config.joints),
             steps.normalize,
         ],
