@@ -1,17 +1,27 @@
 """How often LeRobot's reward classifier is wrong, by the simulator's truth.
 
     cronos-record-demos --env.type=cronos --env.scene=so101_desk_2x2 --env.privileged_state=true \
+        --env.observation_height=128 --env.observation_width=128 --dataset.video=false \
         --dataset.repo_id=local/pictures --dataset.root=outputs/judge/pictures --dataset.num_episodes=1200 \
-        --dataset.video=false --seed=1 --steps_after_release=30 --start.layouts=reach --start.arm_pose=either \
+        --seed=1 --steps_after_release=30 --start.layouts=reach --start.arm_pose=either \
         --start.occupied_receptacles=true --start.misplaced_objects=true --start.share=0.5
     python benchmarks/reward_classifier.py encoder --dataset=outputs/judge/pictures --output=outputs/judge/encoder
-    python benchmarks/reward_classifier.py record  --split=train    --output=outputs/judge/streams
-    python benchmarks/reward_classifier.py record  --split=held_out --output=outputs/judge/held_out
-    python benchmarks/reward_classifier.py measure --dataset=outputs/judge/held_out --judge=outputs/judge/judges
 
-Before `measure`, run the commands of docs/robot.md, "Let a model judge", for each task, with
-`--reward_model.model_name=outputs/judge/encoder`. `encoder` stands in for the Hub's pretrained encoders: a small
-one that says from a picture where the bodies are.
+Then record two streams of a clone (docs/finetune.md, "On the SO-101") that does not learn, `train` and `other`:
+
+    cronos-train --policy.path=<clone> --num_envs=16 --steps=184320 --env.type=cronos --env.scene=so101_desk_2x2 \
+        --env.privileged_state=true --env.observation_height=128 --env.observation_width=128 \
+        --env.task_observation=one_hot --algorithm.type=imitation --algorithm.warmup_segments=1000000 \
+        --protocol.scene_reset_interval=1920 --protocol.end_effector_reset=true --protocol.update_interval=480 \
+        --eval_freq=0 --record.repo_id=local/streams --seed=5 --output_dir=outputs/judge/train
+
+`other` has `--steps=61440 --seed=6`. Train a classifier for each task on `train` by docs/robot.md, "Let a model
+judge", with `--reward_model.model_name=outputs/judge/encoder --steps=2000`, and measure them:
+
+    python benchmarks/reward_classifier.py measure --dataset=outputs/judge/other/streams \
+        --judge=outputs/judge/judges
+
+`encoder` stands in for the Hub's pretrained encoders: a small one that says from a picture where the bodies are.
 """
 
 import argparse
@@ -21,66 +31,18 @@ import numpy as np
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import IMAGENET_STATS
-from lerobot_env_cronos import CronosVectorEnv
-from lerobot_env_cronos.expert.expert import ScriptedExpert
 from transformers import ResNetConfig, ResNetModel
 
-from cronos_lerobot.agents.base import ActionSample
-from cronos_lerobot.data.perturbations import ActionNoise, NoiseConfig
-from cronos_lerobot.data.recorder import StreamRecorder
 from cronos_lerobot.data.streams import StreamDataset
-from cronos_lerobot.protocol.interventions import Intervention
-from cronos_lerobot.protocol.loop_state import Step
+from cronos_lerobot.robot.reward_models import EVERY as JUDGED_EVERY
 from cronos_lerobot.robot.reward_models import STEADY, RewardModel
 from cronos_lerobot.statistics import wilson_interval
 
-SCENE, CAMERA, SIZE = "so101_desk_2x2", "observation.images.front", 128
-STREAMS, SEGMENTS_PER_START = 16, 4
-LATEST_STOP = {"train": 480, "held_out": 60}
-"""Control steps. The later, the more segments succeed all the same; what is measured has failures, too."""
+CAMERA, SIZE = "observation.images.front", 128
 EVERY = 8
 """Frames from one picture that the encoder learns to the next."""
 EARLY = 15
 """A verdict is too early if the truth follows later than this [control steps]."""
-
-
-def record(split: str, segments: int, output: Path) -> None:
-    """Streams of an expert that is noisy in half of the segments, and stops at a random step in half of them."""
-    env = CronosVectorEnv(STREAMS, SCENE, privileged_state=True, observation_height=SIZE, observation_width=SIZE)
-    everyone, window = np.arange(STREAMS), env.steps_per_task
-    rng = np.random.default_rng([segments, split == "train"])
-    expert, noise = ScriptedExpert(env), ActionNoise(NoiseConfig(share=0.5), STREAMS, env.scene.robot)
-    recorder = StreamRecorder.open(env, "local/streams", output, segment_length=window, describes=())
-    starts, action = np.zeros(STREAMS, int), np.zeros((STREAMS, len(env.action_names)), np.float32)
-    for t in range(segments * window):
-        segment, step = divmod(t, window)
-        position, event = segment % SEGMENTS_PER_START, Intervention.NONE
-        if step == 0:
-            event = Intervention.TASK_SWITCH if position else Intervention.SCENE_RESET
-            if position == 0:
-                starts = rng.permutation(env.num_starts[split])[:STREAMS]
-                env.scene_reset(everyone, starts, split)
-            env.end_effector_reset(everyone)
-            env.set_task(everyone, [env.tasks[i] for i in rng.integers(len(env.tasks), size=STREAMS)])
-            expert.reset(everyone)
-            for stream in everyone:
-                noise.reset(stream, rng)
-            stops = np.where(rng.random(STREAMS) < 0.5, rng.integers(30, LATEST_STOP[split], STREAMS), window)
-            print(f"segment {segment} of {segments}", flush=True)
-        seen = env.observe()
-        acts = step < stops
-        action = np.where(acts[:, None], noise.apply(expert.act(), acts), action).astype(np.float32)
-        _, reward, _, _, info = env.step(action)
-        same = np.full(STREAMS, 0)
-        recorder.on_step(
-            Step(
-                t, seen, env.instructions, ActionSample(action), reward, info["is_success"], info["diverged"],
-                cut=np.full(STREAMS, step == window - 1), piece=same + segment, preceded_by=same + int(event),
-                segments_since_reset=same + position, interventions=same + segment // SEGMENTS_PER_START + 1,
-                policy_version=0, intervened=np.zeros(STREAMS, bool),
-            )
-        )  # fmt: skip
-    recorder.close()
 
 
 def train_encoder(dataset: Path, steps: int, output: Path) -> None:
@@ -137,7 +99,7 @@ def _normalized(pictures: torch.Tensor) -> torch.Tensor:
 
 
 def measure(dataset: Path, judges: Path) -> None:
-    """Print how often the judges are wrong: in a frame, at the end of a segment, at any time, too early."""
+    """Print how often the judges are wrong: in a frame, in a segment, and too early in one that succeeds."""
     streams = StreamDataset("local/streams", dataset)
     errors: dict[tuple[str, str], list[np.ndarray]] = {}
     for folder in sorted(judges.iterdir()):
@@ -146,17 +108,11 @@ def measure(dataset: Path, judges: Path) -> None:
             verdicts = model.successes({"front": streams.pixels(segment, CAMERA)[1:]})
             # What a picture shows was true after the action before.
             truth = streams.columns(segment, ["next.success"])["next.success"][:-1].astype(bool).ravel()
-            steady = np.convolve(verdicts, np.ones(STEADY))[: len(verdicts)] >= STEADY - 0.5
-            begins = truth.argmax() if truth.any() else len(truth)
-            found = {
-                "frame": (verdicts, truth),
-                "segment, at its end": (verdicts[-1:], truth[-1:]),
-                "segment, at any time": ([verdicts.any()], [truth.any()]),
-                f"segment, {STEADY} in a row": ([steady.any()], [truth.any()]),
-            }
-            if begins > EARLY:
-                found["segment, too early"] = ([verdicts[: begins - EARLY].any()], [False])
-                found[f"segment, too early, {STEADY} in a row"] = ([steady[: begins - EARLY].any()], [False])
+            in_a_row = np.convolve(verdicts[::JUDGED_EVERY], np.ones(STEADY))[: -(STEADY - 1)]
+            says = np.repeat(in_a_row >= STEADY - 0.5, JUDGED_EVERY)[: len(truth)]
+            found = {"frame": (verdicts, truth), "segment": ([says.any()], [truth.any()])}
+            if truth.argmax() > EARLY:
+                found["segment, too early"] = ([says[: truth.argmax() - EARLY].any()], [False])
             for what, pair in found.items():
                 for of in (task, "all tasks"):
                     errors.setdefault((of, what), []).append(np.stack(pair, axis=1))
@@ -172,13 +128,9 @@ def measure(dataset: Path, judges: Path) -> None:
 
 
 def main() -> None:
-    """One of the three commands."""
+    """One of the two commands."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
-    one = commands.add_parser("record")
-    one.add_argument("--split", choices=("train", "held_out"), required=True)
-    one.add_argument("--segments", type=int, default=12, help=f"of each of the {STREAMS} streams")
-    one.add_argument("--output", type=Path, required=True)
     one = commands.add_parser("encoder")
     one.add_argument("--dataset", type=Path, required=True)
     one.add_argument("--steps", type=int, default=3000)
@@ -187,9 +139,7 @@ def main() -> None:
     one.add_argument("--dataset", type=Path, required=True)
     one.add_argument("--judge", type=Path, required=True)
     args = parser.parse_args()
-    if args.command == "record":
-        record(args.split, args.segments, args.output)
-    elif args.command == "encoder":
+    if args.command == "encoder":
         train_encoder(args.dataset, args.steps, args.output)
     else:
         measure(args.dataset, args.judge)

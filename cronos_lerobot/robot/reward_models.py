@@ -35,13 +35,15 @@ LAST = Path("checkpoints/last/pretrained_model")
 """Of a folder that `lerobot-train` wrote."""
 STEPS = ("normalizer_processor", "device_processor")
 """What LeRobot gives a classifier. Other steps of LeRobot load models."""
-STEADY = 8
-"""Verdicts in a row that make a success [control steps]. Single ones flicker, and one counts for its segment."""
+EVERY = 3
+"""Control steps from one verdict to the next; the encoder takes longer than the policy."""
+STEADY = 10
+"""Verdicts in a row that make a success, 1 s at 30 Hz. Single ones flicker, and one counts for its segment."""
 FILES = (CONFIG_NAME, PROCESSOR, SAFETENSORS_SINGLE_FILE)
 
 
 class RewardModelJudge:
-    """Complete once LeRobot's classifier of the task has called the pictures of STEADY control steps a success.
+    """Complete once LeRobot's classifier of the task has called STEADY pictures in a row a success.
 
     Args:
         folder: with a sub-folder for each task, its instruction with underscores: what `lerobot-train` wrote, or a
@@ -74,13 +76,15 @@ class RewardModelJudge:
         """See `Judge`."""
         if task.instruction not in self._models:
             raise ValueError(f"--env.judge has no model for {task.instruction!r}, only for {list(self._models)}")
-        self._task, self._in_a_row = task.instruction, 0
+        self._task, self._in_a_row, self._step = task.instruction, 0, 0
 
     def judge(self, observation: Mapping[str, Any], events: Events) -> bool:
         """See `Judge`."""
-        model = self._models[self._task]
-        says = model.successes({camera: observation[camera][None] for camera in model.cameras})[0]
-        self._in_a_row = self._in_a_row + 1 if says else 0
+        if self._step % EVERY == 0:
+            model = self._models[self._task]
+            says = model.successes({camera: observation[camera][None] for camera in model.cameras})[0]
+            self._in_a_row = self._in_a_row + 1 if says else 0
+        self._step += 1
         return self._in_a_row >= STEADY
 
 

@@ -68,6 +68,7 @@ class RobotStreams:
         self._seen: Mapping[str, Any] = {}
         self._success = False
         self._helping: float | None = None
+        self._wanted: tuple[int, str] | None = None
         station.open()
 
     @property
@@ -81,6 +82,7 @@ class RobotStreams:
 
     def set_task(self, ids: Iterable[int], tasks: Sequence[Any]) -> None:
         """A segment begins."""
+        self._place()
         self._task, self._success = next(iter(tasks)), False
         self._judge.begin(self._task)
         self.station.person.tell(task=self._task.instruction)
@@ -93,6 +95,7 @@ class RobotStreams:
 
     def observe(self, ids: np.ndarray | None = None) -> dict[str, Any]:
         """What was last seen, with one row for each of `ids`."""
+        self._place()
         rows = 1 if ids is None else len(ids)
         if not self._seen:
             self._look()
@@ -138,10 +141,16 @@ class RobotStreams:
         return self.observe(), reward, never, never.copy(), info
 
     def scene_reset(self, ids: np.ndarray, starts: np.ndarray, split: str = "train") -> None:
-        """Go home, show the start that is wanted, and wait until the person has built it."""
-        if len(ids) == 0:
+        """Remember the start that is wanted. The person builds it once something follows, not after a run's end."""
+        if len(ids):
+            self._wanted = int(starts[0]), split
+
+    def _place(self) -> None:
+        """Go home, show the start that is wanted, if any, and wait until the person has built it."""
+        if self._wanted is None:
             return
-        station, start = self.station, int(starts[0])
+        (start, split), self._wanted = self._wanted, None
+        station = self.station
         station.be_ready()
         shown = ""
         if self.folder is not None:

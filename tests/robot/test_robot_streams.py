@@ -75,6 +75,9 @@ def test_a_scene_reset_waits_for_the_person_and_costs_what_it_takes(make):
     env = make()
     before = env.station.clock.time()
     env.scene_reset(ONE, np.array([3]))
+    # Nobody is asked until something follows.
+    assert env.station.clock.time() == before
+    env.observe()
     # Two seconds home and two of the person's.
     assert env.station.clock.time() - before == pytest.approx(4.0, abs=0.1)
     wanted = CronosVectorEnv(1, "so101_desk_2x2", obs_type="environment_state_agent_pos")
@@ -168,6 +171,7 @@ def test_a_lost_device_cuts_the_trace_and_waits_for_a_person(make, device):
     assert np.array_equal(robot.desk.goal, goal) == (device == "bus")
     # The person plugs it in, and puts the scene to the start that is wanted.
     env.scene_reset(ONE, np.array([5]))
+    env.observe()
     assert [line["kind"] for line in ledger(env)] == ["scene_reset", "mend", "scene_reset"]
     assert not hold(env, 5)[-1]["diverged"][0]
 
@@ -180,6 +184,7 @@ def test_an_emergency_stop_moves_nothing_until_the_person_says_so(make):
     assert env.step(env.station.target[None] + 5)[4]["diverged"][0]
     assert not any(env.station.robot.bus.sync_read("Torque_Enable").values())
     env.scene_reset(ONE, np.array([5]))
+    env.observe()
     assert all(env.station.robot.bus.sync_read("Torque_Enable").values())
 
 
@@ -196,12 +201,14 @@ def test_an_emergency_stop_on_the_way_home_or_in_a_pause_counts_too(make):
     assert np.array_equal(robot.desk.goal, before)
     assert not any(robot.bus.sync_read("Torque_Enable").values())
     env.scene_reset(ONE, np.array([5]))
+    env.observe()
     teleop.press("emergency_stop")
     env.station.wait("", lambda events: events.stop)
     goal = robot.desk.goal.copy()
     assert env.step(env.station.target[None] + 5)[4]["diverged"][0]
     assert np.array_equal(robot.desk.goal, goal)
     env.scene_reset(ONE, np.array([5]))
+    env.observe()
     assert [line["kind"] for line in ledger(env)].count("emergency_stop") == 2
     assert not hold(env, 1)[0]["diverged"][0]
 
