@@ -141,7 +141,7 @@ class RobotStreams:
         return self.observe(), reward, never, never.copy(), info
 
     def scene_reset(self, ids: np.ndarray, starts: np.ndarray, split: str = "train") -> None:
-        """Remember the start that is wanted. The person builds it once something follows, not after a run's end."""
+        """Remember the start that is wanted. The person is asked for it once something follows."""
         if len(ids):
             self._wanted = int(starts[0]), split
 
