@@ -9,14 +9,14 @@
 
 Then record two streams of a clone (docs/finetune.md, "On the SO-101") that does not learn, `train` and `other`:
 
-    cronos-train --policy.path=<clone> --num_envs=16 --steps=184320 --env.type=cronos --env.scene=so101_desk_2x2 \
+    cronos-train --policy.path=<clone> --num_envs=16 --steps=153600 --env.type=cronos --env.scene=so101_desk_2x2 \
         --env.privileged_state=true --env.observation_height=128 --env.observation_width=128 \
         --env.task_observation=one_hot --algorithm.type=imitation --algorithm.warmup_segments=1000000 \
         --protocol.scene_reset_interval=1920 --protocol.end_effector_reset=true --protocol.update_interval=480 \
         --eval_freq=0 --record.repo_id=local/streams --record.streams=all --seed=5 --output_dir=outputs/judge/train
 
 `other` has `--steps=61440 --seed=6`. Train a classifier for each task on `train` by docs/robot.md, "Let a model
-judge", with `--reward_model.model_name=outputs/judge/encoder --steps=2000`, and measure them:
+judge", with `--reward_model.model_name=outputs/judge/encoder --steps=1500`, and measure them:
 
     python benchmarks/reward_classifier.py measure --dataset=outputs/judge/other/streams \
         --judge=outputs/judge/judges
