@@ -99,7 +99,10 @@ def _normalized(pictures: torch.Tensor) -> torch.Tensor:
 
 
 def measure(dataset: Path, judges: Path) -> None:
-    """Print how often the judges are wrong: in a frame, in a segment, and too early in one that succeeds."""
+    """Print how often the judges are wrong: in a frame, in a segment, and too early in one that succeeds.
+
+    Segments that begin complete are left out.
+    """
     streams = StreamDataset("local/streams", dataset)
     errors: dict[tuple[str, str], list[np.ndarray]] = {}
     for folder in sorted(judges.iterdir()):
@@ -108,7 +111,11 @@ def measure(dataset: Path, judges: Path) -> None:
             verdicts = model.successes({"front": streams.pixels(segment, CAMERA)[1:]})
             # What a picture shows was true after the action before.
             truth = streams.columns(segment, ["next.success"])["next.success"][:-1].astype(bool).ravel()
-            in_a_row = np.convolve(verdicts[::JUDGED_EVERY], np.ones(STEADY))[: -(STEADY - 1)]
+            if truth[0]:
+                continue
+            looked = verdicts[::JUDGED_EVERY]
+            looked = looked & np.logical_or.accumulate(~looked)
+            in_a_row = np.convolve(looked, np.ones(STEADY))[: -(STEADY - 1)]
             says = np.repeat(in_a_row >= STEADY - 0.5, JUDGED_EVERY)[: len(truth)]
             found = {"frame": (verdicts, truth), "segment": ([says.any()], [truth.any()])}
             if truth.argmax() > EARLY:

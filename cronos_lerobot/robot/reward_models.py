@@ -45,6 +45,8 @@ FILES = (CONFIG_NAME, PROCESSOR, SAFETENSORS_SINGLE_FILE)
 class RewardModelJudge:
     """Complete once LeRobot's classifier of the task has called STEADY pictures in a row a success.
 
+    It must have called one a failure before: where a task began complete, nothing had to be done.
+
     Args:
         folder: with a sub-folder for each task, its instruction with underscores: what `lerobot-train` wrote, or a
             checkpoint.
@@ -76,16 +78,20 @@ class RewardModelJudge:
         """See `Judge`."""
         if task.instruction not in self._models:
             raise ValueError(f"--env.judge has no model for {task.instruction!r}, only for {list(self._models)}")
-        self._task, self._in_a_row, self._step = task.instruction, 0, 0
+        self._task, self._step = task.instruction, 0
+        self._in_a_row: int | None = None
 
     def judge(self, observation: Mapping[str, Any], events: Events) -> bool:
         """See `Judge`."""
         if self._step % EVERY == 0:
             model = self._models[self._task]
             says = model.successes({camera: observation[camera][None] for camera in model.cameras})[0]
-            self._in_a_row = self._in_a_row + 1 if says else 0
+            if not says:
+                self._in_a_row = 0
+            elif self._in_a_row is not None:
+                self._in_a_row += 1
         self._step += 1
-        return self._in_a_row >= STEADY
+        return (self._in_a_row or 0) >= STEADY
 
 
 class RewardModel:
