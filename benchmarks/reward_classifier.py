@@ -26,6 +26,7 @@ judge", with `--reward_model.model_name=outputs/judge/encoder --steps=1500`, and
 
 import argparse
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -34,8 +35,8 @@ from lerobot.utils.constants import IMAGENET_STATS
 from transformers import ResNetConfig, ResNetModel
 
 from cronos_lerobot.data.streams import StreamDataset
-from cronos_lerobot.robot.reward_models import EVERY as JUDGED_EVERY
-from cronos_lerobot.robot.reward_models import STEADY, RewardModel
+from cronos_lerobot.robot.person import Events
+from cronos_lerobot.robot.reward_models import RewardModelJudge
 from cronos_lerobot.statistics import wilson_interval
 
 CAMERA, SIZE = "observation.images.front", 128
@@ -99,33 +100,30 @@ def _normalized(pictures: torch.Tensor) -> torch.Tensor:
 
 
 def measure(dataset: Path, judges: Path) -> None:
-    """Print how often the judges are wrong: in a frame, in a segment, and too early in one that succeeds.
+    """Print how often the judges are wrong in a segment, and too early in one that succeeds.
 
     Segments that begin complete are left out.
     """
     streams = StreamDataset("local/streams", dataset)
-    errors: dict[tuple[str, str], list[np.ndarray]] = {}
-    for folder in sorted(judges.iterdir()):
-        task, model = folder.name.replace("_", " "), RewardModel(folder)
-        for segment in (one for one in streams.segments if one.task == task):
-            verdicts = model.successes({"front": streams.pixels(segment, CAMERA)[1:]})
-            # What a picture shows was true after the action before.
-            truth = streams.columns(segment, ["next.success"])["next.success"][:-1].astype(bool).ravel()
-            if truth[0]:
-                continue
-            looked = verdicts[::JUDGED_EVERY]
-            looked = looked & np.logical_or.accumulate(~looked)
-            in_a_row = np.convolve(looked, np.ones(STEADY))[: -(STEADY - 1)]
-            says = np.repeat(in_a_row >= STEADY - 0.5, JUDGED_EVERY)[: len(truth)]
-            found = {"frame": (verdicts, truth), "segment": ([says.any()], [truth.any()])}
-            if truth.argmax() > EARLY:
-                found["segment, too early"] = ([says[: truth.argmax() - EARLY].any()], [False])
-            for what, pair in found.items():
-                for of in (task, "all tasks"):
-                    errors.setdefault((of, what), []).append(np.stack(pair, axis=1))
+    tasks = {text: SimpleNamespace(instruction=text) for text in sorted({one.task for one in streams.segments})}
+    judge = RewardModelJudge(judges, tuple(tasks.values()), (), {"front": None})
+    errors: dict[tuple[str, str], list[tuple[bool, bool]]] = {}
+    for segment in streams.segments:
+        # What a picture shows was true after the action before.
+        truth = streams.columns(segment, ["next.success"])["next.success"][:-1].astype(bool).ravel()
+        if truth[0]:
+            continue
+        judge.begin(tasks[segment.task])
+        says = np.array([judge.judge({"front": one}, Events()) for one in streams.pixels(segment, CAMERA)[1:]])
+        found = {"segment": (says.any(), truth.any())}
+        if truth.argmax() > EARLY:
+            found["segment, too early"] = (says[: truth.argmax() - EARLY].any(), False)
+        for what, pair in found.items():
+            for of in (segment.task, "all tasks"):
+                errors.setdefault((of, what), []).append(pair)
     print("| task | of a | n | wrong, 95 % | false successes | missed successes |\n|---|---|---|---|---|---|")
     for (of, what), pairs in sorted(errors.items(), key=lambda one: one[0][0] != "all tasks"):
-        said, true = np.concatenate(pairs).astype(bool).T
+        said, true = np.array(pairs).T
         wrong, n = int((said != true).sum()), len(true)
         low, high = wilson_interval(wrong, n)
         print(

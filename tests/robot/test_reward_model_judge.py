@@ -81,6 +81,9 @@ def edit(file: Path, **changes) -> None:
 
 def test_recordings_say_who_judges_and_how_often_it_is_wrong(judges):
     env = robot_streams(judges, judge_error=0.04)
+    env.set_task(np.array([0]), env.tasks[:1])
+    # Of its own camera's picture.
+    assert not env.step(env.station.target[None])[4]["is_success"][0]
     env.close()
     name, _, error = env.identity.source.partition(", wrong in ")
     assert name.startswith("so101_desk_2x2, judge reward_classifier ")
